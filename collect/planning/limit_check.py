@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from collect.errors import ConfigError, StepError
 from collect.motion.moves import park_moves
@@ -22,7 +21,7 @@ from collect.rig.config import RigConfig
 from collect.rig.devices import limits_of
 from collect.rig.paper import Cell, PaperPlane, Sheet
 from collect.touch.selfcheck import triangle_in
-from drivers.arcs.controller import Controller
+from drivers.arcs.controller import Controller, six
 from drivers.arcs.robot import AUBOPE_PORT
 from drivers.arcs.rpc import RpcConnection, open_arcs
 from drivers.errors import LimitExceeded, ProtocolViolation
@@ -237,7 +236,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
 async def _joints(controller: Controller, wire: list[float], near: list[float]) -> list[float] | None:
     match await controller.ask("RobotAlgorithm.inverseKinematics", qnear=near, pose=wire):
         case [list(joints), 0]:  # pyright: ignore[reportUnknownVariableType]
-            return _six("inverseKinematics", joints)
+            return six("inverseKinematics", joints)  # pyright: ignore[reportUnknownArgumentType]
         case [_, int()]:
             return None
         case other:
@@ -246,17 +245,7 @@ async def _joints(controller: Controller, wire: list[float], near: list[float]) 
 
 async def _tool(controller: Controller) -> list[float]:
     """The tool offset that is set on the controller: x, y, z in m, rx, ry, rz in rad."""
-    return _six("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
-
-
-def _six(op: str, values: Any) -> list[float]:
-    try:
-        numbers = [float(v) for v in values]
-    except (TypeError, ValueError):
-        numbers = []
-    if len(numbers) != 6:
-        raise ProtocolViolation(DEVICE, op, f"expected six numbers, got {values!r}")
-    return numbers
+    return six("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
 
 
 def _for_tool(tip: Pose, ours: list[float], theirs: list[float]) -> Pose:

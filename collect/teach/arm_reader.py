@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
+from drivers.arcs.controller import six
 from drivers.arcs.framing import numbers
 from drivers.arcs.robot import AUBOPE_PORT
 from drivers.arcs.rpc import DEVICE, Framing, RpcConnection, open_arcs
@@ -109,7 +110,7 @@ class ArmReader:
 
     async def tool(self) -> tuple[float, ...]:
         """Flange to tool as the cabinet has it: x, y, z in m, rx, ry, rz in rad."""
-        return tuple(_six("getTcpOffset", await self.ask("RobotConfig.getTcpOffset")))
+        return tuple(six("getTcpOffset", await self.ask("RobotConfig.getTcpOffset")))
 
     async def flange(self) -> Pose:
         """Wait until the arm is held still, and return the pose of the flange in the base frame.
@@ -135,7 +136,7 @@ class ArmReader:
     async def flange_now(self) -> Pose:
         """Pose of the flange in the base frame, whether or not the arm rests. Raises `DeviceError`."""
         tool = await self.tool()
-        at = from_wire(_six("getTcpPose", await self.ask("RobotState.getTcpPose")))
+        at = from_wire(six("getTcpPose", await self.ask("RobotState.getTcpPose")))
         turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()
         x, y, z = np.array(at.position_mm) - turn.apply(1e3 * np.array(tool[:3]))
         qx, qy, qz, qw = (float(v) for v in turn.as_quat())
@@ -144,11 +145,13 @@ class ArmReader:
     async def cabinet(self, framing: Framing) -> Cabinet:
         """Everything that the cabinet reports about itself. Raises `DeviceError`."""
         version = await self._connection.call("SystemInfo.getInterfaceVersionCode")
-        tool = await self.tool()
+        tool, level = await self.tool(), await self.ask("RobotConfig.getCollisionLevel")
+        if type(level) is not int:
+            raise ProtocolViolation(DEVICE, "getCollisionLevel", f"expected a whole number, got {level!r}")
         payload = await self.ask("RobotConfig.getPayload")
         try:
             mass_kg, cog_m, *_ = payload
-            payload_kg, cog_mm = float(mass_kg), tuple(1e3 * v for v in numbers(cog_m, 3))
+            [payload_kg], cog_mm = numbers([mass_kg], 1), tuple(1e3 * v for v in numbers(cog_m, 3))
         except (TypeError, ValueError):
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
         return Cabinet(
@@ -162,20 +165,13 @@ class ArmReader:
             (*(1e3 * v for v in tool[:3]), *(math.degrees(v) for v in tool[3:])),
             payload_kg,
             cog_mm,
-            int(await self.ask("RobotConfig.getCollisionLevel")),
+            level,
         )
 
     async def _firmware(self, version: object) -> str:
         with contextlib.suppress(RpcError):
             return f"interface {version}, {await self._connection.call('SystemInfo.getControlSoftwareFullVersion')}"
         return f"interface {version}"
-
-
-def _six(op: str, answer: Any) -> list[float]:
-    try:
-        return numbers(answer, 6)
-    except ValueError as error:
-        raise ProtocolViolation(DEVICE, op, str(error)) from None
 
 
 @contextlib.asynccontextmanager

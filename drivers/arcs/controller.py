@@ -64,18 +64,11 @@ class Controller:
 
     async def pose(self) -> Pose:
         """Where the tip is. Raises `ProtocolViolation`."""
-        return from_wire(await self._six("getTcpPose"))
+        return from_wire(six("getTcpPose", await self.ask("RobotState.getTcpPose")))
 
     async def joint_positions(self) -> list[float]:
         """Six joints in rad. Raises `ProtocolViolation`."""
-        return await self._six("getJointPositions")
-
-    async def _six(self, getter: str) -> list[float]:
-        values = await self.ask(f"RobotState.{getter}")
-        try:
-            return numbers(values, 6)
-        except ValueError as error:
-            raise ProtocolViolation(DEVICE, getter, str(error)) from None
+        return six("getJointPositions", await self.ask("RobotState.getJointPositions"))
 
     async def mode(self) -> RobotMode:
         """The robot mode. Raises `ProtocolViolation` for an unknown name."""
@@ -169,6 +162,14 @@ class Controller:
             await self.connection.call("RuntimeMachine.abort")
             raise
         await self.connection.call("RuntimeMachine.abort")
+
+
+def six(op: str, answer: object) -> list[float]:
+    """A pose, a tool or joints, as the controller answered. Raises `ProtocolViolation` unless they are finite."""
+    try:
+        return numbers(answer, 6)
+    except ValueError as error:
+        raise ProtocolViolation(DEVICE, op, str(error)) from None
 
 
 def accepted(op: str, code: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from collect.protocols.config import load_protocol
 from collect.rig.config import RigConfig, load_rig
 from collect.rig.paper import PaperPlane
 from drivers.arcs.codes import RobotMode
-from drivers.errors import ConnectionLost
+from drivers.errors import ConnectionLost, ProtocolViolation
 from drivers.geometry import brush_pose, from_wire
 from drivers.sim.arcs.server import ArcsServer
 from drivers.sim.arm.kinematics import inverted, matrix_of
@@ -163,6 +164,13 @@ async def test_reach_is_that_of_our_tool_whatever_is_set_on_the_controller(rig_p
         edges.append(x_mm)
     assert 700.0 < edges[0] < 1200.0
     assert edges == [edges[0]] * 3
+
+
+async def test_a_tool_that_is_no_number_is_an_error_of_the_device(rig_path: Path, cabinet: ArcsServer) -> None:
+    config = at(rig_path, cabinet.port)
+    cabinet._methods["rob1.RobotConfig.getTcpOffset"] = lambda _: [math.nan] * 6
+    with pytest.raises(ProtocolViolation, match="getTcpOffset: expected 6 finite numbers"):
+        await ask_reach(rig_path, config, [(brush_pose(300.0, 0.0, 200.0), 10.0, "park")])
 
 
 async def test_a_controller_that_does_not_answer_is_an_error_of_the_device(rig_path: Path) -> None:

@@ -1,0 +1,34 @@
+"""What a cabinet says about itself is checked before it is kept: it may be any firmware, or no cabinet at all."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from collect.teach.arm_reader import Address, reading
+from drivers.errors import ProtocolViolation
+from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.config import SimConfig
+from drivers.sim.world import World
+
+
+@pytest.mark.parametrize(
+    ("getter", "answer"),
+    [
+        ("getPayload", [math.nan, [0.0, 0.0, 0.0]]),
+        ("getPayload", ["1.5", [0.0, 0.0, 0.0]]),
+        ("getCollisionLevel", None),
+        ("getTcpOffset", [0.0, 0.0, math.inf, 0.0, 0.0, 0.0]),
+    ],
+)
+async def test_an_answer_that_is_no_number_is_refused_by_its_getter(getter: str, answer: object) -> None:
+    server = ArcsServer(World(SimConfig()))
+    server._methods[f"rob1.RobotConfig.{getter}"] = lambda _: answer
+    await server.start("127.0.0.1", 0)
+    try:
+        async with reading(Address("127.0.0.1", server.port), "sof") as reader:
+            with pytest.raises(ProtocolViolation, match=getter):
+                await reader.cabinet("sof")
+    finally:
+        await server.stop()
