@@ -54,8 +54,11 @@ def teach(
 
 def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
     import asyncio
+    import os
+    import signal
     import sys
 
+    from collect.headless import stop_signals
     from collect.teach.day import Day
     from drivers.clock import HostClock
 
@@ -63,7 +66,9 @@ def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
         from collect.teach.plain import PlainGuide
 
         day = Day(PlainGuide(rig.with_name(f"{rig.stem}.pictures")), rig, HostClock(), armed=arm)
-        asyncio.run(_taught(day, step))
+        # Like Ctrl-C, which asyncio turns into a cancellation: the arm is stopped before the process ends.
+        with stop_signals(lambda _: os.kill(os.getpid(), signal.SIGINT), (signal.SIGTERM, signal.SIGHUP)):
+            asyncio.run(_taught(day, step))
         return
     from collect.tui.teach_app import run_teaching
 

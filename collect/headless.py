@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Protocol
@@ -106,14 +106,14 @@ def no_pose_text(now: Snapshot) -> str:
 
 
 @contextmanager
-def stop_signals(handle: Callable[[int], None]) -> Generator[None]:
-    """Call `handle` with the number of each SIGINT, SIGTERM and SIGHUP, in a separate thread."""
+def stop_signals(handle: Callable[[int], None], numbers: Sequence[signal.Signals] = STOP_SIGNALS) -> Generator[None]:
+    """Call `handle` with the number of each of these signals, in a separate thread."""
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
         # Not from the handler itself: it may have interrupted code that holds the engine's lock.
         threading.Thread(target=handle, args=(number,), name="stop key").start()
 
-    before = {number: signal.signal(number, on_signal) for number in STOP_SIGNALS}
+    before = {number: signal.signal(number, on_signal) for number in numbers}
     try:
         yield
     finally:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from subprocess import Popen
 
 from calibrate.artefact import artefacts
 from collect.errors import ConfigError
+from collect.headless import stop_signals
 from collect.protocols.config import load_protocol
 from sessions.errors import SessionError
 from sessions.reader import Recording
@@ -34,17 +36,19 @@ class CommandFailed(Exception):
 def run_command(say: Say, *arguments: str | Path, accepts: tuple[int, ...] = (0,)) -> int:
     """Run `brushloop ARGUMENTS` on this terminal, in a process of its own; return its exit code.
 
+    SIGTERM and SIGHUP are passed on to it: a collection must not go on without the command that began it.
     Raises `CommandFailed` for a code that is not in `accepts`.
     """
     words = [str(argument) for argument in arguments]
     say(f"$ brushloop {' '.join(words)}")
-    process = subprocess.Popen([sys.executable, "-m", "brushloop", *words])
-    while True:
-        try:
-            code = process.wait()
-            break
-        except KeyboardInterrupt:
-            continue  # the command receives it too, stops the arm and reports it
+    process = Popen([sys.executable, "-m", "brushloop", *words])
+    with stop_signals(process.send_signal, (signal.SIGTERM, signal.SIGHUP)):
+        while True:
+            try:
+                code = process.wait()
+                break
+            except KeyboardInterrupt:
+                continue  # the command receives it too, stops the arm and reports it
     if code not in accepts:
         raise CommandFailed(words, code if code > 0 else 4)
     return code

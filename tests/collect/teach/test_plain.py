@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
+from collect import cli_rig
 from collect.teach.plain import PlainGuide
 
 
@@ -34,3 +36,23 @@ def test_a_question_that_is_stopped_does_not_wait_for_enter(tmp_path: Path) -> N
     asyncio.run(stopped())  # would wait for the reading thread
     os.close(write)
     os.close(read)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_arm_before_the_process_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    stopped: list[str] = []
+
+    async def moving(*_: object) -> None:
+        os.kill(os.getpid(), number)
+        try:
+            await asyncio.sleep(60.0)
+        except asyncio.CancelledError:
+            stopped.append("the arm")
+            raise
+
+    monkeypatch.setattr(cli_rig, "_taught", moving)
+    with pytest.raises(KeyboardInterrupt):
+        cli_rig._teach(tmp_path / "rig.toml", None, plain=True, arm=True)
+    assert stopped == ["the arm"]
