@@ -157,6 +157,8 @@ class OperatorApp(RunApp):
             else:
                 self.notify(plain(str(error)), severity="error", timeout=20)
             return
+        if self.leaving:
+            return  # a signal came meanwhile: nobody would watch this run
         self.engine = engine
         self._leave_when_over = False
         engine.start()

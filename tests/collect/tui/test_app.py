@@ -342,6 +342,24 @@ async def test_enter_resumes_a_stopped_session_once_the_operator_has_looked_at_t
         assert "RUNNING" in await look(app, pilot)
 
 
+async def test_a_run_is_not_begun_once_a_signal_ends_the_app() -> None:
+    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
+    stopped.stop()
+    resumed = FakeEngine(picture())
+
+    def again(_session_id: str) -> FakeEngine:
+        app.leave()  # the signal comes while files are read
+        return resumed
+
+    app = OperatorApp(stopped, again=again)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        await pilot.press("enter", "y")
+        await app.workers.wait_for_complete()
+    assert resumed.calls == []
+    assert app.engine is stopped
+
+
 async def test_a_session_that_cannot_be_resumed_says_why() -> None:
     def again(_session_id: str) -> FakeEngine:
         raise ConfigError("rig.toml", "", "goes on with no open session")
