@@ -14,6 +14,7 @@ from collect.engine.dry_run import DryRunEngine
 from collect.engine.engine import Engine
 from collect.engine.open_or_resume import Opening, open_store
 from collect.errors import CannotTeach
+from collect.planning.limit_check import check_protocol
 from collect.rig.config import RigConfig
 from collect.rig.doctor import examine
 from collect.rig.paper import PaperPlane
@@ -70,7 +71,10 @@ class ProofStep(Step):
             raise CannotTeach(f"{ill[0].device}: {ill[0].problem}.", ill[0].remedy or "Check power, cable and address.")
 
     async def _run(self, day: Day, folder: Path, protocol: str, *, dry: bool) -> Path:
-        """Run the protocol slowly on what was taught; returns the session's folder."""
+        """Run the protocol slowly on what was taught; returns the session's folder.
+
+        Raises `ConfigError` before anything is connected if a pose would lie outside the limits.
+        """
         rig_path, protocol_path = folder / "rig.toml", folder / "protocol.toml"
         rig_path.write_text(_with_lens_at(day), encoding="utf-8")
         protocol_path.write_text(protocol, encoding="utf-8")
@@ -78,6 +82,7 @@ class ProofStep(Step):
             folder / "sessions", rig_path, protocol_path, armed=True, dry_run_mm=ABOVE_MM if dry else None
         )
         opening = replace(opening, rig=slowly(opening.rig))
+        check_protocol(day.rig_path, protocol_path, opening.rig, opening.protocol)
         make = DryRunEngine if dry else Engine
         engine = make(
             opening.rig,

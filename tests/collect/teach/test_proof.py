@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from collect.errors import CannotTeach
+from collect.errors import CannotTeach, ConfigError
 from collect.operator import Choice
 from collect.rig.config import load_rig
 from collect.teach.day import Day
@@ -59,6 +60,23 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
         await ProofStep().teach(Day(person, tmp_path / "rig.toml", HostClock(), armed=armed))  # type: ignore[arg-type]
     assert len(person.asked) == armed
     assert all("The arm moves by itself, slower than 50 mm/s" in question for question in person.asked)
+
+
+@pytest.mark.parametrize("dry", [True, False])
+async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
+    dry: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_engine(*_: object, **__: object) -> None:
+        raise AssertionError("the arm would have moved")
+
+    text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+    low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
+    monkeypatch.setattr(proof, "_with_lens_at", lambda _: low)
+    monkeypatch.setattr(proof, "DryRunEngine" if dry else "Engine", no_engine)
+    day = Day(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)  # type: ignore[arg-type]
+    protocol = 'kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
+    with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):
+        await ProofStep()._run(day, tmp_path, protocol, dry=dry)
 
 
 def test_every_move_of_the_proof_is_slower_than_50_mm_s(tmp_path: Path) -> None:
