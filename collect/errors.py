@@ -129,6 +129,15 @@ class Parked(CollectAborted):
     """The run ended between two steps on request, with the arm lifted and parked."""
 
 
+def arm_at_fault(error: BaseException) -> bool:
+    """Whether the arm failed, or the brush met something hard: then the arm must not move before a person has looked.
+
+    A line that was refused for a limit is no fault of the arm, which may still be lifted.
+    """
+    robots = isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, LimitExceeded)
+    return robots or isinstance(error, ForceTooHigh)
+
+
 def rest_is_unknown(error: BaseException | None) -> bool:
     """Whether it is not known that the arm rests after this error: the connection was lost, or it did not answer the
     stop."""

@@ -15,15 +15,13 @@ from collect.engine.set_up import question as set_up_question
 from collect.engine.snapshot import SET_UP
 from collect.engine.steps.context import RunContext
 from collect.engine.steps.retake import marked_bad
-from collect.errors import ForceTooHigh, Parked, SheetFull, StepError, describe
+from collect.errors import Parked, SheetFull, StepError, arm_at_fault, describe
 from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.plan import takes
 from collect.protocols.steps import Protocol, Result, Step, StepKind
-from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError, RpcError
+from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from sessions.errors import SessionError
 
-ITS_OWN_TROUBLE = (MotionError, RpcError, ForceTooHigh)
-"""After these errors the arm does not move before a person has looked."""
 KEEP_SHEET = Choice("o", "keep the old sheet")
 
 
@@ -173,7 +171,7 @@ class Run:
     async def _ask(self, error: StepError | DeviceError) -> str:
         """Let a person decide after `error`; return the answer, or raise an error if it is to stop."""
         in_order = False
-        if not isinstance(error, ITS_OWN_TROUBLE):
+        if not arm_at_fault(error):
             with contextlib.suppress(StepError, DeviceError):
                 await self._recover()  # a person is about to reach under the arm
                 in_order = True
@@ -196,9 +194,8 @@ class Run:
         return await self.context.asker.ask(prompt)
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
-        """Lift the brush off the paper after `error`. Where the arm is at fault, or the brush met something hard, leave
-        it: a person must look first."""
-        if isinstance(error, ITS_OWN_TROUBLE) or getattr(error, "device", "") == "robot":
+        """Lift the brush off the paper after `error`, unless the arm is at fault."""
+        if arm_at_fault(error):
             return
         try:
             await self._recover()

@@ -9,7 +9,7 @@ import statistics
 from collections.abc import AsyncGenerator, Sequence
 from typing import Protocol
 
-from collect.errors import ForceTooHigh, StepError
+from collect.errors import StepError, arm_at_fault
 from collect.motion import moves
 from collect.motion.moves import Move
 from collect.rig.config_touch import ForceTouchConfig
@@ -82,12 +82,12 @@ class TouchArm:
 
     @contextlib.asynccontextmanager
     async def lifted_after(self) -> AsyncGenerator[None]:
-        """Lift at the end and after any error but a stop: a person who stopped the arm wants it to stay."""
+        """Lift at the end and after an error, unless the arm is at fault. After a stop the arm stays where it is."""
         try:
             yield
-        except (asyncio.CancelledError, ForceTooHigh):
-            raise
         except Exception as error:
+            if arm_at_fault(error):
+                raise
             try:
                 await self.lift()
             except Exception as trouble:

@@ -6,9 +6,9 @@ import pytest
 
 from collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
 from collect.engine.policy import MAX_FAILURES, Action, decide
-from collect.errors import SheetFull, StepVoid
+from collect.errors import ForceTooHigh, SheetFull, StepVoid, arm_at_fault
 from collect.protocols.steps import Step, StepKind
-from drivers.errors import DeviceError, DeviceTimeout, MotionFailed, RobotNotSafe, Stuck
+from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
 
 
 def test_stop_is_possible_from_every_state_that_is_not_over() -> None:
@@ -58,3 +58,18 @@ def test_motion_is_never_blindly_repeated(
     step: Step, error: StepVoid | DeviceError, failures: int, action: Action
 ) -> None:
     assert decide(step, error, failures) is action
+
+
+@pytest.mark.parametrize(
+    ("error", "looked_at_first"),
+    [
+        (MotionFailed("robot", "moveLine", "out of reach"), True),
+        (DeviceTimeout("robot", "getTcpPose", "no reply"), True),
+        (ForceTooHigh(6.0, 5.0), True),
+        (LimitExceeded("robot", "tilt on the way", 16.0, 0.0, 15.0, "deg"), False),
+        (LATE_CAMERA, False),
+        (StepVoid("rests too high"), False),
+    ],
+)
+def test_an_arm_at_fault_is_not_lifted_before_a_person_has_looked(error: Exception, looked_at_first: bool) -> None:
+    assert arm_at_fault(error) is looked_at_first

@@ -17,6 +17,7 @@ from collect.operator import Asker
 from collect.rig.config_touch import TouchConfig
 from collect.touch.heights import PlaneResult
 from collect.touch.measure import Jogged, asked, measure_plane
+from drivers.errors import MotionFailed
 from drivers.samples import Pose
 
 if TYPE_CHECKING:
@@ -124,6 +125,21 @@ async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
     with pytest.raises(StepError, match="do not lie in a plane: residuals"):
         await measured(bench, method="force", touches=1, points_mm=four, force={"sigma_mm": 0.05})
     assert bench.lifted
+
+
+async def test_an_arm_that_failed_is_left_where_it_is(make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = make_bench()
+    move = bench.move
+
+    async def held_up(target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
+        await move(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
+        if target.z_mm < 121.0:
+            raise MotionFailed("robot", "moveLine", "rests 0.40 mm and 0.00 deg from the target")
+
+    monkeypatch.setattr(bench, "move", held_up)
+    with pytest.raises(MotionFailed):
+        await measured(bench, method="force")
+    assert not bench.lifted
 
 
 async def test_an_arm_that_was_stopped_is_left_where_it_is(make_bench: MakeBench) -> None:
