@@ -1,20 +1,21 @@
-"""A dragged brush as a footprint that has a length: three discs, each pulled by the tip on a leash of its own.
+"""A dragged brush as a footprint that has a length: three discs along a stick, pulled by the tip on a leash.
 
 `model.drag` draws with a single disc, which is enough for long strokes. A character consists of ends and corners, and
-there the length of the footprint shows: it lands behind the tip, swings round behind a corner, and reaches ahead of its
-middle when the brush lifts. Here the footprint is the hull of neighbouring discs, from the heel to the tips of the
-hairs. Each disc rests until its leash is taut and then follows straight towards the tip (a tractrix). A brush that is
-pressed deeper slides away from the ferrule, by as much as if it had landed that deep. Leash and half width are
-polynomials of the depth. The mark is the union of the footprints along the path. Lengths are mm, x and y in
-the frame of the path, y upward, depth into the paper.
+there the length of the footprint shows: it lands behind the tip, swings round behind a corner, and is drawn towards the
+tip when the brush lifts. Here the footprint is the hull of neighbouring discs, from the heel to the tips of the hairs.
+Its middle rests until the leash is taut and then follows straight towards the tip (a tractrix); the stick turns towards
+where it is pulled, over a length of its own, and is shorter while it is pulled across. A brush that is pressed deeper
+slides away from the ferrule, by as much as if it had landed that deep. Every stroke begins and ends with a vertical
+motion at depth 0, which marks as well. Leash, landing, places of the discs and half widths are quadratic in the depth.
+The mark is the union of the footprints along the path. Lengths are mm, x and y in the frame of the path, y upward,
+depth into the paper.
 
-The simulated brush of the loopback rig is pulled on a taut leash as well (`drivers.sim.brush.drag`), though its
+The simulated brush of the loopback rig is a stick on a taut leash as well (`drivers.sim.brush.drag`), though its
 footprint is computed from bristles. What this model scores there is therefore no evidence for a real brush.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,23 +32,34 @@ Indices = NDArray[np.int64]
 DISCS = 3
 STEP_MM = 0.5
 """Longest distance of the tip between two footprints of a mark."""
-PER_DISC = ("leash_mm", "leash_per_mm", "land_mm", "land_per_mm", "half_mm", "half_per_mm", "half_per_mm2")
-"""Leash, distance behind the tip at which the disc lands, half width: each at depth 0, then its growth."""
-NAMES = (*(f"{name}_{disc}" for disc in range(1, DISCS + 1) for name in PER_DISC), "drift_along_mm", "drift_across_mm")
+OF_STICK = (
+    *("leash_mm", "leash_per_mm", "leash_per_mm2", "land_mm", "land_per_mm", "land_per_mm2"),
+    *("turn_mm", "turn_per_mm", "across_mm", "thinner_per_mm"),
+)
+"""Leash, distance behind the tip at which the middle lands, length over which the stick turns: each at depth 0, then
+its growth. Offset to the left of the stick, and half width lost per mm of path."""
+PER_DISC = ("ahead_mm", "ahead_per_mm", "ahead_per_mm2", "half_mm", "half_per_mm", "half_per_mm2")
+"""Place along the stick, ahead of the middle, and half width: each at depth 0, then its growth."""
+NAMES = (*OF_STICK, *(f"{name}_{disc}" for disc in range(1, DISCS + 1) for name in PER_DISC))
 START = (
-    *(0.5, 0.1, 0.5, 0.1, 0.2, 0.12, 0.0),
-    *(0.5, 0.5, 0.5, 0.5, 0.3, 0.25, 0.0),
-    *(0.5, 1.0, 0.5, 1.0, 0.1, 0.08, 0.0),
-    *(0.0, 0.0),
+    *(0.5, 0.5, 0.0, 0.5, 0.5, 0.0),
+    *(0.2, 0.3, 0.0, 0.0),
+    *(0.3, 0.4, 0.0, 0.2, 0.15, 0.0),
+    *(0.0, 0.0, 0.0, 0.2, 0.25, 0.0),
+    *(-0.3, -0.4, 0.0, 0.2, 0.15, 0.0),
 )
 """A starting point for a fit, not a real brush."""
-SCALE = (*(1.5, 0.4, 1.5, 0.4, 0.5, 0.15, 0.01) * DISCS, 1.0, 1.0)
+SCALE = (
+    *(1.5, 0.4, 0.02, 1.5, 0.4, 0.02),
+    *(1.0, 0.2, 1.0, 0.01),
+    *(1.0, 0.4, 0.02, 0.5, 0.15, 0.01) * DISCS,
+)
 """How far each parameter may be from its start before it costs as much as one pixel of wrong ink."""
 EACH_SCALE = 0.5
 """The same for footprints of single strokes, as a share."""
 SPREADS_MM = (0.8, 0.3)
 """Softness of the edge in a fit: first wide, so that ink that is far off still pulls, then narrow."""
-ROUNDS = 20
+ROUNDS = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +84,12 @@ class Footprint:
 
     def half_width_mm(self, depth_mm: Floats) -> Floats:
         """Half width of a straight mark, (N,) -> (N,) mm."""
-        discs = [self.values[k : k + len(PER_DISC)] for k in range(0, DISCS * len(PER_DISC), len(PER_DISC))]
-        return np.max([d[4] + d[5] * depth_mm + d[6] * depth_mm**2 for d in discs], axis=0)
+        discs = np.reshape(self.values[len(OF_STICK) :], (DISCS, len(PER_DISC)))
+        return np.max([_quadratic(disc[3:], depth_mm) for disc in discs], axis=0)
 
     def lag_mm(self, depth_mm: Floats) -> Floats:
-        """Distance of the middle disc behind the tip in a straight stroke, (N,) -> (N,) mm."""
-        leash_mm, per_mm = self.values[len(PER_DISC) : len(PER_DISC) + 2]
-        return np.maximum(leash_mm + per_mm * depth_mm, 0.0)
+        """Distance of the footprint's middle behind the tip in a straight stroke, (N,) -> (N,) mm."""
+        return np.maximum(_quadratic(np.array(self.values[:3]), depth_mm), 0.0)
 
     def distance(self, paths: Sequence[Floats], x_mm: Floats, y_mm: Floats) -> Floats:
         """Signed distance in mm to the edge of the ink of all paths, positive in ink, (len(y_mm), len(x_mm)).
@@ -94,21 +105,40 @@ def inked(footprints: Sequence[Footprint], paths: Sequence[Floats], x_mm: Floats
     return distances(made.discs, made.starts, x_mm, y_mm, np.array([0, len(made.starts) - 1]))[0]
 
 
-def sampled(path: Floats, like: Floats | None = None) -> Floats:
-    """(N, 4) path -> (M, 4), at most `STEP_MM` apart, corners included; divided as the path `like` would be."""
-    pieces = [path[:1]]
-    for (a, b), (c, d) in zip(
-        itertools.pairwise(path), itertools.pairwise(path if like is None else like), strict=True
-    ):
-        count = max(1, math.ceil(float(np.linalg.norm((d - c)[:3])) / STEP_MM))
-        pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
-    return np.concatenate(pieces)
+def _quadratic(of: Floats, depth_mm: Floats) -> Floats:
+    return of[0] + of[1] * depth_mm + of[2] * depth_mm**2
+
+
+def sampling(path: Floats) -> tuple[Floats, Floats]:
+    """How nodes at most `STEP_MM` apart, corners included, follow from an (N, 4) path with its landing and its lift.
+
+    Returns shares of the path's points, (M, N), and factors on the depth, (M,): from 0 to 1 while the brush lands on
+    the first point, from 1 to 0 while it lifts from the last.
+    """
+    each = np.eye(len(path))
+    corners = [each[0], *each, each[-1]]
+    down = [0.0, *np.ones(len(path)), 0.0]
+    steps_mm = [path[0, 2], *np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1), path[-1, 2]]
+    shares, factors = [each[:1]], [np.zeros(1)]
+    for k, step_mm in enumerate(steps_mm):
+        at = np.linspace(0.0, 1.0, max(1, math.ceil(step_mm / STEP_MM)) + 1)[1:]
+        shares.append(corners[k] + at[:, None] * (corners[k + 1] - corners[k]))
+        factors.append(down[k] + at * (down[k + 1] - down[k]))
+    return np.concatenate(shares), np.concatenate(factors)
+
+
+def sampled(path: Floats) -> Floats:
+    """(N, 4) path -> (M, 4) nodes from depth 0 back to depth 0, at most `STEP_MM` apart, corners included."""
+    shares, down = sampling(path)
+    nodes = shares @ path
+    nodes[:, 2] *= down
+    return nodes
 
 
 def marks(paths: Sequence[Floats], values: Floats) -> Marks:
     """The footprints along sampled paths, each (M, 4) of x, y, depth, heading in deg.
 
-    `values` are those of one footprint, (23,), or of one for each path, (paths, 23).
+    `values` are those of one footprint, (28,), or of one for each path, (paths, 28).
     """
     from model import footprint_kernel  # numba takes a fifth of a second to import
 

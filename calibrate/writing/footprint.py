@@ -38,7 +38,9 @@ class FootprintArtefact(SessionFit):
     @model_validator(mode="after")
     def _whole(self) -> Self:
         if set(self.values) != set(NAMES):
-            raise ValueError(f"values: expected {', '.join(NAMES)}")
+            raise ValueError(
+                f"values: expected the {len(NAMES)} of this version; fit the session again with `brushloop write fit`"
+            )
         return self
 
 

@@ -31,7 +31,7 @@ from model.characters.brush import Reach
 from model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
 from model.characters.phases import Phase, phase_map
 from model.characters.plan import grid, without_tilt
-from model.footprint import Footprint, fit_each, fit_footprint
+from model.footprint import NAMES, Footprint, fit_each, fit_footprint
 
 Floats = NDArray[np.float64]
 MOST_MM = 1.5
@@ -94,10 +94,8 @@ def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:
     groups = np.cumsum([0, *(len(one) for one in strokes)])
     ink = np.stack([captured[figure.name] for figure in plan.figures])
     x_mm, y_mm = grid(plan.cell_mm, ink.shape[1])
-    try:
-        start = None if known is None else Footprint(known)
-    except ValueError as error:
-        raise CalibrationError("plan.json", f"planned_by.footprint: {error}") from None
+    # a plan of an earlier version holds the values of another model of the footprint: the fit begins afresh
+    start = None if known is None or len(known) != len(NAMES) else Footprint(known)
     return fit_footprint([path for one in strokes for path in one], groups, ink, x_mm, y_mm, start)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from model.characters.ink import Image
 from model.characters.plan import Path, directions, grid, tangents, without_tilt
 from model.damped import Equations, descend
 from model.drag import distances, ink
-from model.footprint import Footprint, Marks, ink_equations, inked, marks, sampled
+from model.footprint import Footprint, Marks, ink_equations, inked, marks, sampled, sampling
 
 Floats = NDArray[np.float64]
 UNITS = np.array([0.3, 0.3, 0.5, 10.0])
@@ -27,6 +28,9 @@ BENT = 0.015
 """Cost of a squared second difference along a stroke, in these units: keeps the path calm where ink tells nothing."""
 FIRST_SPREADS_MM, LATER_SPREADS_MM = (1.5, 0.8, 0.4, 0.2), (0.8, 0.4, 0.2)
 ROUNDS = 60
+PLUNGE = 2.0
+"""Greatest change of depth per mm of a led path: more than that of `Reach`, since the footprint knows how the brush
+lands straight down and lifts straight up. Corners and ends need it."""
 GAIN = 5e-4
 """Smallest share by which a step must lower the cost for another one to be made."""
 
@@ -35,6 +39,7 @@ def first_lead(
     paths: Sequence[Path], footprint: Footprint, reach: Reach, side_mm: float, tilt_deg: float
 ) -> list[Floats]:
     """Trajectories (N, 5) with the depth of each width, whose tip is one lag ahead along the stroke."""
+    reach = replace(reach, plunge=PLUNGE)
     depths = np.linspace(*reach.height_mm, 64)
     halves = np.maximum.accumulate(footprint.half_width_mm(depths))
     out: list[Floats] = []
@@ -65,7 +70,7 @@ def lead(
     is the cost of the squared change of each variable, in `UNITS`: what was measured along one path holds only near
     it. Points stay `Reach.apart_mm` apart.
     """
-    problem = _Problem(footprints, strokes, wanted, side_mm, reach, added_mm, held)
+    problem = _Problem(footprints, strokes, wanted, side_mm, replace(reach, plunge=PLUNGE), added_mm, held)
     vector = problem.vector(strokes)
     for spread_mm in spreads_mm:
         vector = descend(
@@ -140,12 +145,12 @@ class _Problem:
         slopes = np.zeros((len(made.discs), 3, len(vector)))
         row = 0
         for number, path in enumerate(paths):
-            nodes, shares = sampled(path), sampled(np.eye(len(path)), path)
+            nodes, (shares, down) = sampled(path), sampling(path)
             base = marks([nodes], self._values[number]).discs
             for point in range(len(path)):
                 for column in range(4 if point == 0 else 3):
                     moved = nodes.copy()
-                    moved[:, column] += 1e-3 * UNITS[column] * shares[:, point]
+                    moved[:, column] += 1e-3 * UNITS[column] * shares[:, point] * (down if column == 2 else 1.0)
                     changed = marks([moved], self._values[number]).discs
                     at = 4 * (self._ends[number] + point) + column
                     slopes[row : row + len(base), :, at] = (changed - base) / 1e-3

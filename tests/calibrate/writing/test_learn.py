@@ -34,7 +34,7 @@ def brush_of(**changed: float) -> Footprint:
 
 
 PLANNED = brush_of()
-TRUE = brush_of(half_mm_2=-0.1, leash_mm_2=1.2, drift_across_mm=0.6)
+TRUE = brush_of(half_mm_2=-0.1, leash_mm=1.2, across_mm=0.6)
 """The brush that writes: thinner, farther behind and farther to the left than the one that the plan knows."""
 
 
@@ -82,7 +82,7 @@ def test_a_round_brings_the_ink_to_where_it_was_wanted(plan: PlanRecord, after: 
     assert arrays(after.figures[0].commanded)[0][:, 1].mean() < arrays(plan.figures[0].commanded)[0][:, 1].mean() - 0.3
     # What the plan knows of the brush is what the ink showed.
     assert after.planned_by.footprint is not None
-    drift = dict(zip(NAMES, after.planned_by.footprint, strict=True))["drift_across_mm"]
+    drift = dict(zip(NAMES, after.planned_by.footprint, strict=True))["across_mm"]
     assert drift == pytest.approx(0.6, abs=0.3)
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from model.characters.brush import Reach
 from model.characters.ink import swept
-from model.characters.lead import covered, drawn, first_lead, lead
+from model.characters.lead import PLUNGE, covered, drawn, first_lead, lead
 from model.characters.phases import Phase, phase_map, phases_of
 from model.characters.plan import Path
-from model.footprint import NAMES, Footprint, fit_each, fit_footprint, inked, sampled
+from model.footprint import NAMES, START, Footprint, fit_each, fit_footprint, inked, marks, sampled
 
 SIDE_MM, SIZE_PX = 48.0, 96
 HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])
@@ -43,7 +43,7 @@ def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
 
 def test_a_footprint_is_found_again_from_its_ink() -> None:
     true = Footprint(
-        tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "leash_mm_2": 3.0, "half_mm_2": 0.9}.values())
+        tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "leash_mm": 2.0, "half_mm_2": 0.9}.values())
     )
     x_mm = (np.arange(64) + 0.5) * SIDE_MM / 64
     y_mm = SIDE_MM - x_mm
@@ -61,7 +61,7 @@ def test_a_footprint_is_found_again_from_its_ink() -> None:
     assert wrong(found) < 0.4 * wrong(Footprint())
     with pytest.raises(ValueError, match="not alike"):
         fit_footprint(paths[:2], np.arange(4), ink, x_mm, y_mm)
-    with pytest.raises(ValueError, match="a footprint has 23 finite values, got 2"):
+    with pytest.raises(ValueError, match="a footprint has 28 finite values, got 2"):
         Footprint((1.0, 2.0))
 
 
@@ -90,12 +90,41 @@ def test_each_stroke_has_a_footprint_of_its_own() -> None:
     assert np.count_nonzero((inked([upper, lower], paths, x_mm, y_mm) > 0.0) != (ink[0] > 0.5)) < 40
 
 
-def test_a_path_is_sampled_densely_and_keeps_its_corners() -> None:
+def test_a_path_is_sampled_densely_from_its_landing_to_its_lift() -> None:
     path = np.array([[0.0, 0.0, 1.0, 0.0], [3.0, 0.0, 1.0, 0.0], [3.0, 4.0, 2.0, 90.0]])
     dense = sampled(path)
     assert np.linalg.norm(np.diff(dense[:, :3], axis=0), axis=1).max() <= 0.5
     assert all((dense == corner).all(axis=1).any() for corner in path)
-    assert len(sampled(2.0 * path, like=path)) == len(dense)
+    assert dense[0].tolist() == [0.0, 0.0, 0.0, 0.0]
+    assert dense[-1].tolist() == [3.0, 4.0, 0.0, 90.0]
+
+
+def test_a_brush_that_lifts_marks_ahead_of_where_it_was_dragged_to() -> None:
+    path = np.array([[14.0, 24.0, 8.0, 0.0], [34.0, 24.0, 8.0, 0.0]])
+    dragged, lifted = (marks([nodes], np.array(START)).discs for nodes in (path, sampled(path)))
+    assert dragged[-2, 0] == pytest.approx(34.0 - float(Footprint().lag_mm(np.array([8.0]))[0]))
+    assert lifted[-2, 0] == pytest.approx(34.0 - float(Footprint().lag_mm(np.array([0.0]))[0]))
+
+
+def test_a_footprint_swings_round_behind_a_corner() -> None:
+    path = np.array([[14.0, 24.0, 4.0, 0.0], [24.0, 24.0, 4.0, 0.0], [24.0, 34.0, 4.0, 0.0]])
+    discs = marks([sampled(path)], np.array(START)).discs.reshape(-1, 3, 3)
+    along = discs[:, 0, :2] - discs[:, 2, :2]
+    heading = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
+    assert heading[0] == pytest.approx(0.0, abs=1e-6)
+    assert heading[-1] == pytest.approx(90.0, abs=10.0)
+    assert np.count_nonzero((heading > 20.0) & (heading < 70.0)) > 1
+    assert np.all(np.diff(heading) > -1e-9)
+
+
+def test_a_led_path_is_as_steep_as_it_may_be_and_no_steeper() -> None:
+    path = hook()
+    short = Path(path.points, np.where(np.arange(len(path.points)) % 4 == 0, 3.0, 0.5))
+    wanted = swept([short], SIDE_MM, SIZE_PX)
+    [led] = first_lead([short], Footprint(), Reach(), SIDE_MM, 5.0)
+    [led] = lead([Footprint()], [led], wanted, SIDE_MM, Reach(), rounds=3)
+    slope = np.abs(np.diff(led[:, 2])) / np.linalg.norm(np.diff(led[:, :2], axis=0), axis=1)
+    assert Reach().plunge < slope.max() <= PLUNGE + 0.01
 
 
 def test_a_stroke_is_divided_into_phases() -> None:
