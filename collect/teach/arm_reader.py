@@ -61,10 +61,10 @@ class Address:
         host, _, port = text.strip().partition(":")
         if not host or any(c.isspace() for c in host):
             raise ValueError(f"{text!r} is not an address like 192.0.2.7 or 192.0.2.7:30004")
-        number = int(port) if port else 30004
-        if not 1 <= number <= 65535:
-            raise ValueError(f"port {number} is outside 1 to 65535")
-        return cls(host, number)
+        port = port or "30004"
+        if not (port.isdecimal() and len(port) <= 5 and 1 <= int(port) <= 65535):
+            raise ValueError(f"port {port!r} is not a number from 1 to 65535")
+        return cls(host, int(port))
 
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"

@@ -144,7 +144,9 @@ def _in_lines(error: Refused) -> tuple[str, ...]:
         case CannotTeach():
             return error.what, error.way_out
         case DeviceError():
-            return f"{error.device}: {error.op}: {error.what}", error.remedy or "Check power, cable and address."
+            # With the notes: one of them may say that the arm was not seen at rest.
+            state = (f"{error.device}: {error.op}: {error.what}.", error.condition, *getattr(error, "__notes__", []))
+            return " ".join(filter(None, state)), error.remedy or "Check power, cable and address."
         case _:
             return (str(error),)
 

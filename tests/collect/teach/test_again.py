@@ -13,16 +13,23 @@ from collect.teach.steps.camera import CameraStep
 from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from collect.teach.wizard import Wizard
 from drivers.clock import HostClock
+from drivers.errors import DeviceTimeout
 
 
 class Leaving:
     """A person who leaves at the first question."""
 
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
     async def overview(self, steps: tuple[StepState, ...]) -> None:
         pass
 
     async def show(self, what: Shown) -> None:
-        pass
+        self.shown += what.lines
+
+    async def choose(self, *_: object) -> str:
+        raise LeftOff
 
     async def number(self, *_: object) -> float:
         raise LeftOff
@@ -40,3 +47,21 @@ async def test_a_step_that_is_taught_again_stays_open_until_it_is_done(tmp_path:
         await Wizard(day, (CameraStep(),)).again("camera")
     assert set(day.notebook.done) == {"arm"}
     assert day.notebook.values == {}
+
+
+async def test_a_step_that_failed_says_in_what_state_the_arm_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def silent(*_: object) -> None:
+        error = DeviceTimeout("robot", "moveLine", "no reply in 1 s", condition="A stop was sent to the arm.")
+        error.add_note("The arm may still be moving.")
+        raise error
+
+    monkeypatch.setattr(CameraStep, "teach", silent)
+    person = Leaving()
+    day = Day(person, tmp_path / "rig.toml", HostClock(), armed=True)  # type: ignore[arg-type]
+    with pytest.raises(CollectAborted):
+        await Wizard(day, (CameraStep(),)).run()
+    assert person.shown[0] == (
+        "robot: moveLine: no reply in 1 s. A stop was sent to the arm. The arm may still be moving."
+    )

@@ -13,6 +13,12 @@ from drivers.sim.config import SimConfig
 from drivers.sim.world import World
 
 
+@pytest.mark.parametrize("port", ["x", "0", "65536", "-1", "9" * 5000])
+def test_a_port_is_a_number_in_the_range_of_ports(port: str) -> None:
+    with pytest.raises(ValueError, match="is not a number from 1 to 65535"):
+        Address.of(f"192.0.2.7:{port}")
+
+
 @pytest.mark.parametrize(
     ("getter", "answer"),
     [
