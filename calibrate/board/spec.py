@@ -11,6 +11,7 @@ from calibrate.artefact import Frozen
 from calibrate.errors import CalibrationError
 
 Corners = Annotated[int, Field(ge=3, le=60)]
+Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 
 class BoardSpec(Frozen):
@@ -21,7 +22,7 @@ class BoardSpec(Frozen):
     square_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
     marker_mm: Annotated[float, Field(gt=0.0, le=1000.0)]
     dictionary: Annotated[str, Field(pattern=r"^DICT_[0-9A-Z_]+$")] = "DICT_5X5_1000"
-    origin_mm: tuple[Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]]
+    origin_mm: tuple[Place, Place]
     """Lower left corner of the board, in the paper frame."""
 
     @model_validator(mode="after")

@@ -54,6 +54,7 @@ def test_the_rig_that_the_simulator_writes_is_valid(tmp_path: Path) -> None:
         ),
         ("touch_z_mm = 120.030", "touch_z_mm = nan", r"paper.touch_z_mm: .*finite"),
         ("touch_z_mm = 120.030", "touch_z_mm = 1e300", r"paper.touch_z_mm: .*less than or equal to 1000000.*1e\+300"),
+        ("origin_mm = [-34.0, -34.0]", "origin_mm = [1e300, 0]", r"board.origin_mm.0: .*to 1000000.*1e\+300"),
         ("origin_mm = [460.0, -110.0]", "origin_mm = [-1e300, 0]", r"paper.origin_mm.0: .*to -1000000.*1e\+300"),
         ("touch_z_mm = 120.030", "", r"paper.touch_z_mm: Field required"),
         ("x_mm = [200.0, 640.0]", "x_mm = [640.0, 200.0]", r"robot.limits: .*x_mm = \[640.0, 200.0\]"),
