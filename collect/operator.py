@@ -69,11 +69,11 @@ class Asker:
 
     async def ask(self, prompt: Prompt) -> str:
         """Return the key of the answer. Raises `NeedsOperator` if nobody can answer."""
-        if not self._watched:
-            raise NeedsOperator(prompt.question)
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[str] = loop.create_future()
         with self._lock:
+            if not self._watched:
+                raise NeedsOperator(prompt.question)
             self._count += 1
             self._open = (replace(prompt, number=self._count), loop, answered)
         try:
