@@ -58,7 +58,9 @@ class BrushStep(Step):
         kind = await day.guide.choose("What keeps the ink well filled?", (NONE, STATION, PUMP), NONE.key)
         config: InkDeviceConfig | None = None
         if kind != NONE.key:
-            port = await day.guide.text("Its serial line, such as /dev/ttyUSB0", "")
+            port = (await day.guide.text("Its serial line, such as /dev/ttyUSB0", "")).strip()
+            if not port:
+                raise CannotTeach("no serial line was named.", "Type its path; `ls /dev/tty*` lists what there is.")
             config = await self._device(day, kind, port)
         name = await day.guide.text("Name of the ink, for the record", "ink")
         with day.together():
