@@ -46,6 +46,8 @@ FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
 STILL_S, PATIENCE_S = 0.1, 20.0
+MOST_CHARACTERS = 100
+"""Of a name that a cabinet reports; the notebook has no room for more than a few of these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +158,12 @@ class ArmReader:
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
         return Cabinet(
             framing,
-            str(await self.ask("RobotConfig.getRobotType")),
-            str(await self.ask("RobotConfig.getControlBoxType")),
-            await self._firmware(version),
-            str(await self.ask("RobotState.getRobotModeType")),
-            str(await self.ask("RobotState.getSafetyModeType")),
-            str(await self.ask("RobotManage.getOperationalMode")),
+            _name(await self.ask("RobotConfig.getRobotType")),
+            _name(await self.ask("RobotConfig.getControlBoxType")),
+            _name(await self._firmware(version)),
+            _name(await self.ask("RobotState.getRobotModeType")),
+            _name(await self.ask("RobotState.getSafetyModeType")),
+            _name(await self.ask("RobotManage.getOperationalMode")),
             (*(1e3 * v for v in tool[:3]), *(math.degrees(v) for v in tool[3:])),
             payload_kg,
             cog_mm,
@@ -172,6 +174,10 @@ class ArmReader:
         with contextlib.suppress(RpcError):
             return f"interface {version}, {await self._connection.call('SystemInfo.getControlSoftwareFullVersion')}"
         return f"interface {version}"
+
+
+def _name(answer: object) -> str:
+    return str(answer)[:MOST_CHARACTERS]
 
 
 @contextlib.asynccontextmanager

@@ -24,5 +24,5 @@ class Enter:
 
 async def test_an_ink_device_without_a_serial_line_is_refused_with_the_way_out(tmp_path: Path) -> None:
     day = Day(Enter(), tmp_path / "rig.toml", HostClock(), armed=False)  # type: ignore[arg-type]
-    with pytest.raises(CannotTeach, match="no serial line was named. Type its path"):
+    with pytest.raises(CannotTeach, match=r"no serial line was named\. Type its path"):
         await BrushStep()._ink(day)
