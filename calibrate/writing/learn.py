@@ -7,8 +7,7 @@ where they are, since the miss was measured there. This is iterative learning co
 learning filter (D. A. Bristow, M. Tharayil, A. G. Alleyne, IEEE Control Systems 26(3), 2006), applied to the picture
 of the ink as by Mueller et al., IROS 2013.
 
-A character whose last round was no better than the best one is corrected from the best one again, by half
-as much. If that does not help either, it goes back to the best and is settled.
+A character whose last round was no better than the best one goes back to the best and is settled.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ FINER = 4
 LEAST_GAIN_PERCENT = 0.2
 """A round that gains less CSIM than this has not helped: two writings of one plan differ by about as much."""
 WORSE = 0.5
-"""Factor on the correction after a round that has not helped, and once more in each phase that became worse."""
+"""Factor on the correction in each phase that became worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +71,9 @@ def learned(written: WritingComparison, gain: float = 0.7) -> tuple[PlanRecord, 
     lessons: list[Lesson] = []
     for figure in plan.figures:
         found = round_of(figure, writings[figure.name], plan.cell_mm)
-        after = _after(figure, found, captured[figure.name])
+        after = _after(figure, found)
         if not after.settled:
-            after = _corrected(after, footprint, reach, plan.cell_mm, gain)
+            after = _corrected(after, captured[figure.name], footprint, reach, plan.cell_mm, gain)
         figures.append(after)
         lessons.append(Lesson(figure.name, found, after.settled))
     by = plan.planned_by.model_copy(update={"footprint": footprint.values})
@@ -99,16 +98,14 @@ def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:
     return fit_footprint([path for one in strokes for path in one], groups, ink, x_mm, y_mm, start)
 
 
-def _after(figure: FigureRecord, found: Round, ink: Image) -> FigureRecord:
-    """The figure with its round added, back at its best; settled if two rounds in succession have not helped."""
+def _after(figure: FigureRecord, found: Round) -> FigureRecord:
+    """The figure with its round added, back at its best; settled if the round has not helped."""
     before = max((one.csim_percent for one in figure.rounds), default=float("-inf"))
-    better = found.csim_percent > before or not figure.best
-    best = figure.commanded if better else figure.best
+    best = figure.commanded if found.csim_percent > before or not figure.best else figure.best
     rounds = (*figure.rounds, found)
-    known = better or bool(figure.best_png)  # older plans hold no ink of the best round: nothing to correct it by
-    settled = figure.settled or (not _helped(rounds) and (not known or not _helped(rounds[:-1])))
+    settled = figure.settled or not _helped(rounds)
     update = {"rounds": rounds, "best": best, "settled": settled, "commanded": best, "intended": best}
-    return figure.model_copy(update=update | ({"best_png": encoded(ink)} if better else {}))
+    return figure.model_copy(update=update)
 
 
 def _helped(rounds: Sequence[Round]) -> bool:
@@ -117,8 +114,10 @@ def _helped(rounds: Sequence[Round]) -> bool:
     return last >= max(before, default=float("-inf")) + LEAST_GAIN_PERCENT
 
 
-def _corrected(figure: FigureRecord, footprint: Footprint, reach: Reach, side_mm: float, gain: float) -> FigureRecord:
-    commanded, ink = arrays(figure.best), figure.best_ink()
+def _corrected(
+    figure: FigureRecord, ink: Image, footprint: Footprint, reach: Reach, side_mm: float, gain: float
+) -> FigureRecord:
+    commanded = arrays(figure.commanded)
     size_px = len(ink)
     paths, groups = [without_tilt(points) for points in commanded], np.array([0, len(commanded)])
     footprints = fit_each(paths, groups, ink[None], *grid(side_mm, size_px), footprint)
@@ -152,12 +151,12 @@ def missed(ink: Image, predicted_mm: Floats, side_mm: float) -> Floats:
 
 
 def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
-    """A factor on the correction of each pixel: less after a round that has not helped, and in phases made worse."""
-    factors = np.full(len(Phase), 1.0 if _helped(figure.rounds) else WORSE)
+    """A factor on the correction of each pixel: less in phases that the last round made worse."""
     if len(figure.rounds) < 2 or not figure.medians:
-        return np.full((size_px, size_px), factors[0])
+        return np.ones((size_px, size_px))
+    factors = np.ones(len(Phase))
     before, now = figure.rounds[-2].lost_percent, figure.rounds[-1].lost_percent
     for k, phase in enumerate(Phase):
         if now.get(phase, 0.0) > before.get(phase, 0.0):
-            factors[k] *= WORSE
+            factors[k] = WORSE
     return factors[phase_map(ways_of(figure), side_mm, size_px)]

@@ -86,7 +86,7 @@ class FigureRecord(BaseModel):
     best: Points = ()
     """What was commanded in the best of them."""
     best_png: Text = ""
-    """The mean ink of that round, as `wanted_png`; empty in older plans."""
+    """Written by an earlier version, and not used."""
     settled: bool = False
     """Whether a further round is not expected to help: `commanded` is then the best that was written."""
 
@@ -102,10 +102,6 @@ class FigureRecord(BaseModel):
     def simulated(self) -> Image:
         """(128, 128) ink from 0 to 1 as the planning model draws it. Raises `CalibrationError`."""
         return _decoded(self.simulated_png, f"{self.name}: simulated_png")
-
-    def best_ink(self) -> Image:
-        """(128, 128) mean ink of the best round from 0 to 1. Raises `CalibrationError`."""
-        return _decoded(self.best_png, f"{self.name}: best_png")
 
 
 class PlanRecord(BaseModel):

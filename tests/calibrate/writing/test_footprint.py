@@ -10,7 +10,7 @@ import pytest
 from calibrate.drags.captures import Drawn
 from calibrate.errors import CalibrationError
 from calibrate.writing import footprint
-from calibrate.writing.footprint import FOLDER, fit_session, load_footprint
+from calibrate.writing.footprint import FOLDER, FootprintArtefact, fit_session, load_footprint
 from calibrate.writing.practice import FIGURES, MARGIN, practice_strokes, write_practice
 from collect.protocols.config import load_protocol
 from collect.protocols.write import WriteConfig
@@ -59,6 +59,9 @@ def test_a_session_of_practice_becomes_a_footprint(tmp_path: Path, monkeypatch: 
     assert made.source == "loopback rig"
     assert made.strokes == 4
     assert made.csim_percent > 95.0
+    older = made.model_dump() | {"values": {"drift_along_mm": 0.0}}
+    with pytest.raises(ValueError, match="fit the session again with `brushloop write fit`"):
+        FootprintArtefact.model_validate(older)
     monkeypatch.setattr(footprint, "read_drags", lambda *_, **__: drawn(1))
     with pytest.raises(CalibrationError, match="holds 2 strokes, at least 3 are needed"):
         fit_session(tmp_path)
