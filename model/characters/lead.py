@@ -28,7 +28,7 @@ BENT = 0.015
 """Cost of a squared second difference along a stroke, in these units: keeps the path calm where ink tells nothing."""
 FIRST_SPREADS_MM, LATER_SPREADS_MM = (1.5, 0.8, 0.4, 0.2), (0.8, 0.4, 0.2)
 ROUNDS = 60
-PLUNGE = 2.0
+PLUNGE = 3.0
 """Greatest change of depth per mm of a led path: more than that of `Reach`, since the footprint knows how the brush
 lands straight down and lifts straight up. Corners and ends need it."""
 GAIN = 5e-4
