@@ -117,14 +117,12 @@ def test_a_footprint_swings_round_behind_a_corner() -> None:
     assert np.all(np.diff(heading) > -1e-9)
 
 
-def test_a_led_path_is_as_steep_as_it_may_be_and_no_steeper() -> None:
+def test_a_led_path_may_be_steeper_than_one_of_presses() -> None:
     path = hook()
-    short = Path(path.points, np.where(np.arange(len(path.points)) % 4 == 0, 3.0, 0.5))
-    wanted = swept([short], SIDE_MM, SIZE_PX)
-    [led] = first_lead([short], Footprint(), Reach(), SIDE_MM, 5.0)
-    [led] = lead([Footprint()], [led], wanted, SIDE_MM, Reach(), rounds=3)
+    uneven = Path(path.points, np.where(np.arange(len(path.points)) % 4 == 0, 3.0, 0.5))
+    [led] = first_lead([uneven], Footprint(), Reach(), SIDE_MM, 5.0)
     slope = np.abs(np.diff(led[:, 2])) / np.linalg.norm(np.diff(led[:, :2], axis=0), axis=1)
-    assert Reach().plunge < slope.max() <= PLUNGE + 0.01
+    assert Reach().plunge < slope.max() <= PLUNGE + 1e-9
 
 
 def test_a_stroke_is_divided_into_phases() -> None:
