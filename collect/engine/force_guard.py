@@ -62,7 +62,7 @@ class ForceGuard:
         try:
             await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
             if watch.done():
-                # Stop the arm first; how the procedure ends then no longer matters.
+                work.cancel()  # or it would send its next line while the arm is being stopped
                 await self._rig.robot.stop()
                 watch.result()
             return await work

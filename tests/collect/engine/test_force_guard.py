@@ -1,0 +1,54 @@
+"""The force ceiling: what is under way ends with the stop, and nothing is sent after it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from collect.engine.force_guard import ForceGuard
+from collect.errors import ForceTooHigh
+from drivers.samples import ForceSample, Stamp
+
+
+class Cell:
+    """An arm whose lines end at once and whose stops take a while, and a sensor that a test speaks for."""
+
+    def __init__(self) -> None:
+        self.did: list[str] = []
+        self.say: Callable[[ForceSample], None] = lambda _: None
+
+    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
+        self.say = on_sample or (lambda _: None)
+
+    def latest_n(self) -> tuple[float, float, float]:
+        return 0.0, 0.0, 0.0
+
+    async def move(self) -> None:
+        self.did.append("line")
+        await asyncio.sleep(0.0)
+
+    async def stop(self) -> None:
+        self.did.append("stop")
+        await asyncio.sleep(0.05)
+        self.did.append("at rest")
+
+
+async def test_no_line_is_sent_after_the_stop_for_too_much_force() -> None:
+    cell = Cell()
+    rig: Any = SimpleNamespace(robot=cell, force=cell, config=SimpleNamespace(force=SimpleNamespace(max_n=5.0)))
+    guard = ForceGuard(rig)
+    guard.listen()
+
+    async def down_step_by_step() -> None:
+        while True:
+            await cell.move()
+            if len(cell.did) == 3:
+                cell.say(ForceSample(Stamp(1), (0.0, 0.0, 6.0), (0.0, 0.0, 0.0)))
+
+    with pytest.raises(ForceTooHigh, match=r"reached 6\.00 N"):
+        await guard.guarded(down_step_by_step())
+    assert cell.did[cell.did.index("stop") :] == ["stop", "at rest"]
