@@ -152,13 +152,17 @@ class Run:
     async def _touch_again(self, step: Step) -> None:
         """Zero touch by jog between two strokes; if it fails, the plane stays as it was."""
         touch = Step(StepKind.ZERO_TOUCH, step.index + 1, {"method": "jog", "between_strokes": True})
+        released = False
         try:
             await self.performer.perform(touch)
-        except StepError as error:
+        except (StepError, DeviceError) as error:
             self.context.progress.log(
                 f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True
             )
-        await self._once_arm_is_free(self._recover)
+            if arm_at_fault(error):
+                await self._ask(error)
+                released = isinstance(error, MotionError)
+        await self._once_arm_is_free(self._recover, released=released)
 
     async def _ask_about(self, step: Step, result: Result) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""

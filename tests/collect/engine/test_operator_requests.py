@@ -9,9 +9,12 @@ import pytest
 
 from collect.engine.control import State
 from collect.engine.engine import Engine
+from collect.engine.perform import Performer
 from collect.engine.snapshot import Mark
-from collect.errors import CollectAborted, NeedsOperator, Parked
+from collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
 from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
+from collect.protocols.steps import Result, Step
+from drivers.errors import DeviceTimeout
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
 from sessions.remarks import mark_bad_or_good
@@ -172,6 +175,43 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     assert any("the paper lies +1." in line for line in engine.snapshot().messages)
     methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
     assert methods == ["taught", "jog"]
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    """Zero touch between strokes ends with this error."""
+    perform = Performer.perform
+
+    async def performed(self: Performer, step: Step) -> Result:
+        if step.params.get("between_strokes"):
+            raise error
+        return await perform(self, step)
+
+    monkeypatch.setattr(Performer, "perform", performed)
+
+
+def test_too_much_force_in_a_jog_between_strokes_is_looked_at_before_the_arm_moves(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    failing(monkeypatch, ForceTooHigh(6.0, 5.0))
+    engine = lab.engine(watched=True)
+    engine.request(OperatorRequest.JOG)
+    engine.start()
+    answer(engine, "the force reached 6.00 N", "g")
+    wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 1
+
+
+def test_a_sensor_that_falls_silent_in_a_jog_between_strokes_leaves_the_paper_where_it_was(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    failing(monkeypatch, DeviceTimeout("force", "latest", "no sample"))
+    engine = lab.engine(watched=True)
+    engine.request(OperatorRequest.JOG)
+    engine.start()
+    wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 1
 
 
 def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_where_it_was(lab: Lab) -> None:
