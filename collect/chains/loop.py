@@ -19,6 +19,7 @@ from collect.chains.commands import Say, collected_session, run_command
 from collect.engine.open_or_resume import check_fresh_sheet
 from collect.errors import ConfigError
 from collect.rig.config import RigConfig, load_rig
+from collect.rig.config_file import read_text
 from sessions.reader import Recording
 from sessions.recording.schemas import BareName, Header
 
@@ -113,7 +114,7 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, 
 
 def check_recovered(path: Path) -> None:
     """Refuse presses recovered with a model that does not fit this brush."""
-    rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_CSV_BYTES).decode("utf-8"))))
+    rows = list(csv.DictReader(io.StringIO(read_text(path, MAX_CSV_BYTES))))
     bound = sum("at_bound" in (row.get("flags") or "") for row in rows)
     if 2 * bound > len(rows):
         share = f"{bound} of {len(rows)} presses were recovered at a bound of the range"
