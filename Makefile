@@ -30,7 +30,7 @@ test: $(STAMP)-dev  ## lint, layers, types, and the tests; types are checked bes
 
 # Bytecode is kept, whatever the shell says: workers and the processes that tests start compile each module once.
 suite: $(STAMP)-dev
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 6 --dist loadgroup
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 6 --dist loadgroup --no-loadscope-reorder
 
 lint: $(STAMP)-dev
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import io
 import json
@@ -38,16 +39,21 @@ def render(template: str, **values: Any) -> str:
 
     Names, licences and origins come from other people's files, so everything is escaped.
     """
+    return _templates().get_template(template).render(**values)
+
+
+@functools.cache
+def _templates() -> Any:
+    """The templates; each is compiled once in a process."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
+    return Environment(
         loader=PackageLoader("calibrate"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(**values)
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -172,10 +178,12 @@ def printable(text: str) -> str:
 def plot_uri(figure: Any) -> str:
     """A figure of `plot` as an SVG data URI; the same figure gives the same bytes."""
     import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    buffer = io.BytesIO()
+    buffer, canvas = io.BytesIO(), cast("Any", FigureCanvasSVG(figure))
     with matplotlib.rc_context({"svg.hashsalt": "brushloop"}):  # pyright: ignore[reportUnknownMemberType]
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        # Not `savefig`, which lays out and draws every figure twice.
+        canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
@@ -202,7 +210,7 @@ def show_picture(axis: Any, image: Image, title: str, *, fontsize: int, **option
 
 def save_picture(figure: Any, path: Path) -> None:
     """Write a figure of `picture_grid` as PNG. Raises OSError."""
-    figure.savefig(path, format="png", metadata={"Software": None})
+    figure.canvas.print_png(path, metadata={"Software": None})  # `savefig` would lay it out and draw it twice
 
 
 class Sealed(Frozen):

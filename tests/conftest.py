@@ -35,24 +35,32 @@ typer.main.get_command = typer.testing._get_command = functools.cache(typer.main
 TOLERATED = ("asyncio_", "pytest_timeout", "ThreadPoolExecutor", "tqdm", "fsspecIO")
 """Pools that live as long as their loop or process; nothing of ours is called that."""
 
-LONGEST = (
+FIRST = (
     "tests/test_demo.py",
     "tests/collect/tui/test_session.py",
-    "tests/collect/quality",
-    "tests/calibrate/validate",
-    "tests/calibrate/compare",
-    "tests/calibrate/invert",
+    "tests/collect/quality/test_recognised.py",
     "tests/calibrate/fit",
+    "tests/model/train",
+    "tests/calibrate/drags",
+    "tests/collect/teach/test_first_day.py",
+    "tests/calibrate/validate/test_cluster.py",
+    "tests/calibrate/",
+    "tests/model/",
     "tests/collect/durability",
     "tests/collect/faults",
+    "tests/contract",
+    "tests/drivers/arcs",
+    "tests/drivers/ink",
+    "tests/drivers/force",
+    "tests/drivers/sim/faults",
     "tests/collect/test_soak.py",
-    "tests/model",
-    "tests/contract/test_rig_option.py",
     "tests/sessions/test_kill.py",
     "tests/sessions/test_repair_everywhere.py",
     "tests/test_bench.py",
+    "tests/collect/",
 )
-"""They come first, so that no worker is left alone with one of them at the end."""
+"""The order of the suite. The longest tests begin first, so that no worker is left alone with one of them at the end.
+Those that mostly wait run while a worker computes a whole folder (`TOGETHER`); short ones come last, by folder."""
 
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
@@ -61,18 +69,26 @@ TOGETHER = {
     "tests/calibrate/fit/": "comparing",
     "tests/calibrate/loop/": "comparing",
     "tests/calibrate/writing/": "comparing",
+    "tests/calibrate/drags/": "drags",
+    "tests/calibrate/test_pages.py": "pages",
+    "tests/calibrate/test_apply.py": "pages",
+    "tests/calibrate/board/test_lens_in_session.py": "lens",
     "tests/model/": "model",
 }
-"""What one worker runs: its first test imports and compiles for ten seconds, which the others then do without."""
+"""What one worker runs: its first test imports, compiles or records for seconds, which the others then do without."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))  # stable: otherwise the order stays
+    items.sort(key=_place)  # stable: otherwise the order stays
     for item in items:
         for folder, group in TOGETHER.items():
             if item.nodeid.startswith(folder) and item.get_closest_marker("xdist_group") is None:
                 item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _place(item: pytest.Item) -> int:
+    return next((place for place, start in enumerate(FIRST) if item.nodeid.startswith(start)), len(FIRST))
 
 
 @pytest.hookimpl(trylast=True)

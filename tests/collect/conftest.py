@@ -26,7 +26,7 @@ from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S
 
 OPTIONS = ("--out", "--config", "--protocol")
-SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=25.0)
+SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=15.0)
 SMALL_TABLE = Table(
     sheet_mm=(110.0, 80.0),
     board_origin_mm=(-20.0, -20.0),
@@ -128,7 +128,7 @@ class Lab:
 @contextmanager
 def coarse(folder: Path) -> Iterator[Lab]:
     """A camera too coarse to judge ink by, and two strokes."""
-    with serving(SimConfig(rate=60.0, view=SMALL_VIEW)) as rig:
+    with serving(SimConfig(rate=60.0, view=SMALL_VIEW, force_hz=100.0)) as rig:
         made = Lab(rig, folder)
         text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
         text += "\n[quality]\nenabled = false\n"

@@ -23,7 +23,7 @@ VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=5.0)
 
 async def serve(path: Path, rate: float) -> None:
     """Write rig.toml, say so, and serve until the input ends."""
-    async with LoopbackRig(SimConfig(rate=rate, view=VIEW)) as rig:
+    async with LoopbackRig(SimConfig(rate=rate, view=VIEW, force_noise_n=0.0005)) as rig:
         rig.world.flaws.update(dict.fromkeys(range(MOST_PRESSES), (Flaw.SPLIT, 0.0)))
         path.write_text(rig.toml(), encoding="utf-8")
         asked = await lines_of_input()

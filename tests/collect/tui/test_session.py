@@ -98,9 +98,9 @@ touches = 1
 
 [touch.force]
 sigma_mm = 0.3
-fast_samples = 20
-medium_samples = 40
-slow_samples = 100
+fast_samples = 5
+medium_samples = 10
+slow_samples = 25
 settle_s = 0.01
 
 [self_check]
