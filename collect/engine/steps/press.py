@@ -25,7 +25,7 @@ async def press(context: StepContext) -> Result:
         await timing.begin(down[0])
         pressing = procedures.press(cell, height_mm, tilt_deg, context.number("dwell_s"))
         depth_mm = await context.guard.guarded(pressing)
-    return _marked(context, depth_mm, timing)
+    return _marked(context, depth_mm, context.guard.peak_n, timing)
 
 
 async def draw(context: StepContext) -> Result:
@@ -36,6 +36,7 @@ async def draw(context: StepContext) -> Result:
     config = run.rig.config
     await asyncio.to_thread(check_drawn, config, plane, limits_of(config), [cell], drawn)
     depths_mm: list[float] = []
+    peaks_n: list[float] = []
     with DipToTouch(context).watching() as timing:
         for number, points in enumerate(drawn.strokes):
             if drawn.dips_before(number):
@@ -52,7 +53,8 @@ async def draw(context: StepContext) -> Result:
                 blend_mm=drawn.blend_mm,
             )
             depths_mm.append(await context.guard.guarded(stroke))
-    return {**_marked(context, max(depths_mm), timing), "depths_mm": depths_mm}
+            peaks_n.append(context.guard.peak_n)
+    return {**_marked(context, max(depths_mm), max(peaks_n), timing), "depths_mm": depths_mm}
 
 
 async def _ready(context: StepContext) -> Cell:
@@ -66,7 +68,7 @@ async def _ready(context: StepContext) -> Cell:
     return context.cell
 
 
-def _marked(context: StepContext, depth_mm: float, timing: DipToTouch) -> Result:
+def _marked(context: StepContext, depth_mm: float, peak_n: float, timing: DipToTouch) -> Result:
     assert context.cell is not None
     result: Result = {
         "stroke_id": context.step.params["stroke_id"],
@@ -76,4 +78,4 @@ def _marked(context: StepContext, depth_mm: float, timing: DipToTouch) -> Result
     }
     if timing.longest_s is not None:
         result[WAIT] = round(timing.longest_s, 3)
-    return result if context.run.rig.force is None else {**result, "peak_force_n": context.guard.peak_n}
+    return result if context.run.rig.force is None else {**result, "peak_force_n": peak_n}

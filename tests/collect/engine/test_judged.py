@@ -14,7 +14,7 @@ from collect.errors import CollectAborted, NeedsOperator
 from collect.quality.checks import check_drawing
 from collect.quality.verdict import Verdict
 from drivers.sim.brush.flaws import Flaw
-from sessions.journal.journal import replay
+from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.reader import Recording
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until
@@ -131,6 +131,17 @@ name = "bar"
 [[figures.strokes]]
 points = [[12.0, 18.0, 5.0, 0.0, 0.0], [37.0, 18.0, 5.0, 0.0, 0.0]]
 """
+SHALLOW = """[[figures.strokes]]
+points = [[12.0, 26.0, 1.0, 0.0, 0.0], [37.0, 26.0, 1.0, 0.0, 0.0]]
+"""
+
+
+def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab) -> None:
+    (sharp_lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
+    run(sharp_lab.engine())
+    [folder] = sharp_lab.sessions.iterdir()
+    [drawn] = [line["result"] for line in replay(folder / JOURNAL_NAME).segments if line["kind"] == "draw"]
+    assert drawn["peak_force_n"] > 0.02, "the shallow stroke comes last and reaches 0.007 N"
 
 
 def test_a_figure_without_ink_is_drawn_again(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
