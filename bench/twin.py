@@ -23,6 +23,7 @@ GAP_POINTS, REPEAT_POINTS = 1.5, 1.0
 CONFIDENCE = 0.95
 TRUTH = {f"frozen-{k}": spec for k, spec in enumerate(FROZEN, 1)}
 """Constants of the brushes that the simulator pressed, by name."""
+BRUSHES = (*TRUTH, *BRISTLE_SETS)
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
@@ -31,21 +32,17 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     value = CSIM points below the ceiling, or between the agreement of two captures and of two presses of the twin; for
     a brush whose constants are known, also the share of the intervals that hold them.
     """
-    results: list[Result] = []
-    for brush in _brushes(n):
-        results += _scored(brush, seed)
-    return results
+    return [result for name in BRUSHES[:n] for result in measure(name, seed)]
 
 
-def _brushes(n: int | None) -> Iterator[BrushPresses]:
-    count = len(FROZEN) + len(BRISTLE_SETS) if n is None else n
-    for name, spec in list(TRUTH.items())[:count]:
-        yield simulated(spec, name, REPEATS)
-    for name in BRISTLE_SETS[: max(0, count - len(FROZEN))]:
-        try:
-            yield bristles(name)
-        except BenchError as error:
-            sys.stderr.write(f"twin: {error}\n")
+def measure(name: str, seed: int = 0) -> Sequence[Result]:
+    """The results of one of `BRUSHES`; none, and a line on stderr, if its presses are not at hand."""
+    try:
+        brush = simulated(TRUTH[name], name, REPEATS) if name in TRUTH else bristles(name)
+    except BenchError as error:
+        sys.stderr.write(f"twin: {error}\n")
+        return []
+    return list(_scored(brush, seed))
 
 
 def _scored(brush: BrushPresses, seed: int) -> Iterator[Result]:
@@ -75,3 +72,17 @@ def _scored(brush: BrushPresses, seed: int) -> Iterator[Result]:
             f"twin.intervals.{brush.name}", 100.0 * share, "%", f"{100.0 * CONFIDENCE:g}", share / CONFIDENCE,
             len(held), seed, f"simulated; {sum(held)} of {len(held)} intervals hold the constant of the captured brush",
         )  # fmt: skip
+
+
+def main(arguments: Sequence[str]) -> None:
+    """`python -m bench.twin [BRUSH ...]`: each of these of `BRUSHES`, or all, printed as soon as it is measured."""
+    if unknown := [name for name in arguments if name not in BRUSHES]:
+        sys.exit(f"unknown: {', '.join(unknown)}; known: {', '.join(BRUSHES)}")
+    for name in arguments or BRUSHES:
+        for result in measure(name):
+            sys.stdout.write(f"# {result.conditions}\n{result.to_line()}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

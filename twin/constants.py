@@ -79,6 +79,7 @@ SPREAD = (
     Constant("spread_wander", "", 0.7, factor=True),
     Constant("reach_wander_mm", "mm", 0.7, factor=True),
     Constant("bow_wander_mm", "mm", 0.7, factor=True),
+    Constant("place_wander_mm", "mm", 0.2),
     Constant("strand_mm", "mm", 0.7, factor=True),
 )
 """Constants by which presses of one cell differ."""

@@ -31,7 +31,7 @@ FINE = 3
 """Each pixel of the grid is the mean of this many by this many samples."""
 LEAST_MM = 0.5
 REMEMBERED = 4
-STILL = {"spread_wander": 0.0, "reach_wander_mm": 0.0, "bow_wander_mm": 0.0}
+STILL = {"spread_wander": 0.0, "reach_wander_mm": 0.0, "bow_wander_mm": 0.0, "place_wander_mm": 0.0}
 """Values for a brush whose presses of a cell differ only by their paper."""
 
 

@@ -33,7 +33,7 @@ from twin.drawing import Cell
 from twin.quality import sound_head
 from twin.score import TWIN, parts_of, predicted
 from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, of_parts, search, start
-from twin.spread import Repeats, Spread, fit_spread
+from twin.spread import Repeats, Spread, drawn_agreement, fit_spread
 
 MOST_WORKERS = 8
 MOST_SD = 0.7
@@ -127,22 +127,27 @@ def fit_twin(
     parts = parts_of(target.cells)
     ticks = _Ticks(progress, (1 + len(parts)) * sum(one.steps for one in (*COARSE, FINE)))
     run = _Run(pool, ticks, before or {}, keep)
-    found = run.shape("all cells", target)
+    found = run.coarse("all cells", target)
+    repeats, spread = repeats_of(cells), None
+    if repeats.cells:
+        spread = fit_spread(_brush(found, target), offset_at(found.point), repeats, grid, pool.map)
+        # hairs that stray make every mark wider and its ends fainter: the shape is fitted to the captures with them
+        target = replace(target, base=with_values(target.base, SPREAD, spread.point))
+    found = run.fine("all cells", target, found)
     variance = np.diagonal(covariance(target, found, pool))
     spec, offset = _brush(found, target), offset_at(found.point)
-    repeats = repeats_of(cells)
-    spread = fit_spread(spec, offset, repeats, grid, pool.map) if repeats.cells else None
     scores, points = Scores(), list[Vector]()
     for number, part in enumerate(parts, 1):
         kept = [k for k in range(len(cells)) if k not in part]
-        there = run.shape(f"part {number} left out", target.only(kept))
+        name, others = f"part {number} left out", target.only(kept)
+        there = run.fine(name, others, run.coarse(name, others))
         points.append(there.point)
-        _score_part(scores, cells, [target.cells[k] for k in part], there, target, spread)
+        _score_part(scores, cells, [target.cells[k] for k in part], there, target)
     ticks.end()
     errors = WIDER * np.sqrt(variance + of_parts(points))
     estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
-        spec = _brush(found, target, spread)
+        spread = replace(spread, twin_percent=drawn_agreement(spec, offset, repeats, grid))
         estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
     held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
     return Twin(spec, offset, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
@@ -154,10 +159,9 @@ def _score_part(
     held: list[Cell],
     there: Found,
     target: Target,
-    spread: Spread | None,
 ) -> None:
     """Score the cells `held` by the twin found without them, and by a Bezier refitted to the others."""
-    drawn = predicted(_brush(there, target, spread), offset_at(there.point), held, target.grid)
+    drawn = predicted(_brush(there, target), offset_at(there.point), held, target.grid)
     others = [one for cell, group in cells.items() if cell not in held for one in group]
     bezier = None
     with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
@@ -169,9 +173,8 @@ def _score_part(
         scores.add(cells[cell], images)
 
 
-def _brush(found: Found, target: Target, spread: Spread | None = None) -> BrushSpec:
-    spec = brush_at(found.point, replace(target.base, seed=found.seed))
-    return spec if spread is None else with_values(spec, SPREAD, spread.point)
+def _brush(found: Found, target: Target) -> BrushSpec:
+    return brush_at(found.point, replace(target.base, seed=found.seed))
 
 
 def target_of(cells: dict[Cell, list[Pressed]], radius_mm: float, length_mm: float, grid: Grid) -> Target:
@@ -222,10 +225,13 @@ class _Run:
         self._before = before
         self._keep = keep
 
-    def shape(self, what: str, target: Target) -> Found:
+    def coarse(self, what: str, target: Target) -> Found:
         found = self._individual(f"{what}, first individual", target, start())
         for one in COARSE:
             found = self._step(f"{what}, blur {one.blur_mm:g} mm", one, target, found)
+        return found
+
+    def fine(self, what: str, target: Target, found: Found) -> Found:
         found = self._individual(f"{what}, individual", target, found)
         return self._step(f"{what}, blur {FINE.blur_mm:g} mm", FINE, target, found)
 

@@ -31,6 +31,6 @@ def test_the_middle_of_the_search_is_the_default_brush_of_the_captured_size() ->
 
 
 def test_the_spread_is_set_without_touching_the_shape() -> None:
-    found = with_values(BrushSpec(friction=0.3), SPREAD, [1.0, 0.0, 0.0, 0.0])
+    found = with_values(BrushSpec(friction=0.3), SPREAD, [1.0] + [0.0] * (len(SPREAD) - 1))
     assert found.friction == 0.3
     assert found.spread_wander == pytest.approx(BrushSpec().spread_wander * np.exp(0.7))

@@ -56,6 +56,8 @@ class Wander:
     """(CLUMPS,) relative ink per clump."""
     strand_mm: Vector
     """(m,) sideways stray of each hair."""
+    place_mm: tuple[float, float]
+    """Offset of the whole mark, (x, y)."""
 
 
 def grow_bristles(spec: BrushSpec, rng: np.random.Generator) -> Bristles:
@@ -80,7 +82,9 @@ def draw_wander(spec: BrushSpec, rng: np.random.Generator) -> Wander:
     """Draw the natural variation of one press."""
     spread = float(np.exp(spec.spread_wander * rng.standard_normal()))
     reach, bow = rng.normal(0.0, spec.reach_wander_mm), rng.normal(0.0, spec.bow_wander_mm)
-    return Wander(spread, float(reach), float(bow), rng.random(CLUMPS), rng.normal(0.0, spec.strand_mm, spec.bristles))
+    clump_ink, strand = rng.random(CLUMPS), rng.normal(0.0, spec.strand_mm, spec.bristles)
+    x, y = rng.normal(0.0, spec.place_wander_mm, 2)
+    return Wander(spread, float(reach), float(bow), clump_ink, strand, (float(x), float(y)))
 
 
 def clump_flow(clump_ink: Vector, ink_load: float) -> Vector:
@@ -149,7 +153,8 @@ class Tuft:
         ends = (node[-1] - at) * link_mm >= bristles.short_mm[:, None]
         ink = flow[:, None] * np.clip(1.5 * (1.0 - np.maximum(dot_z, 0.0) / film_mm), 0.0, 1.0) * ends
         inked = ink > 0.0
-        return Dots(dot_x[inked], dot_y[inked], ink[inked])
+        aside_x, aside_y = wander.place_mm
+        return Dots(dot_x[inked] + aside_x, dot_y[inked] + aside_y, ink[inked])
 
 
 def print_footprint(

@@ -29,6 +29,7 @@ ALLOWED: Mapping[str, tuple[float, float]] = MappingProxyType(
         "spread_wander": (0.0, 0.3),
         "reach_wander_mm": (0.0, 3.0),
         "bow_wander_mm": (0.0, 3.0),
+        "place_wander_mm": (0.0, 3.0),
         "strand_mm": (0.0, 1.0),
         "bristles": (50, 5000),
         "seed": (0, 2**63 - 1),
@@ -83,6 +84,8 @@ class BrushSpec:
     """Extra reach of the tip along the paper, standard deviation between presses."""
     bow_wander_mm: float = 0.12
     """Sideways offset of the tip, standard deviation between presses."""
+    place_wander_mm: float = 0.0
+    """Offset of the whole mark in x and in y, standard deviation between presses: the bundle hangs a little aside."""
     strand_mm: float = 0.06
     """Sideways stray of each hair, standard deviation in each press."""
     bristles: int = 400
