@@ -7,7 +7,7 @@ import pytest
 
 from calibrate.fit.captures import Grid
 from drivers.sim.brush.spec import BrushSpec
-from twin.constants import Offset
+from twin.constants import SPREAD, Offset, with_values
 from twin.drawing import draw
 from twin.spread import Repeats, agreement, fit_spread, statistics
 
@@ -23,6 +23,14 @@ def test_equal_repeats_agree_wholly_and_moved_ones_deviate_by_as_much_as_they_we
     pairs = [np.stack([a, b]) for a, b in zip(one, moved, strict=True)]
     assert agreement(pairs) < 97.0
     assert np.exp(statistics(pairs, GRID)[1]) == pytest.approx(0.8 / np.sqrt(2.0), abs=0.15)
+
+
+def test_presses_that_lie_elsewhere_are_not_taken_for_hairs_that_stray() -> None:
+    captured = draw(BrushSpec(place_wander_mm=0.4), HERE, CELLS, GRID, repeats=6, first_seed=70)
+    found = fit_spread(BrushSpec(), HERE, Repeats(CELLS, tuple(captured)), GRID)
+    brush = with_values(BrushSpec(), SPREAD, found.point)
+    assert brush.place_wander_mm == pytest.approx(0.4, abs=0.15)
+    assert brush.strand_mm < 0.2
 
 
 def test_a_brush_that_varies_more_gets_a_wider_spread() -> None:

@@ -26,8 +26,9 @@ PRESSED = (
     (4272.797, 3165.911, 3266.336),
     (4235.855, 3262.018, 3449.286),
     (3842.285, 2882.832, 2868.087),
+    (10297.543, 8338.703, 7977.463),
 )
-"""Ink of a press, a drag and a split press of each frozen brush, as pressed before its constants could be chosen."""
+"""Ink of a press, a drag and a split press of each frozen brush and of the paper's, as pressed when they were made."""
 
 
 def written(folder: Path, text: str) -> Path:
@@ -125,10 +126,10 @@ def test_a_lab_that_nobody_has_measured_has_a_brush_of_its_own(tmp_path: Path) -
     assert isinstance(ran.exception, LabRefused)
 
 
-def test_the_frozen_brushes_press_and_draw_what_they_always_did() -> None:
+def test_the_frozen_brushes_and_the_papers_press_and_draw_what_they_always_did() -> None:
     # the bytes agreed too; another processor may round the last bit differently
     ink: list[list[float]] = []
-    for spec in FROZEN:
+    for spec in (*FROZEN, load_brush(Path(PAPER)).spec):
         brush = Brush(spec)
         press = brush.press(12.0, 5.0, ink_load=0.8, press_seed=3)
         split = brush.press(9.0, 0.0, ink_load=1.0, press_seed=4, flaw=Flaw.SPLIT, severity=0.7)

@@ -82,6 +82,15 @@ def test_repeats_are_alike_but_not_identical(brush, depth_mm, tilt_deg):
     assert 0.95 < np.mean(scores) < 0.99
 
 
+def test_the_place_of_a_press_wanders_and_its_mark_stays_as_it_is(brush):
+    elsewhere = Brush(BrushSpec(place_wander_mm=1.0))
+    here, there = (
+        np.array([centroid_mm(wet(one, 11.0, 5.0, seed)) for seed in range(8)]) for one in (brush, elsewhere)
+    )
+    assert (there - here).std(axis=0, ddof=1) == pytest.approx([1.0, 1.0], rel=0.6)
+    assert extent_mm(wet(elsewhere, 11.0, 5.0, 3)) == pytest.approx(extent_mm(wet(brush, 11.0, 5.0, 3)), abs=0.4)
+
+
 def test_two_brushes_of_one_make_differ_more_than_repeats(brush):
     assert (
         grow_bristles(BrushSpec(), np.random.default_rng(1)).clump
