@@ -54,11 +54,8 @@ def teach(
 
 def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
     import asyncio
-    import os
-    import signal
     import sys
 
-    from collect.headless import stop_signals
     from collect.teach.day import Day
     from drivers.clock import HostClock
 
@@ -66,9 +63,7 @@ def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
         from collect.teach.plain import PlainGuide
 
         day = Day(PlainGuide(rig.with_name(f"{rig.stem}.pictures")), rig, HostClock(), armed=arm)
-        # Like Ctrl-C, which asyncio turns into a cancellation: the arm is stopped before the process ends.
-        with stop_signals(lambda _: os.kill(os.getpid(), signal.SIGINT), (signal.SIGTERM, signal.SIGHUP)):
-            asyncio.run(_taught(day, step))
+        asyncio.run(_until_signalled(day, step))
         return
     from collect.tui.teach_app import run_teaching
 
@@ -81,6 +76,25 @@ def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
 
     if (written := run_teaching(watched_day, str(rig))) is not None:
         say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
+
+
+async def _until_signalled(day: Day, step: str | None) -> None:
+    """Teach; SIGTERM and a lost terminal stop the arm and end it, as Ctrl-C does by itself. Raises `CollectAborted`."""
+    import asyncio
+    import signal
+
+    from collect.errors import CollectAborted
+    from collect.headless import stop_signals
+
+    loop, teaching = asyncio.get_running_loop(), asyncio.ensure_future(_taught(day, step))
+    with stop_signals(lambda _: loop.call_soon_threadsafe(teaching.cancel), (signal.SIGTERM, signal.SIGHUP)):
+        try:
+            await teaching
+        except asyncio.CancelledError:
+            this = asyncio.current_task()
+            if this is not None and this.cancelling():
+                raise  # by Ctrl-C
+            raise CollectAborted("stopped; the same command resumes from there") from None
 
 
 async def _taught(day: Day, step: str | None) -> Path | None:

@@ -106,7 +106,7 @@ def no_pose_text(now: Snapshot) -> str:
 
 
 @contextmanager
-def stop_signals(handle: Callable[[int], None], numbers: Sequence[signal.Signals] = STOP_SIGNALS) -> Generator[None]:
+def stop_signals(handle: Callable[[int], object], numbers: Sequence[signal.Signals] = STOP_SIGNALS) -> Generator[None]:
     """Call `handle` with the number of each of these signals, in a separate thread."""
 
     def on_signal(number: int, _frame: FrameType | None) -> None:

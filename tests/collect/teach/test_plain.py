@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from collect import cli_rig
+from collect.errors import CollectAborted
 from collect.teach.plain import PlainGuide
 
 
@@ -53,6 +54,6 @@ def test_a_signal_stops_the_arm_before_the_process_ends(
             raise
 
     monkeypatch.setattr(cli_rig, "_taught", moving)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(CollectAborted, match="the same command resumes"):
         cli_rig._teach(tmp_path / "rig.toml", None, plain=True, arm=True)
     assert stopped == ["the arm"]
