@@ -133,21 +133,23 @@ class RunControl:
                 return
             self._set(State.PAUSED)
         self._doing("paused")
-        while self._pause_wanted and not self._park_wanted:
+        while True:
             self._go_on.clear()
+            with self._lock:
+                if self._park_wanted or not self._pause_wanted:
+                    self._change(State.RUNNING)
+                    return
             await self._go_on.wait()
-        self.move_to(State.RUNNING)
 
-    def running(self) -> State:
-        """The state to go on in: running, or pausing if a pause was requested."""
-        return State.PAUSING if self._pause_wanted else State.RUNNING
+    def go_on(self) -> None:
+        """Run, or pause before the next step if that was requested. Raises `CancelledError` once a stop was."""
+        with self._lock:
+            self._change(State.PAUSING if self._pause_wanted else State.RUNNING)
 
     def move_to(self, new: State) -> None:
         """Change the state. Raises `CancelledError` once a stop was requested."""
         with self._lock:
-            self._refuse_after_a_stop()
-            if new is not self._state:  # unchanged if one question follows another
-                self._set(new)
+            self._change(new)
 
     def begin_closing(self) -> None:
         """Ignore stops from now on: one would lose the merge. Raises `CancelledError` if one was already requested."""
@@ -161,6 +163,11 @@ class RunControl:
             if state is State.STOPPED and self._state is not State.STOPPING:
                 self._set(State.STOPPING)
             self._set(state)
+
+    def _change(self, new: State) -> None:
+        self._refuse_after_a_stop()
+        if new is not self._state:  # unchanged if one question follows another
+            self._set(new)
 
     def _refuse_after_a_stop(self) -> None:
         if self._state == State.STOPPING:

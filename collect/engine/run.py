@@ -167,7 +167,7 @@ class Run:
     async def _ask_about(self, step: Step, result: Result) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
         answer = await self._answer(set_up_question(step.kind, result, self.context.rig.config))
-        self.control.move_to(self.control.running())
+        self.control.go_on()
         if answer == STOP.key:
             await self._park()
         return answer
@@ -214,4 +214,4 @@ class Run:
         except ArmMoved as moved:
             self.context.progress.log(describe(moved), warning=True)  # logged before the arm moves
         await self.performer.retreat()
-        self.control.move_to(self.control.running())
+        self.control.go_on()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
-from collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, State, check_transition
+from collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State, check_transition
 from collect.engine.policy import MAX_FAILURES, Action, decide
 from collect.errors import ForceTooHigh, SheetFull, StepVoid, arm_at_fault
 from collect.protocols.steps import Step, StepKind
@@ -33,6 +35,30 @@ def test_every_state_can_be_reached() -> None:
 def test_a_way_that_the_table_does_not_have_is_a_defect() -> None:
     with pytest.raises(IllegalTransition, match="done -> running"):
         check_transition(State.DONE, State.RUNNING)
+
+
+def test_a_pause_that_comes_as_the_run_goes_on_is_not_lost() -> None:
+    control = RunControl(lambda _: None)
+    control.move_to(State.RECOVERING)
+
+    class PausedFirst:
+        """The lock of the run; the pause key gets it first, once."""
+
+        def __init__(self) -> None:
+            self._lock, self._late = threading.Lock(), True
+
+        def __enter__(self) -> None:
+            if self._late:
+                self._late = False
+                control.pause()
+            self._lock.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            self._lock.release()
+
+    control._lock = PausedFirst()  # type: ignore[assignment]
+    control.go_on()
+    assert control.state is State.PAUSING
 
 
 PRESS, CAPTURE = Step(StepKind.PRESS, 0), Step(StepKind.CAPTURE, 0)
