@@ -25,21 +25,21 @@ BareName = Annotated[str, AfterValidator(_bare_or_empty)]
 
 
 class Topic(StrEnum):
-    """Topics of a session."""
+    """Topics of a session: the first carry Foxglove's messages (`messages.py`), the others the events below."""
 
-    TCP = "/robot/tcp"
-    JOINTS = "/robot/joints"
-    TRANSFORMS = "/tf"
-    STILL = "/camera/still"
-    CALIBRATION = "/camera/calibration"
-    PREVIEW = "/camera/preview"
+    TCP = "/robot/tcp"  # PoseInFrame
+    JOINTS = "/robot/joints"  # JointStates
+    TRANSFORMS = "/tf"  # FrameTransforms
+    CALIBRATION = "/camera/calibration"  # CameraCalibration
+    STILL = "/camera/still"  # CompressedImage, PNG
+    PREVIEW = "/camera/preview"  # CompressedImage, JPEG
+    LOG = "/log"  # Log
     WRENCH = "/force/wrench"
-    INK = "/ink/state"
+    INK = "/ink/state"  # InkState
     QUALITY = "/quality"
     CADENCE = "/cadence"
-    STEP = "/step"
+    STEP = "/step"  # StepEvent
     STROKE = "/stroke"
-    LOG = "/log"
 
 
 class Source(StrEnum):

@@ -1,4 +1,7 @@
-"""The dip: keeps the well filled, fills the brush, and times how long the ink then waits before it meets the paper."""
+"""The dip: keeps the well filled, fills the brush, and times how long the ink then waits before it meets the paper.
+
+The path of the arm, with wipe and wash, is in `collect.motion.moves`.
+"""
 
 from __future__ import annotations
 
