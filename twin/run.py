@@ -33,7 +33,7 @@ from twin.drawing import Cell
 from twin.quality import sound_head
 from twin.score import TWIN, parts_of, predicted
 from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, of_parts, search, start
-from twin.spread import Repeats, Spread, drawn_agreement, fit_spread
+from twin.spread import Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
 MOST_SD = 0.7
@@ -136,6 +136,8 @@ def fit_twin(
     found = run.fine("all cells", target, found)
     variance = np.diagonal(covariance(target, found, pool))
     spec, offset = _brush(found, target), offset_at(found.point)
+    if spread is not None:
+        spread = fit_spread(spec, offset, repeats, grid, pool.map, spread.point)
     scores, points = Scores(), list[Vector]()
     for number, part in enumerate(parts, 1):
         kept = [k for k in range(len(cells)) if k not in part]
@@ -147,7 +149,7 @@ def fit_twin(
     errors = WIDER * np.sqrt(variance + of_parts(points))
     estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
-        spread = replace(spread, twin_percent=drawn_agreement(spec, offset, repeats, grid))
+        spec = with_values(spec, SPREAD, spread.point)
         estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
     held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
     return Twin(spec, offset, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))

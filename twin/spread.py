@@ -27,8 +27,8 @@ REPEATS = 6
 FIRST_SEED = 500
 END_SHARE = 1.0 / 3.0
 """Share of the mark whose middle measures the bow, from its tip, or the place, from its other end."""
-STARTS = {"place_wander_mm": 0.1}
-"""Values from which the search starts where the default is a bad place: deviations do not yet rise at 0."""
+START = tuple(0.5 if one.name == "place_wander_mm" else 0.0 for one in SPREAD)
+"""Where the search starts, in scales: a place that wanders by 0 is a bad start, where deviations do not yet rise."""
 PRIOR_SD = 2.0
 STEP = 0.3
 STEPS = 6
@@ -62,7 +62,14 @@ class Spread:
     """The same of the twin."""
 
 
-def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid, each: Map = map) -> Spread:
+def fit_spread(
+    spec: BrushSpec,
+    offset: Offset,
+    repeats: Repeats,
+    grid: Grid,
+    each: Map = map,
+    start: Sequence[float] = START,
+) -> Spread:
     """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST_REPEATS` captures."""
     from scipy.optimize import least_squares  # slow to import
 
@@ -76,7 +83,7 @@ def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid, ea
     low, high = np.array([one.bounds for one in SPREAD]).T
     best = least_squares(
         off,
-        [one.scales(STARTS.get(one.name, one.default)) for one in SPREAD],
+        start,
         jac=lambda point: derivatives(off, point, high, STEP, each),
         bounds=(low, high),
         max_nfev=STEPS,
@@ -85,11 +92,6 @@ def fit_spread(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid, ea
     jacobian = np.asarray(best.jac, np.float64)
     error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
     return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(repeats.ink), agreement(twin))
-
-
-def drawn_agreement(spec: BrushSpec, offset: Offset, repeats: Repeats, grid: Grid) -> float:
-    """Mean CSIM in percent of two presses of a cell by this brush, in the cells of `repeats`."""
-    return agreement(list(draw(spec, offset, repeats.cells, grid, REPEATS, FIRST_SEED)))
 
 
 def _off(

@@ -32,5 +32,5 @@ def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monke
     brush = replace(BrushSpec(), strand_mm=0.5)
     captured = draw(brush, Offset(0.0, 0.0, 0.0), [cell], GRID, repeats=4)[0]
     twin = fit_twin([Pressed(*cell, ink) for ink in captured], GRID, brush.radius_mm, brush.length_mm, Serial())
-    assert strays == [(1.0, BrushSpec().strand_mm), (0.5, twin.spec.strand_mm)]
+    assert strays == [(1.0, BrushSpec().strand_mm), (0.5, pytest.approx(twin.spec.strand_mm, rel=0.2))]
     assert twin.spec.strand_mm > BrushSpec().strand_mm
