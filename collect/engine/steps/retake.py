@@ -1,4 +1,7 @@
-"""Decides which strokes count, are pressed again on another cell, or are left out: after a capture, and in review."""
+"""Decides which strokes count, are pressed again on another cell, or are left out: after a capture, and in review.
+
+That a photograph is taken again, and a failed step done again, is decided in `collect.engine.policy`.
+"""
 
 from __future__ import annotations
 
