@@ -96,11 +96,12 @@ async def measure(rig: RigConfig, n: int, seed: int, conditions: str) -> list[Re
                 await wire.sees("moveLine")
                 await asyncio.sleep(rng.uniform(0.0, LATEST_KEY_S))
                 pressed_ns = time.monotonic_ns()
-                await robot.stop()
+                stop = asyncio.create_task(robot.stop())
                 ours_ms.append((await wire.sees("stopLine") - pressed_ns) / 1e6)
                 if move.done():
                     raise BenchError("the call that was to stay unanswered ended")
                 await wire.release()
+                await stop  # it ends when the line that it has overtaken is answered
                 move.cancel()
                 await asyncio.gather(move, return_exceptions=True)
                 await wire.release()

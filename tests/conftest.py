@@ -41,26 +41,28 @@ FIRST = (
     "tests/collect/quality/test_recognised.py",
     "tests/calibrate/fit",
     "tests/model/train",
-    "tests/calibrate/drags",
     "tests/collect/teach/test_first_day.py",
-    "tests/calibrate/validate/test_cluster.py",
+    "tests/calibrate/drags",
+    "tests/calibrate/validate",
     "tests/calibrate/",
     "tests/model/",
+)
+"""The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
+
+WAITING = (
     "tests/collect/durability",
+    "tests/collect/engine",
     "tests/collect/faults",
+    "tests/collect/photograph",
+    "tests/collect/teach",
+    "tests/collect/test_headless.py",
     "tests/contract",
     "tests/drivers/arcs",
-    "tests/drivers/ink",
     "tests/drivers/force",
+    "tests/drivers/ink",
     "tests/drivers/sim/faults",
-    "tests/collect/test_soak.py",
-    "tests/sessions/test_kill.py",
-    "tests/sessions/test_repair_everywhere.py",
-    "tests/test_bench.py",
-    "tests/collect/",
 )
-"""The order of the suite. The longest tests begin first, so that no worker is left alone with one of them at the end.
-Those that mostly wait run while a worker computes a whole folder (`TOGETHER`); short ones come last, by folder."""
+"""Tests that mostly wait for a rig. They are mixed with those that compute, so that no core is idle."""
 
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
@@ -80,7 +82,10 @@ TOGETHER = {
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=_place)  # stable: otherwise the order stays
+    first = sorted((item for item in items if item.nodeid.startswith(FIRST)), key=_place)
+    rest = [item for item in items if not item.nodeid.startswith(FIRST)]
+    waiting = [item for item in rest if item.nodeid.startswith(WAITING)]
+    items[:] = first + _mixed(waiting, [item for item in rest if not item.nodeid.startswith(WAITING)])
     for item in items:
         for folder, group in TOGETHER.items():
             if item.nodeid.startswith(folder) and item.get_closest_marker("xdist_group") is None:
@@ -88,7 +93,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _place(item: pytest.Item) -> int:
-    return next((place for place, start in enumerate(FIRST) if item.nodeid.startswith(start)), len(FIRST))
+    return next(place for place, start in enumerate(FIRST) if item.nodeid.startswith(start))
+
+
+def _mixed(some: list[pytest.Item], others: list[pytest.Item]) -> list[pytest.Item]:
+    """Both lists in their order, evenly mixed."""
+    places = [(k / len(items), item) for items in (some, others) for k, item in enumerate(items)]
+    return [item for _, item in sorted(places, key=lambda one: one[0])]
 
 
 @pytest.hookimpl(trylast=True)

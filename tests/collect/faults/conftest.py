@@ -86,7 +86,7 @@ class Stage:
 
 
 @pytest.fixture
-def stage(tmp_path: Path) -> Iterator[Stage]:
+def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     ready: Future[tuple[LoopbackRig, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
     gears = Gears()
     view = View(width_px=512, height_px=384, px_per_mm=1.56, fps=20.0)
@@ -106,9 +106,8 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
     text = re.sub("least_dwell_s = .*", "", text)  # a phase is struck at half real speed
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
     (tmp_path / "protocol.toml").write_text(PROTOCOL, encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stopping, "CONFIRM_S", CONFIRM_S)
-        yield Stage(rig, loop, gears, tmp_path)
+    monkeypatch.setattr(stopping, "CONFIRM_S", CONFIRM_S)
+    yield Stage(rig, loop, gears, tmp_path)
     loop.call_soon_threadsafe(over.set)
     thread.join(timeout=PATIENCE_S)
     assert not thread.is_alive(), "waited 30 s for the loopback rig to end"
