@@ -42,27 +42,26 @@ FIRST = (
     "tests/calibrate/fit",
     "tests/model/train",
     "tests/collect/teach/test_first_day.py",
-    "tests/calibrate/drags",
-    "tests/calibrate/validate",
-    "tests/calibrate/",
-    "tests/model/",
 )
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
 
-WAITING = (
-    "tests/collect/durability",
-    "tests/collect/engine",
-    "tests/collect/faults",
+DEVICES = (
     "tests/collect/photograph",
-    "tests/collect/teach",
-    "tests/collect/test_headless.py",
     "tests/contract",
     "tests/drivers/arcs",
     "tests/drivers/force",
     "tests/drivers/ink",
     "tests/drivers/sim/faults",
 )
-"""Tests that mostly wait for a rig. They are mixed with those that compute, so that no core is idle."""
+"""Tests that mostly wait for a device."""
+RUNS = (
+    "tests/collect/durability",
+    "tests/collect/engine",
+    "tests/collect/faults",
+    "tests/collect/teach",
+    "tests/collect/test_headless.py",
+)
+"""Tests of whole runs, which wait for half of their time. Both kinds are mixed with tests that only compute."""
 
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
@@ -82,23 +81,21 @@ TOGETHER = {
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    first = sorted((item for item in items if item.nodeid.startswith(FIRST)), key=_place)
-    rest = [item for item in items if not item.nodeid.startswith(FIRST)]
-    waiting = [item for item in rest if item.nodeid.startswith(WAITING)]
-    items[:] = first + _mixed(waiting, [item for item in rest if not item.nodeid.startswith(WAITING)])
+    parts: dict[tuple[str, ...], list[pytest.Item]] = {FIRST: [], DEVICES: [], RUNS: [], (): []}
+    for item in items:
+        parts[next((part for part in parts if item.nodeid.startswith(part)), ())].append(item)
+    first = parts.pop(FIRST)
+    first.sort(key=lambda item: next(place for place, start in enumerate(FIRST) if item.nodeid.startswith(start)))
+    items[:] = first + _evenly_mixed(list(parts.values()))
     for item in items:
         for folder, group in TOGETHER.items():
             if item.nodeid.startswith(folder) and item.get_closest_marker("xdist_group") is None:
                 item.add_marker(pytest.mark.xdist_group(group))
 
 
-def _place(item: pytest.Item) -> int:
-    return next(place for place, start in enumerate(FIRST) if item.nodeid.startswith(start))
-
-
-def _mixed(some: list[pytest.Item], others: list[pytest.Item]) -> list[pytest.Item]:
-    """Both lists in their order, evenly mixed."""
-    places = [(k / len(items), item) for items in (some, others) for k, item in enumerate(items)]
+def _evenly_mixed(parts: list[list[pytest.Item]]) -> list[pytest.Item]:
+    """All parts in one list, each in its order and spread over the whole of it."""
+    places = [(place / len(part), item) for part in parts for place, item in enumerate(part)]
     return [item for _, item in sorted(places, key=lambda one: one[0])]
 
 
