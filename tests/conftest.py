@@ -46,7 +46,6 @@ FIRST = (
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""
 
 DEVICES = (
-    "tests/collect/photograph",
     "tests/contract",
     "tests/drivers/arcs",
     "tests/drivers/force",

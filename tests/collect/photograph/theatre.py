@@ -11,8 +11,9 @@ import numpy as np
 
 from collect.photograph.photographer import ArmTrips, Photographer
 from collect.rig.config_devices import CameraConfig
-from drivers.clock import HostClock
+from drivers.clock import Clock
 from drivers.samples import Frame, Pose, PoseSample, Stamp
+from tests.simulated_time import LoopClock
 
 PERIOD_S, TRIP_S = 0.02, 0.06
 PARK_MM, OVER_MM = (0.0, 0.0, 100.0), (200.0, 0.0, 100.0)
@@ -22,11 +23,11 @@ OUT_MM, IN_MM = 60.0, 120.0
 
 @dataclass
 class Theatre:
-    """`Robot` and `Camera` as far as a photographer needs them; every delay is in seconds of real time."""
+    """`Robot` and `Camera` as far as a photographer needs them; every delay is in seconds of the loop's time."""
 
     delay: Callable[[float], float]
     """By the time of exposure, in s since the start."""
-    clock: HostClock = field(default_factory=HostClock)
+    clock: Clock = field(default_factory=LoopClock)
     intruder: bool = False
     """A hand in the picture."""
     ink: int = 0
