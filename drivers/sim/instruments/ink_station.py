@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import tempfile
 import threading
 import tty
 from collections import deque
+from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -41,7 +43,11 @@ class Instrument(Protocol):
 
 
 class PtyLine:
-    """An instrument on a pseudo terminal, served by a thread; open `path` as the serial port."""
+    """An instrument on a pseudo terminal, served by a thread; open `path` as the serial port.
+
+    `path` is a link of its own that goes with the cable, as udev's do: the kernel gives the number of a closed
+    terminal to the next one, so a driver that connects again by number would reach another instrument.
+    """
 
     def __init__(self, instrument: Instrument, *, late_s: float = 0.3) -> None:
         self.instrument = instrument
@@ -51,12 +57,16 @@ class PtyLine:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._wake: tuple[int, int] = (-1, -1)
+        self._link: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> Self:
         """Open the pty and serve it."""
         master, slave = os.openpty()
         tty.setraw(slave)  # or the terminal would echo, and translate line ends
-        self.path = os.ttyname(slave)
+        self._link = tempfile.TemporaryDirectory(prefix="brushloop-line-")
+        link = Path(self._link.name) / "tty"
+        link.symlink_to(os.ttyname(slave))
+        self.path = str(link)
         self._wake = os.pipe()
         self._stopping.clear()
         self._thread = threading.Thread(target=self._serve, args=(master, slave), name="pty instrument", daemon=True)
@@ -74,6 +84,9 @@ class PtyLine:
             if end >= 0:
                 os.close(end)
         self._wake = (-1, -1)
+        if self._link is not None:
+            self._link.cleanup()
+            self._link = None
 
     def fail(self, *faults: InkFault) -> None:
         """Apply these faults to the next requests, one each."""
@@ -98,6 +111,7 @@ class PtyLine:
                 while (request := self.instrument.take(buffer)) is not None:
                     self._meet(master, request)
         finally:
+            Path(self.path).unlink(missing_ok=True)
             os.close(slave)
             os.close(master)
 

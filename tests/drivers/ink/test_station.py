@@ -215,6 +215,13 @@ async def test_a_pulled_cable_is_a_lost_connection_at_once_and_stays_one(line: P
         await station.connect()
 
 
+async def test_a_lost_port_does_not_lead_to_the_station_that_was_given_its_number(line: PtyLine, station: InkStation):
+    line.unplug()
+    await station.close()
+    with PtyLine(StationFirmware()), pytest.raises(ConnectionLost, match="cannot open"):
+        await station.connect()
+
+
 async def test_where_there_is_no_port_nothing_is_connected(tmp_path):
     station = station_at(str(tmp_path / "ttyUSB0"))
     with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
