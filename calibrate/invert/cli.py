@@ -77,7 +77,8 @@ def invert(
     say(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
     for name, mean, sd, inside, n in off_command(made.rows):
         unit = "mm" if name == "H" else "deg"
-        say(f"{name}: recovered - commanded {mean:+.3f} {unit}, sd {sd:.3f}; {inside:.0%} of {n} in the interval")
+        scatter = "" if sd is None else f", sd {sd:.3f}"
+        say(f"{name}: recovered - commanded {mean:+.3f} {unit}{scatter}; {inside:.0%} of {n} in the interval")
     say(
         "alpha follows from how far the mark lies from the zero-touch point, and is as accurate as the model's "
         "prediction of that distance; the shape of the mark alone does not determine it."

@@ -278,8 +278,11 @@ def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
         raise CalibrationError("--height-range, --tilt-range", str(error)) from None
 
 
-def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float, float, int]]:
-    """Yield (parameter, mean of recovered - commanded, standard deviation, share in the 95 % interval, n)."""
+def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, float, int]]:
+    """Yield (parameter, mean of recovered - commanded, standard deviation, share in the 95 % interval, n).
+
+    A single press has no standard deviation: None.
+    """
     pairs = {
         "H": [(r.height_mm, r.height_sd_mm, r.commanded_height_mm) for r in rows],
         "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows if r.tilt_sd_deg is not None],
@@ -289,4 +292,5 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float, float, int
         if known:
             off, sd = (np.array(part, np.float64) for part in zip(*known, strict=True))
             inside = np.abs(off) <= NORMAL_95 * sd
-            yield name, float(off.mean()), float(off.std()), float(inside.mean()), len(known)
+            scatter = float(off.std(ddof=1)) if len(off) > 1 else None
+            yield name, float(off.mean()), scatter, float(inside.mean()), len(off)

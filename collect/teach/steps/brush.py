@@ -58,9 +58,10 @@ class BrushStep(Step):
         kind = await day.guide.choose("What keeps the ink well filled?", (NONE, STATION, PUMP), NONE.key)
         config: InkDeviceConfig | None = None
         if kind != NONE.key:
-            port = (await day.guide.text("Its serial line, such as /dev/ttyUSB0", "")).strip()
+            port = (await day.guide.text("Its serial line, such as /dev/serial/by-id/usb-…", "")).strip()
             if not port:
-                raise CannotTeach("no serial line was named.", "Type its path; `ls /dev/tty*` lists what there is.")
+                remedy = "Type its path; `ls -l /dev/serial/by-id /dev/tty*` lists what there is."
+                raise CannotTeach("no serial line was named.", remedy)
             config = await self._device(day, kind, port)
         name = await day.guide.text("Name of the ink, for the record", "ink")
         with day.together():

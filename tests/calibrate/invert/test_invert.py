@@ -132,8 +132,10 @@ def test_the_summary_compares_with_what_was_commanded() -> None:
     rows = [Row("a", 10.1, 4.0, 0.1, 0.5, 0.1, (), 10.0, 5.0), Row("b", 12.5, 4.0, 0.1, None, 0.1, (), 12.0, None)]
     summary = {name: values for name, *values in off_command(rows)}
     assert summary["H"][0] == pytest.approx(0.3)
+    assert summary["H"][1] == pytest.approx(0.4 / 2**0.5)
     assert summary["H"][2:] == [0.5, 2]
     assert summary["alpha"][0] == pytest.approx(-1.0)
+    assert summary["alpha"][1] is None
     assert summary["alpha"][3] == 1
 
 
