@@ -18,6 +18,8 @@ from drivers.arcs.framing import numbers
 from drivers.arcs.rpc import DEVICE, Framing
 from drivers.arcs.waiting import until_mode
 from drivers.errors import ProtocolViolation, RpcError, SettingsChanged
+from drivers.geometry import distance, from_wire
+from drivers.samples import Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class ArcsOptions:
 
 METHOD_NOT_FOUND = -32601
 TOLERANCE = 1e-3
-"""Difference allowed in every number, in mm, deg and kg: a controller may keep single precision."""
+"""Largest difference in mm, deg and kg: a controller may keep single precision."""
 
 Value = tuple[float, ...] | str | None
 """None if the controller has no such setting."""
@@ -130,16 +132,23 @@ def require_same(op: str, wanted: Settings, found: Settings) -> None:
     changes = tuple(
         f"{setting.name} is {_in_words(setting, found[setting.name])}, not {_in_words(setting, wanted[setting.name])}"
         for setting in SETTINGS
-        if setting.name in wanted and not _same(wanted[setting.name], found[setting.name])
+        if setting.name in wanted and not _same(setting, wanted[setting.name], found[setting.name])
     )
     if changes:
         raise SettingsChanged(DEVICE, op, changes)
 
 
-def _same(wanted: Value, found: Value) -> bool:
-    if isinstance(wanted, tuple) and isinstance(found, tuple):
-        return all(abs(a - b) <= TOLERANCE for a, b in zip(wanted, found, strict=True))
-    return wanted == found
+def _same(setting: Setting, wanted: Value, found: Value) -> bool:
+    if not isinstance(wanted, tuple) or not isinstance(found, tuple):
+        return wanted == found
+    if setting.name == TOOL_OFFSET:  # one rotation has several sets of angles, such as 180 and -180 deg
+        return max(distance(_tool(wanted), _tool(found))) <= TOLERANCE
+    return all(abs(a - b) <= TOLERANCE for a, b in zip(wanted, found, strict=True))
+
+
+def _tool(offset: tuple[float, ...]) -> Pose:
+    """The tool centre point on the flange."""
+    return from_wire([*(v / 1e3 for v in offset[:3]), *map(math.radians, offset[3:])])
 
 
 def _in_words(setting: Setting, value: Value) -> str:

@@ -10,6 +10,7 @@ import pytest
 from drivers.arcs.controller import Controller
 from drivers.arcs.robot import AuboArcs
 from drivers.arcs.rpc import RpcConnection
+from drivers.arcs.settings import TOOL_OFFSET, require_same
 from drivers.arcs.waiting import Tolerance, until_settled
 from drivers.errors import ArmMoved, LimitExceeded, RobotNotSafe, SettingsChanged
 from drivers.geometry import brush_pose, distance
@@ -124,6 +125,22 @@ async def test_ignored_is_fine_where_it_is_set_already(sleeping_arm: AuboArcs, c
     cabinet.cabinet.tcp_offset = [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
     cabinet._methods["rob1.RobotConfig.setTcpOffset"] = lambda _: 13
     await sleeping_arm.enable()
+
+
+@pytest.mark.parametrize(
+    ("wanted_deg", "found_deg"),
+    [((180.0, 0.0, 0.0), (-180.0, 0.0, 0.0)), ((180.0, 0.0, 30.0), (0.0, 180.0, -150.0))],
+)
+def test_a_tool_that_is_read_back_in_other_angles_is_the_same_tool(
+    wanted_deg: tuple[float, ...], found_deg: tuple[float, ...]
+):
+    wanted, found = ({TOOL_OFFSET: (0.0, 0.0, 180.0, *turn)} for turn in (wanted_deg, found_deg))
+    require_same("enable", wanted, found)
+
+
+def test_a_tool_turned_by_a_hundredth_of_a_degree_is_another():
+    with pytest.raises(SettingsChanged, match=r"\(-179\.99, 0, 0\) deg, not .*\(180, 0, 0\)"):
+        require_same("enable", {TOOL_OFFSET: (0, 0, 0, 180, 0, 0)}, {TOOL_OFFSET: (0, 0, 0, -179.99, 0, 0)})
 
 
 async def test_from_below_the_floor_only_the_tool_axis_leads_up(arm: AuboArcs, other: Controller, cabinet: ArcsServer):
