@@ -17,7 +17,15 @@ DARK_SHARE = 0.6
 """A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""
 SHRINK = 8
 MOST_SHIFT_PX = 8.0
-LEAST_RESPONSE = 0.05
+LEAST_CORRELATION = 0.5
+"""Of the two photographs once they are aligned; below it there is nothing to align by."""
+BLURS_PX = (17, 5)
+"""The wide blur finds the shift from afar, the narrow one to a fifth of a pixel."""
+UNTIL = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+"""Most iterations of the alignment, and the growth of the correlation at which it ends."""
+NEW_INK_GRAY = 40
+RIM_PX = 9
+"""Width of the square by which new ink is grown to hold its blurred edge as well."""
 NOISE_SIGMAS = 6.0
 CORE = 0.35
 """Darkening, as a share of the paper's brightness, that a stroke must reach somewhere."""
@@ -86,18 +94,22 @@ def new_stroke(
 
 
 def _shift(before: Gray, after: Gray) -> tuple[float, float]:
-    """How far the page moved, (x, y) px, by phase correlation; 0 where the two photographs do not determine it."""
-    a, b = (cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float64) for image in (before, after))
-    if float(a.std()) < 3.0:
+    """How far the page moved, (x, y) px; 0 where the two photographs do not determine it."""
+    # New ink must not affect the shift. It is darker than everything that a shift could have brought to its place.
+    around = np.ones((2 * round(MOST_SHIFT_PX) + 1,) * 2, np.uint8)
+    new = (cv2.subtract(cv2.erode(before, around), after) > NEW_INK_GRAY).astype(np.uint8)
+    comparable = (cv2.dilate(new, np.ones((RIM_PX, RIM_PX), np.uint8)) == 0).astype(np.uint8)
+    warp, correlation = np.eye(2, 3, dtype=np.float32), 0.0
+    try:
+        for blur_px in BLURS_PX:
+            correlation, found = cv2.findTransformECC(
+                before, after, warp, cv2.MOTION_TRANSLATION, UNTIL, comparable, blur_px
+            )
+            warp = np.asarray(found, np.float32)
+    except cv2.error:  # it does not converge where there is nothing to see
         return 0.0, 0.0
-    # New ink must not affect the shift, so it is replaced by what was there before.
-    same = np.abs(a - b) < 40.0
-    b = np.where(same, b, a)
-    window = cv2.createHanningWindow((before.shape[1], before.shape[0]), cv2.CV_64F)
-    (dx, dy), response = cv2.phaseCorrelate(a, b, window)
-    if response < LEAST_RESPONSE or max(abs(dx), abs(dy)) > MOST_SHIFT_PX:
-        return 0.0, 0.0
-    return float(dx), float(dy)
+    dx, dy = (float(v) for v in warp[:, 2])
+    return (dx, dy) if correlation >= LEAST_CORRELATION and max(abs(dx), abs(dy)) <= MOST_SHIFT_PX else (0.0, 0.0)
 
 
 def _moved(image: Gray, by: tuple[float, float]) -> cv2.typing.MatLike:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import cv2
@@ -47,7 +48,9 @@ NEW = (180, 220, 90, 16)
 
 
 @pytest.mark.parametrize(
-    ("light", "shift"), [(1.0, (0, 0)), (0.85, (0, 0)), (1.0, (0.6, -0.4))], ids=["still", "lamp", "moved"]
+    ("light", "shift"),
+    [(1.0, (0, 0)), (0.85, (0, 0)), (1.0, (0.6, -0.4)), (1.0, (3.0, 2.0)), (0.85, (-6.0, 5.0))],
+    ids=["still", "lamp", "moved", "moved by far", "lamp and moved by far"],
 )
 def test_the_new_stroke_is_found_and_nothing_else(light: float, shift: tuple[float, float]) -> None:
     truth = np.zeros((400, 600), np.uint8)
@@ -55,6 +58,9 @@ def test_the_new_stroke_is_found_and_nothing_else(light: float, shift: tuple[flo
     found = new_stroke(page(*OLD), page(*OLD, NEW, light=light, shift=shift), PX_PER_MM, "page")
     assert (found.mask & (truth > 0)).sum() / (found.mask | (truth > 0)).sum() > 0.995
     assert not any(flag.startswith(("crosses", "cut")) for flag in found.flags)
+    said_px = [float(flag.split()[4]) for flag in found.flags if flag.startswith("moved: the page lay")]
+    moved_px = math.hypot(*shift)
+    assert said_px == ([pytest.approx(moved_px, abs=0.2)] if moved_px > 1.0 else [])
 
 
 def test_what_lies_on_older_ink_is_said_to_be_hidden() -> None:
