@@ -33,6 +33,16 @@ def compare(captured: Pixels, predicted: Pixels, reach: int, out: NDArray[np.flo
     _compare(_read_only(captured), _read_only(predicted), reach, out)
 
 
+def shift_to_overlap(fixed: Pixels, moving: Pixels, reach: int) -> tuple[int, int]:
+    """(rows, columns), at most `reach` each, by which `moving` must move back for the largest overlap with `fixed`.
+
+    Both are (h, w) uint8. Equal overlaps, as when one mark lies inside the other, go to the smallest shift, then to
+    the first.
+    """
+    a, b = _read_only(fixed), _read_only(moving)
+    return _best_shift(a.astype(np.float32), b.astype(np.float32), _box(a), reach)
+
+
 def _read_only(pixels: Pixels) -> Pixels:
     """The same pixels in one kind of array: numba would compile everything again for each kind."""
     view = np.ascontiguousarray(pixels).view()

@@ -140,9 +140,10 @@ def to_tone(coverage: Image, tone: Tone) -> Image:
 
 
 def best_shift(moving: Image, fixed: Image) -> Image:
-    """Shift `moving` by at most 6 px each way so that its overlap with `fixed` is largest."""
+    """Shift `moving` by at most 6 px each way so that its overlap with `fixed` is largest, and of equals the least."""
+    from calibrate.compare.compiled import shift_to_overlap  # numba takes a fifth of a second to import
+
     reach = BEST_SHIFT_PX
-    padded = np.pad(moving, reach)
-    overlap = cv2.matchTemplate(padded, fixed, cv2.TM_CCORR)
-    row, column = np.unravel_index(int(np.argmax(overlap)), overlap.shape)
-    return padded[row : row + SIZE_PX, column : column + SIZE_PX]
+    a, b = (np.rint(255.0 * image).astype(np.uint8) for image in (fixed, moving))
+    row, column = shift_to_overlap(a, b, reach)
+    return np.pad(moving, reach)[reach + row :, reach + column :][:SIZE_PX, :SIZE_PX]

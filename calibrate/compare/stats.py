@@ -119,26 +119,33 @@ class Paired:
     """Mean of paired differences, its 95 % interval, and its p-value."""
 
     n: int
+    groups: int
     mean: float
     interval: Interval | None
+    """Resamples whole groups; None for fewer than three."""
     p: float
-    """Two-sided, by flipping the signs of differences: exact up to 13 of them, else by 10,000 random flips."""
+    """Two-sided, by flipping the signs of whole groups: exact up to 13 of them, else by 10,000 random flips."""
 
 
-def paired(before: Floats, after: Floats) -> Paired | None:
-    """`after` minus `before`, pair by pair, NaN left out; None where no pair is left."""
+def paired(before: Floats, after: Floats, groups: NDArray[np.int64]) -> Paired | None:
+    """`after` minus `before`, pair by pair, NaN left out; None where no pair is left.
+
+    Pairs of one group, (n,) numbers, share an error, such as that of a model in one cell: they are flipped and drawn
+    together.
+    """
     difference = after - before
-    difference = difference[np.isfinite(difference)]
+    known = np.isfinite(difference)
+    difference = difference[known]
     n = len(difference)
     if not n:
         return None
-    interval = None
-    if n > 1:
-        interval = _interval(np.concatenate([means for means, _ in _draws(difference, np.zeros(n, np.int64))]))
+    _, group = np.unique(groups[known], return_inverse=True)
+    of_group = [difference[group == k] for k in range(int(group.max()) + 1)]
     # Differences below one millionth are ignored: reports keep six digits.
     equal = bool(np.all(np.abs(difference) < 1e-6))
-    p = 1.0 if equal or n == 1 else _sign_flip_p(difference)
-    return Paired(n, float(difference.mean()), interval, p)
+    sums = np.array([float(one.sum()) for one in of_group])
+    p = 1.0 if equal or len(sums) == 1 else _sign_flip_p(sums)
+    return Paired(n, len(sums), float(difference.mean()), interval_over_groups([one.tolist() for one in of_group]), p)
 
 
 def _sign_flip_p(difference: Floats) -> float:

@@ -25,6 +25,9 @@ MEASURES = ("csim", "ssim")
 Series = tuple[str, str, str, str]
 """Model, alignment, tone, measure."""
 Strokes = dict[tuple[str, ...], float]
+"""Scores by (H, alpha) and, where the same strokes are compared, recording and stroke."""
+CELL = slice(2)
+"""The part of such a key that names the cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +76,12 @@ def compare(before: Path, after: Path) -> Difference:
         if series not in new:
             continue
         both = sorted(old[series].keys() & new[series].keys())
-        values = [np.array([100.0 * side[series][key] for key in both]) for side in (old, new)]
-        test = paired(*values)
+        first, second = (np.array([100.0 * side[series][key] for key in both]) for side in (old, new))
+        cells = sorted({key[CELL] for key in both})
+        # The error of a model is common to all strokes of a cell.
+        test = paired(first, second, np.array([cells.index(key[CELL]) for key in both], np.int64))
         if test is not None:
-            tests.append((series, test, float(values[0].mean()), float(values[1].mean())))
+            tests.append((series, test, float(first.mean()), float(second.mean())))
     if not tests:
         raise CalibrationError(str(other), f"has no stroke, cell or model in common with {one}")
     corrected = holm([test.p for _, test, _, _ in tests])
@@ -107,7 +112,7 @@ def report_path(given: Path) -> Path:
 
 
 def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
-    """Read scores by (recording, stroke), or averaged by cell. Raises `CalibrationError` for an edited table."""
+    """Read scores by cell, recording and stroke, or averaged by cell. Raises `CalibrationError` for an edited table."""
     table = path.with_name("scores.csv")
     try:
         with table.open("rb") as file:
@@ -120,8 +125,8 @@ def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, 
     sums: dict[Series, dict[tuple[str, ...], tuple[float, int]]] = {}
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            stroke = (recordings[row["session_id"]], as_text(row["stroke_id"]))
-            key = stroke if by_stroke else (row["height_mm"], row["tilt_deg"])
+            cell = (row["height_mm"], row["tilt_deg"])
+            key = (*cell, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else cell
             for measure in MEASURES:
                 series = sums.setdefault((row["model"], row["alignment"], row["tone"], measure), {})
                 total, count = series.get(key, (0.0, 0))
@@ -135,8 +140,8 @@ def sentences(found: Difference) -> Iterator[str]:
     yield f"Before: {_named(found.before)}, brushloop {versions[0]}. After: {_named(found.after)}, {versions[1]}."
     what = "the same stroke" if found.paired_by == "stroke" else "the average of the same (H, α)"
     yield (
-        f"Paired by {what}, n = {found.changes[0].test.n}; p by a sign-flip test, corrected by Holm for "
-        f"{len(found.changes)} series ({found.before.label})."
+        f"Paired by {what}, n = {found.changes[0].test.n} in {found.changes[0].test.groups} cells; p by flipping the "
+        f"signs of whole cells, corrected by Holm for {len(found.changes)} series ({found.before.label})."
     )
     if found.paired_by == "cell":
         yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."

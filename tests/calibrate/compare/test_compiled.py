@@ -8,9 +8,9 @@ import pytest
 
 from calibrate.compare import compiled
 from calibrate.compare.compiled import compare
-from calibrate.compare.field import BEST_SHIFT_PX
+from calibrate.compare.field import BEST_SHIFT_PX, Alignment
 from calibrate.compare.images import pack, unpack
-from calibrate.compare.similarity import csim, ssim
+from calibrate.compare.similarity import csim, similarity, ssim
 
 
 def marks(rng: np.random.Generator, count: int, tones: int) -> np.ndarray:
@@ -64,6 +64,17 @@ def test_the_best_shift_is_taken_before_scoring(tones: int) -> None:
         assert found[0] == pytest.approx(csim(captured / 255.0, shifted), abs=1e-9)
         assert found[1] == pytest.approx(ssim(captured / 255.0, shifted), abs=1e-9)
     assert out[3, 0] < out[2, 0] + 1e-9
+
+
+def test_a_mark_inside_another_is_left_where_it_is_by_every_comparison() -> None:
+    captured, predicted = np.zeros((128, 128), np.uint8), np.zeros((128, 128), np.uint8)
+    captured[40:90, 20:110] = 255
+    predicted[50:80, 30:100] = 255  # every shift of up to 6 px has the same overlap
+    out = np.empty((1, 2))
+    compare(captured, predicted[None], BEST_SHIFT_PX, out)
+    a, b = (image.astype(np.float32) / 255 for image in (captured, predicted))
+    assert similarity(a, b, Alignment.SIZE_NORMALISED) == pytest.approx(out[0], abs=1e-9)
+    assert out[0, 1] == pytest.approx(ssim(a, b), abs=1e-9)
 
 
 def test_a_blank_image_has_no_score() -> None:

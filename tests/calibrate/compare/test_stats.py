@@ -61,27 +61,40 @@ def test_equal_scores_give_equal_numbers() -> None:
 
 
 def test_a_paired_test_counts_every_flip_of_few_differences() -> None:
-    found = paired(np.zeros(5), np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
+    found = paired(np.zeros(5), np.array([1.0, 2.0, 3.0, 4.0, 5.0]), np.arange(5))
     assert found is not None
     assert found.mean == 3.0
     assert found.p == pytest.approx(2 / 32)
 
 
+def test_presses_of_one_cell_are_flipped_and_drawn_together() -> None:
+    rng = np.random.default_rng(5)
+    cells = strata(*[10] * 4)
+    before = rng.normal(90.0, 3.0, 40)
+    # The change has one sign in every cell by chance; ten presses of a cell are no further evidence of it.
+    found = paired(before, before + np.array([0.2, 1.8, 0.4, 2.4])[cells] + rng.normal(0.0, 0.1, 40), cells)
+    assert found is not None
+    assert (found.n, found.groups) == (40, 4)
+    assert found.p == pytest.approx(2 / 16)
+    assert found.interval is not None
+    assert found.interval[1] - found.interval[0] > 1.0
+
+
 def test_a_shift_within_noise_is_no_difference_and_a_clear_one_is() -> None:
     rng = np.random.default_rng(4)
-    before = rng.normal(90.0, 3.0, 100)
-    noise = paired(before, before + rng.normal(0.0, 1.0, 100))
-    shift = paired(before, before + rng.normal(1.0, 1.0, 100))
+    before, alone = rng.normal(90.0, 3.0, 100), np.arange(100)
+    noise = paired(before, before + rng.normal(0.0, 1.0, 100), alone)
+    shift = paired(before, before + rng.normal(1.0, 1.0, 100), alone)
     assert noise is not None
     assert shift is not None
     assert noise.p > 0.05
     assert shift.p < 0.001
     assert shift.interval is not None
     assert shift.interval[0] > 0.5
-    same = paired(before, before.copy())
+    same = paired(before, before.copy(), alone)
     assert same is not None
     assert same.p == 1.0
-    assert paired(np.array([np.nan]), np.array([1.0])) is None
+    assert paired(np.array([np.nan]), np.array([1.0]), np.array([0])) is None
 
 
 def test_many_tests_are_corrected_together() -> None:

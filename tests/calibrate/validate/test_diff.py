@@ -40,15 +40,19 @@ def test_a_report_does_not_differ_from_itself(before: Path) -> None:
 def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
     invoke("validate", session, "--out", tmp_path, *MODELS, "--mm-per-px", "0.5")
     found = {change.series: change for change in compare(before, tmp_path).changes}
-    # A coarser field: more blank paper in every window of SSIM.
-    assert found[("line", "mm", "binary", "ssim")].verdict == "better"
-    assert found[("line", "mm", "binary", "ssim")].test.n == 10
+    # A coarser field: more blank paper in every window of SSIM, in each of the five cells.
+    coarser = found[("line", "mm", "binary", "ssim")]
+    assert (coarser.test.n, coarser.test.groups) == (10, 5)
+    assert coarser.test.interval is not None
+    assert coarser.test.interval[0] > 0.0
+    assert coarser.test.p == pytest.approx(2 / 2**5)  # signs are flipped by cell: five alike are no proof yet
+    assert coarser.verdict == "no significant difference"
     assert found[("line", "size-normalised", "binary", "ssim")].verdict == "no significant difference"
     said = json.loads(invoke("validate", "diff", before, tmp_path, "--json"))
     assert said["paired_by"] == "stroke"
     assert said["source"] == "imported photographs"
     table = invoke("validate", "diff", before, tmp_path)
-    assert "better" in table
+    assert "n = 10 in 5 cells" in table
     assert "the same stroke" in table
 
 
