@@ -20,7 +20,6 @@ from bench.harness import Bench, BenchError, Result, results_of
 def benches() -> dict[str, Bench]:
     """Every benchmark by name; a new one is added here. What a benchmark needs is imported when it runs."""
     return {
-        "adaptive": _late("adaptive"),
         "analysis": _late("analysis"),
         "brushfit": _late("brushfit"),
         "characters": _late("characters"),

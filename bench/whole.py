@@ -39,7 +39,6 @@ ACCURACY = {
     "generator": 1000,
     "generator-qbc": 1000,
     "written": 1300,
-    "adaptive": 600,
     "brushfit": 1800,
     "twin": 2400,
 }
