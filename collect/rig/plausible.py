@@ -70,7 +70,13 @@ def tool_length(offset_mm: tuple[float, float, float]) -> Check:
 
 
 def brush_square(rotation_deg: tuple[float, float, float]) -> Check:
-    """Angle between the flange's axis and the brush's: a holder is not far from square to the flange."""
+    """Angle between the flange's axis and the brush's: a holder is not far from square to the flange.
+
+    No measurement gives exactly zero: there the brush was only taken as square.
+    """
+    if not any(rotation_deg):
+        remedy = "Hold the brush upright: brushloop rig teach tip."
+        return unmeasured("brush to the flange's axis", "taken as square", remedy)
     about_x, about_y, _ = map(math.radians, rotation_deg)
     lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, math.cos(about_x) * math.cos(about_y)))))
     remedy = "The brush would lean far from the flange's axis. Look at the holder, and teach the tip again."

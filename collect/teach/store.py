@@ -97,9 +97,9 @@ class Notebook(Config):
         kept = {field: taught for field, taught in self.values.items() if not field.startswith(beginnings)}
         return self.model_copy(update={"values": kept})
 
-    def without_touches(self, *kinds: str) -> Notebook:
-        """The same without what was touched of these kinds."""
-        kept = {name: touch for name, touch in self.touches.items() if name.split(" ")[0] not in kinds}
+    def without_touches(self, *things: str) -> Notebook:
+        """The same without what was touched of these kinds, such as `pin`, or of these names, such as `pin 0`."""
+        kept = {n: touch for n, touch in self.touches.items() if n not in things and n.split(" ")[0] not in things}
         return self.model_copy(update={"touches": kept})
 
     def finished(self, step: StepName, *, reopens: tuple[StepName, ...] = ()) -> Notebook:

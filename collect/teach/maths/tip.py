@@ -26,6 +26,9 @@ ELSEWHERE_MM = 10.0
 """A touch that lies farther than this from where the others agree was not made at the pin."""
 HAND_MM = 0.15
 """Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
+LEAST_OFF_DEG, LEAST_AGREEING = 1.0, 5
+"""A hold that is less than this from the others is no stray, and fewer holds than this do not outvote a stray."""
+MEDIAN_STEPS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,23 +128,57 @@ class AxisFit:
     """As `robot.tcp_rotation_deg`: about x, then y, then z of the flange."""
     lean_deg: float
     sigma_deg: float
-    """Standard error of the lean in each direction."""
+    """Standard error of the lean in each direction; infinite for a single hold."""
+    off_deg: tuple[float, ...]
+    """Angle of each hold from the direction in which most of them agree."""
+    strays: tuple[int, ...]
+    """Numbers of the holds that do not agree with the others, and are not part of the fit."""
+
+    @property
+    def holds(self) -> int:
+        """Number of holds that agree."""
+        return len(self.off_deg) - len(self.strays)
+
+    @property
+    def clear(self) -> bool:
+        """Whether so many holds agree that it is the strays which were not upright, and not the others."""
+        return self.holds >= max(LEAST_AGREEING, 2 * len(self.strays))
 
 
 def find_axis(flanges: Sequence[Pose]) -> AxisFit:
-    """The brush's direction in the flange's frame: the mean of where "down" was. At least three poses.
+    """The brush's direction in the flange's frame: the mean of where "down" was, without the holds that stray.
 
-    A person who holds a brush upright by eye errs by a degree to any side, which the mean takes out.
+    A hold strays if it is far from the geometric median of all, which a minority of bad holds hardly moves (Weiszfeld's
+    iteration; Vardi and Zhang 2000). At least one pose.
     """
     down = np.array([Rotation.from_quat(p.quaternion).inv().apply([0.0, 0.0, -1.0]) for p in flanges])
-    mean = np.asarray(down.mean(axis=0) / np.linalg.norm(down.mean(axis=0)), np.float64)
-    scatter = down - mean * (down @ mean)[:, None]
-    sigma = math.sqrt(float((scatter**2).sum()) / (2.0 * (len(down) - 1)) / len(down))
+    middle = down.mean(axis=0)
+    for _ in range(MEDIAN_STEPS):
+        weights = 1.0 / np.maximum(np.linalg.norm(down - middle, axis=1), 1e-6)
+        middle = weights @ down / weights.sum()
+    typical_deg = float(np.sort(_angles_deg(down, middle))[(len(down) - 1) // 2])
+    agree = _angles_deg(down, middle) <= max(LEAST_OFF_DEG, OUTLIER_SHARE * typical_deg)
+    mean = np.asarray(down[agree].mean(axis=0) / np.linalg.norm(down[agree].mean(axis=0)), np.float64)
+    count, off_deg = int(agree.sum()), _angles_deg(down, mean)
+    squares = float((off_deg[agree] ** 2).sum())
+    sigma_deg = math.sqrt(squares / (2.0 * (count - 1)) / count) if count > 1 else math.inf
     across = np.cross([0.0, 0.0, 1.0], mean)
     lean = math.atan2(float(np.linalg.norm(across)), float(mean[2]))
     axis = across / max(float(np.linalg.norm(across)), 1e-12)
     rz, ry, rx = Rotation.from_rotvec(lean * axis).as_euler("ZYX", degrees=True)
-    return AxisFit((float(rx), float(ry), float(rz)), math.degrees(lean), math.degrees(sigma))
+    return AxisFit(
+        (float(rx), float(ry), float(rz)),
+        math.degrees(lean),
+        sigma_deg,
+        tuple(off_deg.tolist()),
+        tuple(np.flatnonzero(~agree).tolist()),
+    )
+
+
+def _angles_deg(directions: Floats, toward: Floats) -> Floats:
+    """(n,) angles between (n, 3) directions and one, of any lengths."""
+    across = np.linalg.norm(np.cross(directions, toward), axis=1)
+    return np.degrees(np.arctan2(across, directions @ toward))
 
 
 def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, float]:

@@ -69,12 +69,8 @@ class PlacesStep(Step):
             how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
             wipe = await touch(day, reader, Target("well-rim", 1, may_skip=True), how, "well-rim 1") is not None
         if wipe:
-            try:
+            with day.touched_again_if_refused("well-rim 1"):
                 check_wipe(day.notebook)
-            except CannotTeach:
-                kept = {name: touch for name, touch in day.notebook.touches.items() if name != "well-rim 1"}
-                day.save(day.notebook.model_copy(update={"touches": kept}))
-                raise
         day.keep("places", "aside.wipe", wipe, "answered")
 
     async def _wash(self, day: Day, reader: ArmReader) -> None:

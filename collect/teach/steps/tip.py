@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collect.errors import CannotTeach
+from collect.rig.plausible import brush_square
 from collect.teach.arm_reader import ArmReader
 from collect.teach.day import Day, Step
 from collect.teach.guide import Target
 from collect.teach.jog import touch
-from collect.teach.maths.tip import LEAST_TOUCHES, elsewhere, find_axis, find_tip
+from collect.teach.maths.tip import LEAST_TOUCHES, AxisFit, elsewhere, find_axis, find_tip
 from collect.teach.store import Notebook, StepName, Taught, now_utc
+from drivers.geometry import distance
 
 MOST_TOUCHES = 24
 GOOD_MM = 0.18
@@ -17,12 +19,14 @@ WORST_MM = 0.35
 """Above this after the last touch, the tip is not accepted."""
 UNKNOWN_MM = 20.0
 """Error above which no place of the tip is shown."""
-LEAST_UPRIGHTS, UPRIGHTS = 3, 12
-"""Times that the brush is held against a set square, each with another turn of the wrist. An upright brush bends along
-the heading only by the few degrees of its set, so an error of 0.12 deg across the heading turns every mark by 5 deg,
-and the mark is judged bent. Twelve times, each accurate to 0.15 deg, leave 0.04 deg."""
-LEAST_LEAN = 3.0
-"""A lean of the brush against the flange counts from this many standard errors."""
+LEAST_UPRIGHTS, UPRIGHTS, MOST_UPRIGHTS = 3, 12, 24
+"""Times that the brush is held against a set square, each with another turn of the wrist. Twelve times, each accurate
+to 0.15 deg, leave a standard error of 0.04 deg."""
+WORST_DEG = 0.12
+"""Standard error above which the direction counts as not measured. An upright brush bends along the heading only by the
+few degrees of its set, so an error of 0.12 deg across the heading turns every mark by 5 deg, and it is judged bent."""
+LEAST_TURN_DEG = 10.0
+"""By less than this from hold to hold the wrist was not turned, and perhaps the arm was not even moved."""
 SIDES = ("away from you", "to the right", "toward you", "to the left")
 
 
@@ -43,13 +47,7 @@ class TipStep(Step):
         async with day.arm() as reader:
             await self._pin(day, reader)
             await day.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
-            for index in range(UPRIGHTS):
-                how = (
-                    f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
-                    f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
-                )
-                if await touch(day, reader, Target("upright", index, may_skip=True), how, f"upright {index}") is None:
-                    break
+            await self._uprights(day, reader)
 
     async def _pin(self, day: Day, reader: ArmReader) -> None:
         if await self._known(day):
@@ -85,8 +83,7 @@ class TipStep(Step):
         if slip is not None:
             name = list(touches)[slip]
             await day.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
-            kept = {key: t for key, t in day.notebook.touches.items() if key != f"pin {name}"}
-            day.save(day.notebook.model_copy(update={"touches": kept}))
+            day.save(day.notebook.without_touches(f"pin {name}"))
             return False
         x, y, z = fit.offset_mm
         if fit.error_mm > UNKNOWN_MM:
@@ -98,6 +95,53 @@ class TipStep(Step):
             f"{fit.error_mm:.3f} mm (goal {GOOD_MM:g}); the touches scatter by {max(fit.residuals_mm):.2f} mm at most."
         )
         return fit.error_mm <= GOOD_MM
+
+    async def _uprights(self, day: Day, reader: ArmReader) -> None:
+        """Have the brush held upright until its direction is known well enough. Raises `CannotTeach`."""
+        while not await self._direction_known(day):
+            free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in day.notebook.touches)
+            if (index := next(free, None)) is None:
+                with day.touched_again_if_refused("upright"):
+                    raise CannotTeach(
+                        f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
+                        "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
+                    )
+            how = (
+                f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
+                f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
+            )
+            if await touch(day, reader, Target("upright", index, may_skip=True), how, f"upright {index}") is None:
+                if measured_axis(day.notebook) is None:
+                    await day.say("The direction of the brush is not measured.", tone="warning")
+                return
+
+    async def _direction_known(self, day: Day) -> bool:
+        """Judge each hold by itself and by the others, name those that were not upright, and forget them."""
+        holds = day.notebook.touched("upright")
+        if not holds:
+            return False
+        *before, newest = holds
+        flanges, axis = list(holds.values()), find_axis(list(holds.values()))
+        names = [f"Hold {int(name) + 1}" for name in holds]
+        square = brush_square(find_axis(flanges[-1:]).rotation_deg)
+        if square.verdict == "contradicts":
+            said = f"{names[-1]}: the brush would lean by {square.value} against the flange ({square.allowed})"
+            wrong = {newest: f"{said}: it was not upright"}
+        elif before and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
+            wrong = {newest: f"{names[-1]} is {names[-2].lower()} again: turn the wrist in between"}
+        else:
+            wrong = {list(holds)[k]: f"{names[k]} is {axis.off_deg[k]:.1f} deg from the others" for k in axis.strays}
+            if wrong and not axis.clear:
+                await day.say(*wrong.values(), "The next holds will show which were not upright.", tone="warning")
+                return False
+        if wrong:
+            await day.say(*wrong.values(), "Left out, and asked for again.", tone="warning")
+            day.save(day.notebook.without_touches(*(f"upright {name}" for name in wrong)))
+            return False
+        if len(holds) >= LEAST_UPRIGHTS:
+            known = f"known to {axis.sigma_deg:.2f} deg (limit {WORST_DEG:g})"
+            await day.say(f"{axis.holds} holds: the direction of the brush is {known}.")
+        return axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The offset, and how the brush leans against the flange."""
@@ -113,30 +157,16 @@ class TipStep(Step):
             at=now,
             step="tip",
         )
-        uprights = list(notebook.touched("upright").values())
-        if len(uprights) < LEAST_UPRIGHTS:
-            square = Taught(
-                value=[0.0, 0.0, 0.0],
-                unit="deg",
-                how="taken as square to the flange",
-                known="not measured",
-                at=now,
-                step="tip",
-            )
-            return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": square}
-        axis = find_axis(uprights)
-        leans = axis.lean_deg > LEAST_LEAN * axis.sigma_deg
+        if (axis := measured_axis(notebook)) is None:
+            lean, how, sigma, known = (0.0, 0.0, 0.0), "taken as square to the flange", None, "not measured"
+        else:
+            lean, sigma = axis.rotation_deg, axis.sigma_deg
+            how = f"held upright along a set square {axis.holds} times"
+            known = f"leans by {axis.lean_deg:.2f} deg against the flange"
         return {
             "robot.tcp_offset_mm": offset,
             "robot.tcp_rotation_deg": Taught(
-                value=list(axis.rotation_deg) if leans else [0.0, 0.0, 0.0],
-                unit="deg",
-                how=f"held upright along a set square {len(uprights)} times",
-                sigma=axis.sigma_deg,
-                known=f"leans by {axis.lean_deg:.2f} deg against the flange"
-                + ("" if leans else ", no more than the hand's error: taken as square"),
-                at=now,
-                step="tip",
+                value=list(lean), unit="deg", how=how, sigma=sigma, known=known, at=now, step="tip"
             ),
         }
 
@@ -148,3 +178,10 @@ class TipStep(Step):
         """The length."""
         x, y, z = notebook.numbers("robot.tcp_offset_mm")
         return f"({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange"
+
+
+def measured_axis(notebook: Notebook) -> AxisFit | None:
+    """The direction of the brush; None where it was not held upright often or well enough to know it."""
+    holds = list(notebook.touched("upright").values())
+    axis = find_axis(holds) if holds else None
+    return axis if axis is not None and axis.holds >= LEAST_UPRIGHTS and axis.sigma_deg <= WORST_DEG else None

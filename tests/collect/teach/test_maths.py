@@ -17,7 +17,7 @@ from calibrate.errors import CalibrationError
 from collect.errors import CannotTeach
 from collect.teach.maths.box import hull
 from collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
-from collect.teach.maths.tip import elsewhere, find_axis, find_tip, tip_of
+from collect.teach.maths.tip import AxisFit, elsewhere, find_axis, find_tip, tip_of
 from drivers.samples import Pose
 
 BOARD = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
@@ -89,17 +89,67 @@ def test_a_touch_that_was_never_made_at_the_pin_is_named_though_it_spoils_the_re
     assert elsewhere(flanges[1:]) is None, "four touches, all of which agree"
 
 
+def holds(rng: np.random.Generator, lean: Rotation, off_deg: list[float], spread_deg: float = 0.15) -> list[Pose]:
+    """A brush that leans on its flange, held upright by hand; some holds are off, each to a side of its own."""
+    down, poses = Rotation.from_rotvec([math.pi, 0.0, 0.0]), []
+    for off in off_deg:
+        toward = rng.uniform(0.0, math.tau)
+        wrong = Rotation.from_rotvec(math.radians(off) * np.array([math.cos(toward), math.sin(toward), 0.0]))
+        hand = Rotation.from_rotvec(np.radians([*rng.normal(0.0, spread_deg, 2), 0.0]))
+        wrist = Rotation.from_euler("Z", rng.uniform(0.0, 360.0), degrees=True)
+        poses.append(flange_at(PIN_MM, hand * wrong * wrist * down * lean.inv(), np.zeros(3)))
+    return poses
+
+
+def axis_error_deg(fit: AxisFit, true: Rotation) -> float:
+    axis = Rotation.from_euler("ZYX", fit.rotation_deg[::-1], degrees=True).apply([0.0, 0.0, 1.0])
+    return math.degrees(math.acos(min(1.0, float(axis @ true.apply([0.0, 0.0, 1.0])))))
+
+
 def test_how_the_brush_leans_is_the_mean_of_upright_poses() -> None:
     rng, true = np.random.default_rng(2), Rotation.from_euler("ZYX", [0.0, 1.5, -2.0], degrees=True)
-    down = Rotation.from_rotvec([math.pi, 0.0, 0.0])
-    poses = []
-    for heading_deg in rng.uniform(0.0, 360.0, 40):
-        held = Rotation.from_rotvec(np.radians([*rng.normal(0.0, 0.5, 2), 0.0]))
-        turn = held * Rotation.from_euler("Z", heading_deg, degrees=True) * down * true.inv()
-        poses.append(flange_at(PIN_MM, turn, np.zeros(3)))
-    fit = find_axis(poses)
-    axis = Rotation.from_euler("ZYX", fit.rotation_deg[::-1], degrees=True).apply([0.0, 0.0, 1.0])
-    assert math.degrees(math.acos(float(axis @ true.apply([0.0, 0.0, 1.0])))) < 4.0 * fit.sigma_deg < 1.0
+    fit = find_axis(holds(rng, true, [0.0] * 40, spread_deg=0.5))
+    assert axis_error_deg(fit, true) < 4.0 * fit.sigma_deg < 1.0
+    assert fit.strays == ()
+
+
+def test_of_twelve_holds_one_to_four_bad_ones_are_named_and_none_of_the_others() -> None:
+    rng, named, missed, wrongly, errors_deg, stated_deg = (
+        np.random.default_rng(28),
+        0,
+        0,
+        0,
+        list[float](),
+        list[float](),
+    )
+    for number in range(400):
+        true = Rotation.from_euler("ZYX", [0.0, *rng.uniform(-3.0, 3.0, 2)], degrees=True)
+        count = 1 + number % 4
+        off_deg = [*rng.uniform(2.0, 40.0, count), *[0.0] * (12 - count)]
+        order = rng.permutation(12)
+        fit = find_axis(holds(rng, true, [off_deg[k] for k in order]))
+        bad = {k for k in range(12) if off_deg[order[k]]}
+        named += len(bad & set(fit.strays))
+        missed += len(bad - set(fit.strays))
+        wrongly += len(set(fit.strays) - bad)
+        errors_deg.append(axis_error_deg(fit, true))
+        stated_deg.append(fit.sigma_deg)
+        assert fit.clear
+    assert (named, missed, wrongly) == (1000, 0, 0)
+    assert max(errors_deg) < 0.2, "the mean of all twelve is off by up to ten degrees"
+    assert math.sqrt(np.mean(np.square(errors_deg)) / 2.0) == pytest.approx(np.mean(stated_deg), rel=0.15)
+
+
+def test_bad_holds_that_came_first_are_not_yet_told_from_good_ones() -> None:
+    """Three holds at one wrong place agree, and only the later ones show that they were not upright."""
+    rng, true = np.random.default_rng(4), Rotation.identity()
+    wrong = holds(rng, Rotation.from_euler("Y", 8.0, degrees=True), [0.0] * 3)
+    fits = [find_axis([*wrong, *holds(rng, true, [0.0] * good)]) for good in range(1, 9)]
+    for fit in fits:
+        assert not fit.clear or set(fit.strays) <= {0, 1, 2}
+        assert fit.strays or fit.sigma_deg > 0.12, "neither named nor accepted"
+    assert fits[-1].clear
+    assert fits[-1].strays == (0, 1, 2)
 
 
 @given(offsets, st.floats(0.0, 359.0), st.floats(10.0, 60.0))
