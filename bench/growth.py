@@ -40,7 +40,7 @@ POINTS, PICTURE = DOCS / "growth.csv", DOCS / "growth.svg"
 VIEWS = {"small": CLOSE, "full": STILL}
 COLUMNS = ("view", "command", "strokes", "wall_s", "cpu_s", "peak_mb")
 EXPORTS = ("png", "npz", "parquet")
-COMMANDS = ("import", "verify", "merge", *(f"export-{kind}" for kind in EXPORTS), "validate")
+COMMANDS = ("import", "verify", *(f"export-{kind}" for kind in EXPORTS), "validate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,6 @@ def measured(largest: int, seed: int, view: str = "full") -> Iterator[Point]:
                     place,
                 ),
                 "verify": ("sessions", "verify", place),
-                "merge": ("sessions", "merge", out / "merged.mcap", place, another),
                 **{f"export-{kind}": ("sessions", "export", place, out / kind, "--format", kind) for kind in EXPORTS},
                 "validate": ("validate", place, "--fit", fitted, "--out", out / "report"),
             }

@@ -21,9 +21,8 @@ from calibrate.session import calibration_of
 from calibrate.stages import Trace, contact_sheet, trace_scaled, trace_seen
 from calibrate.stroke.difference import new_stroke
 from calibrate.stroke.params import Params
-from sessions.imports.sequence import SEQUENCE
 from sessions.progress import Progress, counted, unseen
-from sessions.reader import Capture, Recording
+from sessions.reader import Recording
 from sessions.recording.messages import decode_gray
 from sessions.recording.schemas import Stroke
 
@@ -38,11 +37,9 @@ def show_stroke(session: Path, stroke: str, out: Path, lens: Path | None = None,
     calibration, by the session's last photograph of the board. Raises `CalibrationError`.
     """
     recording = Recording(session)
-    before: Capture | None = None
     for capture in counted(recording.captures(), "strokes read", recording.strokes(), progress):
         if stroke in ("", capture.stroke.stroke_id):
             break
-        before = capture
     else:
         raise CalibrationError(str(recording.path), f"holds no stroke {stroke!r}")
     one, image, where = capture.stroke, capture.image(), f"{recording.path.name} {capture.stroke.stroke_id}"
@@ -51,8 +48,6 @@ def show_stroke(session: Path, stroke: str, out: Path, lens: Path | None = None,
         window_mm = Field().window_mm(one.anchor_mm)
         trace = trace_seen(image, plane, window_mm, one.anchor_mm, where, PARAMS, one.cell_mm)
     elif one.px_per_mm is not None:
-        if recording.header.protocol.startswith(SEQUENCE) and before is not None:
-            image = only_new(before.image(), image, float(np.mean(one.px_per_mm)), where)
         trace = trace_scaled(image, one.px_per_mm, one.anchor_px, where, PARAMS)
     else:
         raise CalibrationError(where, "has neither an anchor on the sheet nor a scale of its own")

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sessions.errors import DiskFull, SessionError, disk_error, in_one_line
+from sessions.errors import DiskFull, InputError, SessionError, disk_error, in_one_line
 
 SPARE_BYTES = 16 * 1024 * 1024
 """Space that is always kept free, so that the journal's last lines fit."""
@@ -31,6 +31,21 @@ def check_room(folder: Path, need_bytes: int) -> None:
     if free < need_bytes + SPARE_BYTES:
         need_mb, free_mb = (need_bytes + SPARE_BYTES) / 1e6, free / 1e6
         raise DiskFull(folder, f"the disk has {free_mb:.0f} MB left, {need_mb:.0f} MB are needed; make room", free)
+
+
+def read_bounded(path: Path, max_bytes: int) -> bytes:
+    """Bytes of a file from a person or from elsewhere. Raises `InputError` where it is larger or cannot be read.
+
+    Never more than `max_bytes` + 1 are read, whatever size the file system or a pipe claims.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise InputError(path, f"cannot read: {in_one_line(error)}") from None
+    if len(data) > max_bytes:
+        raise InputError(path, f"is larger than {max_bytes} bytes, the most that is read")
+    return data
 
 
 def sync(file: IO[Any]) -> None:
@@ -112,20 +127,6 @@ def same_bytes(one: Path, other: Path) -> bool:
             if piece != second.read(_PIECE_BYTES):
                 return False
     return True
-
-
-def publish(part: Path, target: Path) -> None:
-    """Rename a finished file to `target`. Raises `FileExistsError` if `target` exists, or another `OSError`."""
-    try:
-        os.link(part, target)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        if target.exists():
-            raise FileExistsError(target) from None
-        part.rename(target)
-        return
-    part.unlink()
 
 
 def _link(path: Path, kept: Path) -> None:

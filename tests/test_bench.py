@@ -65,7 +65,7 @@ def test_the_table_keeps_rows_that_were_not_measured_and_names_missed_goals(tmp_
 
 
 def test_a_figure_beside_its_goal_or_of_growth_asks_for_a_ratio(tmp_path: Path) -> None:
-    peers = {"overhead: software": "the goal (2 %)", "growth-merge-memory": "1.05 times", "growth-merge-time": "x"}
+    peers = {"overhead: software": "the goal (2 %)", "growth-verify-memory": "1.05 times", "growth-verify-time": "x"}
     path = tmp_path / "bench.md"
     table.renew([Result(name, 3.0, "", peer, 0.95, 4, 0) for name, peer in peers.items()], path)
     goals = [line.split(" | ")[5] for line in path.read_text().splitlines() if line.startswith("| `")]
@@ -74,15 +74,15 @@ def test_a_figure_beside_its_goal_or_of_growth_asks_for_a_ratio(tmp_path: Path) 
 
 def test_growth_compares_the_largest_sizes_with_the_smallest() -> None:
     used = {100: Used(1.0, 2.0, 80.0), 1000: Used(5.0, 6.5, 100.0), 5000: Used(30.0, 30.5, 104.0)}
-    time, memory = growth.results([growth.Point("merge", size, one) for size, one in used.items()], 0)
-    assert (time.name, time.value) == ("growth-merge-time", 6.0)
+    time, memory = growth.results([growth.Point("verify", size, one) for size, one in used.items()], 0)
+    assert (time.name, time.value) == ("growth-verify-time", 6.0)
     assert time.ratio == pytest.approx(5.0 / 6.0)
     assert memory.ratio == pytest.approx(1.05 * 100 / 104)
 
 
 def test_a_point_of_growth_replaces_only_the_same_point(tmp_path: Path) -> None:
     def point(view: str, cpu_s: float) -> growth.Point:
-        return growth.Point("merge", 100, Used(1.0, cpu_s, 80.0), view)
+        return growth.Point("verify", 100, Used(1.0, cpu_s, 80.0), view)
 
     path = tmp_path / "growth.csv"
     growth.kept([point("small", 2.0), point("full", 3.0)], path)

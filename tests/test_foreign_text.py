@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import sys
+import zlib
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -21,6 +24,14 @@ ACTED_ON = [*map(chr, [*range(9), *range(11, 32), *range(127, 160)]), "\u202e", 
 HEADER = Make.header.model_copy(
     update=dict.fromkeys(("software", "brush", "lens", "ink", "paper", "robot", "robot_firmware", "licence"), HOSTILE)
 )
+
+
+def with_profile(png: bytes) -> bytes:
+    """The PNG with a broken colour profile whose name acts on a terminal; libpng prints such a name to stderr."""
+    profile = struct.pack(">I", 1000) + bytes(128) + Random(1).randbytes(868)
+    body = b"iCCP" + b"a\x9b31m\x85\x1b[2J\0" + b"\0" + zlib.compress(profile)
+    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return png[:33] + chunk + png[33:]
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +50,21 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for file in (folder / "damaged").glob("0000-*.mcap"):
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     shutil.copytree(folder / "open", folder / f"name{NAME}")
+    (folder / "photos").mkdir()
+    (folder / "photos" / "profile.png").write_bytes(with_profile(make.png()))
+    (folder / "photos" / "table.csv").write_text("file,px_per_mm,start_x_px,start_y_px\nprofile.png,1,0,12\n")
+    header = make.header.model_copy(update={"session_id": "profile"})
+    store = SessionStore.create(folder / "profile", header, make.snapshots, make.clock())
+    still = make.still(0, with_profile(make.png()))
+    make.take(
+        store,
+        "a",
+        "capture",
+        [still, make.stroke(0, kind="drag", px_per_mm=(1.0, 1.0))],
+        {"stroke_id": "a", "still": 0},
+    )
+    store.close()
+    store.release()
     table = f'"file{HOSTILE.replace(chr(13), "")}",px_per_mm\na.png,1\n'
     (folder / "table.csv").write_text(table, encoding="utf-8")
     (folder / "rig.toml").write_text(f"[robot]\n{json.dumps(HOSTILE)} = {json.dumps(HOSTILE)}\n", encoding="utf-8")
@@ -57,9 +83,13 @@ COMMANDS = [
     "sessions verify damaged",
     "sessions repair open",
     "sessions repair damaged",
-    "sessions merge merged.mcap closed open",
     "sessions export closed exported",
     "sessions import . --csv table.csv",
+    "sessions import photos --csv photos/table.csv --out imported",
+    "sessions verify profile",
+    "sessions repair profile",
+    "sessions export profile out --format npz",
+    "validate profile --no-held-out",
     "validate closed",
     "validate closed --json --no-held-out",
     "validate diff fit.json fit.json",

@@ -53,7 +53,6 @@ COMMANDS = (
     "sim --write-rig no/rig.toml",
     "sessions verify nowhere",
     "sessions export nowhere out",
-    "sessions merge out.mcap nowhere nowhere",
     "sessions import nowhere --csv no.csv",
 )
 SLOW = ("torch", "scipy", "numba", "matplotlib", "skimage", "textual", "jinja2", "can", "rich.progress")

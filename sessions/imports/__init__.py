@@ -1,1 +1,1 @@
-"""Imports: photographs, scans and page sequences from elsewhere become sessions."""
+"""Imports: photographs from elsewhere become sessions."""

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from sessions.cells import as_text
-from sessions.errors import InputError, in_one_line
+from sessions.disk import read_bounded
+from sessions.errors import InputError
 from sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
 from sessions.spool import Spool
 
@@ -106,14 +107,9 @@ def read_text(table: Path) -> str:
     if not table.is_file():
         raise InputError(table, "no such table")
     try:
-        if table.stat().st_size > MAX_TABLE_BYTES:
-            raise InputError(table, f"table of {table.stat().st_size} bytes exceeds {MAX_TABLE_BYTES}")
-        with table.open(encoding="utf-8-sig", newline="") as file:
-            return file.read()
+        return read_bounded(table, MAX_TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(table, "is not UTF-8 text") from None
-    except OSError as error:
-        raise InputError(table, f"cannot read: {in_one_line(error)}") from None
 
 
 def _columns(

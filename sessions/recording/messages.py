@@ -27,7 +27,8 @@ MAX_IMAGE_PIXELS = 200_000_000
 MAX_JPEG_SCANS = 100
 MAX_SCANNED_PIXELS = 4_000_000_000
 """Limit of pixels times scans: each scan of a progressive JPEG covers the whole image, at about 1 ns a pixel."""
-PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+PNG_START, PNG_CHUNKS = b"\x89PNG\r\n\x1a\n", (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+EXIF = b"Exif\0\0"
 JPEG_START = b"\xff\xd8"
 _MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd8\xff])")
 """Marker that begins a segment or ends the file; within a scan 0xFF is followed only by 0 or a restart marker."""
@@ -134,13 +135,16 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
-    """Decode to (h, w) uint8 gray. Raises `SessionDamaged` for other formats, and for cut or absurdly large images."""
+    """Decode to (h, w) uint8 gray, turned as the orientation in a JPEG says, so that pixels count as viewers show them.
+
+    Raises `SessionDamaged` for other formats, and for cut or absurdly large images.
+    """
     import cv2
-    import numpy as np
 
     if len(data) > MAX_IMAGE_BYTES:
         raise SessionDamaged(where, f"image of {len(data)} bytes exceeds {MAX_IMAGE_BYTES}")
     # Checked before decoding: a PNG of one megabyte can unpack to a gigabyte of pixels.
+    data = _pixels_of_png(data) if data.startswith(PNG_START) else data
     size = _png_size(data) or _jpeg_size(data)
     if size is None:
         raise SessionDamaged(where, "is not a complete PNG or JPEG image")
@@ -151,28 +155,62 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     most = min(MAX_JPEG_SCANS, MAX_SCANNED_PIXELS // max(width * height, 1))
     if scans > most:
         raise SessionDamaged(where, f"JPEG of {width} x {height} pixels in more than {most} scans")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error as error:
-        raise SessionDamaged(where, f"cannot decode the image: {error.err}") from None
-    if image is None or image.size == 0:  # pyright: ignore[reportUnnecessaryComparison]
+    image = _decoded(data, cv2.IMREAD_GRAYSCALE, where)
+    if image is None or image.size == 0:
         raise SessionDamaged(where, "cannot decode the image")
-    return cast("NDArray[np.uint8]", image)
+    return image
+
+
+def upright(data: bytes) -> bytes:
+    """The photograph itself, or a gray PNG of it where a JPEG says that it is to be turned.
+
+    `data` must have been decoded by `decode_gray` before. Readers differ in whether they turn a picture: without the
+    mark every reader sees the same pixels, and a point measured in a viewer lies where it was measured.
+    """
+    import cv2
+    import numpy as np
+
+    if EXIF not in data or data.startswith(PNG_START):
+        return data
+    stored = _decoded(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, "")
+    turned = decode_gray(data, "")
+    return data if stored is not None and np.array_equal(stored, turned) else encode_png(turned)
+
+
+def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | None:
+    import cv2
+    import numpy as np
+
+    try:
+        return cast("NDArray[np.uint8] | None", cv2.imdecode(np.frombuffer(data, np.uint8), flags))
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError from None
+        raise SessionDamaged(where, f"cannot decode the image: {error.err}") from None
+
+
+def _pixels_of_png(data: bytes) -> bytes:
+    """Only the chunks that make the picture; empty where a chunk fails its CRC or the end is missing.
+
+    libpng prints to stderr what it finds in the others, such as the name of a colour profile.
+    """
+    pieces, at = [PNG_START], len(PNG_START)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        name, end = data[at + 4 : at + 8], at + 12 + length
+        if data[end - 4 : end] != zlib.crc32(memoryview(data)[at + 4 : end - 4]).to_bytes(4, "big"):
+            return b""
+        if name in PNG_CHUNKS:
+            pieces.append(data[at:end])
+        if name == PNG_CHUNKS[-1]:
+            return b"".join(pieces)
+        at = end
+    return b""
 
 
 def _png_size(data: bytes) -> tuple[int, int, int] | None:
-    """Width, height and 1 scan, from the header; None where a chunk fails its CRC (libpng would print to stderr)."""
-    at = len(PNG_START)
-    while data.startswith(PNG_START) and data[12:16] == b"IHDR" and at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        name, crc_at = data[at + 4 : at + 8], at + 8 + length
-        if data[crc_at : crc_at + 4] != zlib.crc32(memoryview(data)[at + 4 : crc_at]).to_bytes(4, "big"):
-            return None
-        if name == PNG_END:
-            width, height = struct.unpack_from(">II", data, 16)
-            return width, height, 1
-        at = crc_at + 4
-    return None
+    """Width, height and 1 scan, from the header."""
+    return (*struct.unpack_from(">II", data, 16), 1) if data[12:16] == PNG_CHUNKS[0] and len(data) >= 33 else None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int, int] | None:

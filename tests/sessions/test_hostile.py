@@ -39,7 +39,6 @@ COMMANDS = {
     "verify": ["sessions", "verify", "{session}"],
     "repair": ["sessions", "repair", "{session}"],
     "close": ["sessions", "close", "{session}"],
-    "merge": ["sessions", "merge", "{out}.mcap", "{session}", "{file}"],
     "export": ["sessions", "export", "{session}", "{out}"],
     "export a file": ["sessions", "export", "{file}", "{out}-2"],
     "calibrate": ["calibrate", "{session}"],
@@ -178,7 +177,7 @@ def test_nothing_outside_the_folder_is_touched(make, place, opened_outside, way,
             ran = CliRunner().invoke(BRUSHLOOP, [word.format(**places) for word in words])
         finally:
             watch.clear()
-        given = name in ("merge", "export a file", "validate a file") and way == "merged file is a link"
+        given = name in ("export a file", "validate a file") and way == "merged file is a link"
         assert given or not seen, f"{name}: {seen}"
         assert SECRET.decode() not in ran.output
         assert (

@@ -136,7 +136,7 @@ def test_a_huge_table_is_refused(make, photos, refusal, monkeypatch):
     monkeypatch.setattr(table, "MAX_ROWS", 1)
     assert refusal() == "photos/table.csv: has more than 1 rows"
     monkeypatch.setattr(table, "MAX_TABLE_BYTES", 10)
-    assert "exceeds 10" in refusal()
+    assert "larger than 10 bytes" in refusal()
 
 
 def test_a_huge_photograph_is_refused(make, photos, refusal, monkeypatch):
@@ -144,7 +144,7 @@ def test_a_huge_photograph_is_refused(make, photos, refusal, monkeypatch):
     monkeypatch.setattr(messages, "MAX_IMAGE_PIXELS", 100)
     assert refusal() == "photos/a.png: image of 24 x 24 pixels exceeds 100"
     monkeypatch.setattr(importer, "MAX_IMAGE_BYTES", 10)
-    assert "photos/a.png: image of" in refusal()
+    assert "photos/a.png: is larger than 10 bytes" in refusal()
 
 
 def test_a_name_that_is_no_session_id_is_refused(make, tmp_path, photos):
@@ -159,9 +159,9 @@ def test_a_photograph_that_changes_under_the_import_is_refused(make, photos, ref
     read = importer.read_bounded
     seen = []
 
-    def change(path):
+    def change(path, max_bytes):
         seen.append(path)
-        return read(path) + b"x" * (len(seen) > 2)
+        return read(path, max_bytes) + b"x" * (len(seen) > 2)
 
     monkeypatch.setattr(importer, "read_bounded", change)
     assert refusal() == "photos/a.png: changed while it was imported"

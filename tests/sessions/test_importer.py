@@ -4,10 +4,12 @@ import math
 import shutil
 
 import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from sessions.cli import app
+from sessions.export.export import export
 from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
 from sessions.recording.schemas import Source
@@ -132,3 +134,35 @@ def test_a_refusal_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, photos,
     assert "Traceback" not in ran.stderr
     assert message in ran.stderr.splitlines()[-1]  # on a slow machine, progress comes before it
     assert make.tree(tmp_path) == before
+
+
+def turned_jpeg(image, orientation):
+    """A JPEG of the image with this EXIF orientation."""
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    tiff = b"MM\0*\0\0\0\x08\0\x01" + b"\x01\x12\0\x03\0\0\0\x01" + orientation.to_bytes(2, "big") + bytes(6)
+    exif = b"Exif\0\0" + tiff
+    return data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+
+
+def test_a_photograph_is_stored_as_a_viewer_shows_it(photos, out, run, tmp_path):
+    """A person found the dark square near the upper right corner of the picture that a viewer turned."""
+    stored = np.full((60, 40), 230, np.uint8)
+    stored[2:8, 2:8] = 20
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(turned_jpeg(stored, 6))
+    (photos / "b.jpg").write_bytes(turned_jpeg(stored, 1))
+    (photos / "table.csv").write_text("file,px_per_mm,start_x_px,start_y_px\na.jpg,10,55,5\nb.jpg,10,5,5\n")
+    run(ImportOptions())
+    for name in ("npz", "png"):
+        export(out, tmp_path / name, name)
+    with np.load(tmp_path / "npz" / "strokes.npz") as arrays:
+        in_npz = [arrays["image_0000"], arrays["image_0001"]]
+    as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    in_png = [cv2.imread(str(path), as_stored) for path in sorted((tmp_path / "png" / "images").iterdir())]
+    for image, other, capture in zip(in_npz, in_png, Recording(out).captures(), strict=True):
+        x_px, y_px = capture.stroke.anchor_px
+        assert image[int(y_px), int(x_px)] < 60
+        assert image.shape == other.shape
+        assert np.abs(image.astype(int) - other).max() <= 1
+    assert [image.shape for image in in_npz] == [(40, 60), (60, 40)]
+    assert list(Recording(out).captures())[1].still_png == (photos / "b.jpg").read_bytes()

@@ -14,7 +14,6 @@ from sessions.errors import InputError, SessionDamaged, SessionError, SessionLoc
 from sessions.folders import next_session_id, open_sessions
 from sessions.journal.codec import with_crc
 from sessions.journal.journal import JOURNAL_NAME, Journal
-from sessions.merge import merge_recordings
 from sessions.reader import Recording
 from sessions.recording.container import attachments
 from sessions.recording.mcap_file import count_messages
@@ -152,17 +151,13 @@ def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(ma
 
 
 def test_each_attached_file_says_what_it_is(make, tmp_path):
-    """In the merged file of a session, and in one of several sessions."""
     snapshots = {**make.snapshots, "rig.effective.json": '{"name": "bench"}\n'}
-    finals = []
-    for name in ("monday", "tuesday"):
-        store = SessionStore.create(tmp_path / name, make.header, snapshots, make.clock())
-        make.perform(store, name)
-        finals.append(store.close())
-        store.release()
+    store = SessionStore.create(tmp_path / "monday", make.header, snapshots, make.clock())
+    make.perform(store, "monday")
+    final = store.close()
+    store.release()
     expected = dict.fromkeys(make.snapshots, "application/toml") | {"rig.effective.json": "application/json"}
-    for path in (*finals, merge_recordings([final.parent for final in finals], tmp_path / "week.mcap")):
-        assert {a.name: a.media_type for a in attachments(path)} == expected
+    assert {a.name: a.media_type for a in attachments(final)} == expected
 
 
 def test_a_closed_session_is_not_opened_for_writing_again(make, store, resume):
