@@ -75,7 +75,7 @@ class ForceTooHigh(StepError):
         self.force_n = force_n
         self.limit_n = limit_n
         super().__init__(
-            f"the force reached {force_n:.2f} N, the ceiling is {limit_n:g} N: the arm was stopped. "
+            f"the force reached {force_n:.2f} N, the ceiling is {limit_n:g} N: a stop was sent to the arm. "
             "Look at what is under the brush before going on."
         )
 

@@ -8,8 +8,9 @@ from collections.abc import Callable, Coroutine, Generator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from collect.errors import ForceTooHigh
+from collect.errors import ForceTooHigh, describe
 from collect.rig.devices import Rig
+from drivers.errors import DeviceError, MotionFailed
 from drivers.samples import ForceSample
 
 CHECK_S = 0.02
@@ -52,7 +53,7 @@ class ForceGuard:
         """Run the procedure while the force is watched.
 
         Raises `ForceTooHigh` above the ceiling, and `Stale` or `ConnectionLost` if the sensor falls silent; in each
-        case the arm is stopped first.
+        case the arm is stopped first. Raises `MotionFailed`, which names that cause first, if the stop fails.
         """
         if self._rig.force is None or self._guarding:
             return await procedure
@@ -63,7 +64,11 @@ class ForceGuard:
             await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
             if watch.done():
                 work.cancel()  # or it would send its next line while the arm is being stopped
-                await self._rig.robot.stop()
+                try:
+                    await self._rig.robot.stop()
+                except DeviceError as failure:
+                    cause = str(watch.exception()).removesuffix(".")
+                    raise MotionFailed(failure.device, failure.op, cause, condition=describe(failure)) from failure
                 watch.result()
             return await work
         finally:

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from collect.engine.force_guard import ForceGuard
-from collect.errors import ForceTooHigh
+from collect.errors import ForceTooHigh, arm_at_fault, describe, rest_is_unknown
+from drivers.errors import DeviceError, MotionFailed
 from drivers.samples import ForceSample, Stamp
 
 
@@ -36,19 +37,36 @@ class Cell:
         await asyncio.sleep(0.05)
         self.did.append("at rest")
 
+    async def press_too_hard(self) -> None:
+        """Move down step by step, guarded, with 6 N from the third line on where 5 N are allowed."""
+        rig: Any = SimpleNamespace(robot=self, force=self, config=SimpleNamespace(force=SimpleNamespace(max_n=5.0)))
+        guard = ForceGuard(rig)
+        guard.listen()
+
+        async def down_step_by_step() -> None:
+            while True:
+                await self.move()
+                if len(self.did) == 3:
+                    self.say(ForceSample(Stamp(1), (0.0, 0.0, 6.0), (0.0, 0.0, 0.0)))
+
+        await guard.guarded(down_step_by_step())
+
 
 async def test_no_line_is_sent_after_the_stop_for_too_much_force() -> None:
     cell = Cell()
-    rig: Any = SimpleNamespace(robot=cell, force=cell, config=SimpleNamespace(force=SimpleNamespace(max_n=5.0)))
-    guard = ForceGuard(rig)
-    guard.listen()
-
-    async def down_step_by_step() -> None:
-        while True:
-            await cell.move()
-            if len(cell.did) == 3:
-                cell.say(ForceSample(Stamp(1), (0.0, 0.0, 6.0), (0.0, 0.0, 0.0)))
-
     with pytest.raises(ForceTooHigh, match=r"reached 6\.00 N"):
-        await guard.guarded(down_step_by_step())
+        await cell.press_too_hard()
     assert cell.did[cell.did.index("stop") :] == ["stop", "at rest"]
+
+
+async def test_where_the_stop_fails_too_the_force_is_named_first_and_the_arm_counts_as_moving() -> None:
+    class Runaway(Cell):
+        async def stop(self) -> None:
+            raise MotionFailed("robot", "stop", "not seen at rest", condition="The arm may still be moving.")
+
+    with pytest.raises(DeviceError) as caught:
+        await Runaway().press_too_hard()
+    told = describe(caught.value)
+    assert told.index("6.00 N") < told.index("The arm may still be moving.")
+    assert rest_is_unknown(caught.value)
+    assert arm_at_fault(caught.value)
