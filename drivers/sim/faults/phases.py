@@ -11,11 +11,11 @@ from drivers.sim.config import Table
 from drivers.sim.world import World
 
 ON_PAPER_MM = 0.1
-"""A tip that ends or rests no higher than this counts as on the paper, whose height is taught with an error."""
+"""A tip that ends or rests no farther above than this counts as on the paper, which is taught with an error."""
 ALL_BUT_THERE_MM = 0.1
 """Remaining descent that counts as pressed: a dwell is the very slow end of a descent."""
 LIFT_MM = 10.0
-"""Height below which rising counts as lifting."""
+"""Distance from the paper within which rising counts as lifting."""
 HOME_MM = 1.0
 
 
@@ -40,32 +40,32 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A place of the tip: x and y in the paper frame, height above the paper plane."""
+    """A place of the tip: x and y in the paper frame, and its distance from the paper along the paper's normal."""
 
     x_mm: float
     y_mm: float
-    height_mm: float
+    above_mm: float
 
     def distance_mm(self, other: Spot) -> float:
         """Straight-line distance."""
-        return math.dist((self.x_mm, self.y_mm, self.height_mm), (other.x_mm, other.y_mm, other.height_mm))
+        return math.dist((self.x_mm, self.y_mm, self.above_mm), (other.x_mm, other.y_mm, other.above_mm))
 
 
 def phase_of(table: Table, home: Spot, here: Spot, to: Spot | None) -> Phase:
     """The phase of a tip at `here`, on its way to `to`, which is None at rest."""
-    heights = [spot.height_mm for spot in (here, to) if spot is not None]
-    if _over_well(table, here) and min(heights) < table.well_depth_mm:
+    above_mm = [spot.above_mm for spot in (here, to) if spot is not None]
+    if _over_well(table, here) and min(above_mm) < table.well_depth_mm:
         return Phase.DIPPING
     over_sheet = _over_sheet(table, here)
     if to is None:
-        if over_sheet and here.height_mm <= ON_PAPER_MM:
+        if over_sheet and here.above_mm <= ON_PAPER_MM:
             return Phase.PRESSED
         return Phase.PARKED if here.distance_mm(home) <= HOME_MM else Phase.RESTING
-    if over_sheet and here.height_mm < 0.0 and 0.0 <= here.height_mm - to.height_mm <= ALL_BUT_THERE_MM:
+    if over_sheet and here.above_mm < 0.0 and 0.0 <= here.above_mm - to.above_mm <= ALL_BUT_THERE_MM:
         return Phase.PRESSED
-    if over_sheet and to.height_mm < here.height_mm and to.height_mm <= ON_PAPER_MM:
+    if over_sheet and to.above_mm < here.above_mm and to.above_mm <= ON_PAPER_MM:
         return Phase.DESCENDING
-    if over_sheet and to.height_mm > here.height_mm and here.height_mm <= LIFT_MM:
+    if over_sheet and to.above_mm > here.above_mm and here.above_mm <= LIFT_MM:
         return Phase.LIFTING
     return Phase.TRAVELLING
 
@@ -111,4 +111,5 @@ class Truth:
         )
 
     def _spot(self, x_mm: float, y_mm: float, z_mm: float) -> Spot:
-        return Spot(*self._world.to_paper(x_mm, y_mm), z_mm - self._world.config.table.paper_z_mm)
+        x_mm, y_mm = self._world.to_paper(x_mm, y_mm)
+        return Spot(x_mm, y_mm, self._world.config.table.above_mm(x_mm, y_mm, z_mm))

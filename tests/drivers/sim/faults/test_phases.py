@@ -62,3 +62,19 @@ def test_the_world_knows_its_phase_from_the_first_moment_of_a_line_to_its_last()
     clock.s = 2.0
     assert truth.phase() is Phase.RESTING
     assert truth.target() is None
+
+
+@pytest.mark.parametrize(
+    ("above_mm", "phase"), [(3.0, Phase.RESTING), (0.05, Phase.PRESSED), (-2.0, Phase.PRESSED), (60.0, Phase.RESTING)]
+)
+@pytest.mark.parametrize("corner_mm", [(10.0, 10.0), (230.0, 10.0), (10.0, 160.0)])
+def test_on_a_sloping_sheet_heights_count_from_the_paper_under_the_tip(
+    corner_mm: tuple[float, float], above_mm: float, phase: Phase
+):
+    table = Table(yaw_deg=0.0, slope_deg=(1.0, -1.0))
+    (x, y), (left, front) = corner_mm, table.origin_mm
+    world = World(SimConfig(table=table))
+    world.clock = clock = StoppedClock()  # type: ignore[assignment]
+    world.motion.add(brush_pose(left + x, front + y, table.surface_z_mm(x, y) + above_mm), 100.0, 1000.0, clock.s)
+    clock.s = 60.0
+    assert Truth(world).phase() is phase
