@@ -17,7 +17,7 @@ from drivers.sim.camera.mjpeg_server import MjpegServer
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig
 from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import Device, Fault, ForceFault, InkFault
+from drivers.sim.faults.kinds import KINDS, Device, Fault, ForceFault, InkFault
 from drivers.sim.faults.phases import Truth
 from drivers.sim.instruments.force_board import ForceBoard, SocketcandServer
 from drivers.sim.instruments.ink_station import Instrument, PtyLine, StationFirmware
@@ -53,6 +53,10 @@ class Faults:
         self._arcs = arcs
         arcs.faults = rtde.faults = camera.faults = self.board
         self._ink, self._force = ink, force
+        if ink is not None:
+            ink.next_fault = lambda: InkFault(kind) if (kind := self._kind(Device.INK)) else None
+        if force is not None:
+            force.next_fault = lambda: ForceFault(kind) if (kind := self._kind(Device.FORCE)) else None
         self._watching: asyncio.Task[None] | None = None
 
     def hang(self, fault: Fault) -> int:
@@ -112,18 +116,13 @@ class Faults:
     async def _watch(self) -> None:
         while True:
             waits = self.board.waits_by_itself
-            for fault in self.board.due() if waits else ():
-                self._begin(fault)
+            for stop in self.board.due() if waits else ():
+                self._arcs.stop_as(stop.kind)
             await asyncio.sleep(TICK_S if waits else IDLE_TICK_S)
 
-    def _begin(self, fault: Fault) -> None:
-        strikes = fault.strikes or 1
-        if fault.device is Device.INK and self._ink is not None:
-            self._ink.fail(*[InkFault(fault.kind)] * strikes)
-        elif fault.device is Device.FORCE and self._force is not None:
-            self._force.fail(*[ForceFault(fault.kind)] * strikes)
-        else:
-            self._arcs.stop_as(fault.kind)
+    def _kind(self, device: Device) -> str:
+        fault = self.board.meet(device, "", KINDS[device])
+        return "" if fault is None else fault.kind
 
 
 class LoopbackRig:

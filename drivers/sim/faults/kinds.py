@@ -90,8 +90,6 @@ KINDS: dict[Device, frozenset[str]] = {
     Device.INK: frozenset(kind.value for kind in InkFault),
     Device.FORCE: frozenset(kind.value for kind in ForceFault),
 }
-HANDED_OVER = frozenset({Device.INK, Device.FORCE})
-"""Devices whose simulators keep their own list of faults, one for each coming request or round."""
 
 
 class Fault(BaseModel):
@@ -132,8 +130,6 @@ class Fault(BaseModel):
             raise ValueError(f"on = {self.on!r}: only the robot has methods")
         if self.kind in STOPS and (self.for_s is not None or self.count not in (None, 1)):
             raise ValueError(f"{self.kind} happens once and lasts until a person ends it: no count, no for_s")
-        if self.device in HANDED_OVER and self.for_s is not None:
-            raise ValueError(f"for_s does not go with {self.device}: give count")
         if self.by_itself and self.nth != 1:
             raise ValueError(f"nth = {self.nth} counts nothing here: {self.kind} of {self.device} waits for no request")
         if "late_s" in self.model_fields_set and (self.device, self.kind) != (Device.ROBOT, "late"):
@@ -143,7 +139,7 @@ class Fault(BaseModel):
     @property
     def by_itself(self) -> bool:
         """True if it begins without a request."""
-        return self.device in HANDED_OVER or (self.kind in STOPS and self.on is None)
+        return self.device is Device.INK or (self.kind in STOPS and self.on is None)
 
     @property
     def strikes(self) -> int | None:

@@ -15,7 +15,6 @@ import asyncio
 import math
 import random
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -49,12 +48,9 @@ class ForceBoard:
         self._force = force
         self._noise = (noise_n,) * 3 + (noise_nm,) * 3
         self._random = random.Random(seed)
-        self._faults: deque[ForceFault] = deque()
+        self.next_fault: Callable[[], ForceFault | None] = lambda: None
+        """Asked for the fault of each round."""
         self._before: Wrench | None = None
-
-    def fail(self, *faults: ForceFault) -> None:
-        """Apply these faults to the next rounds, one each."""
-        self._faults.extend(faults)
 
     def obey(self, frame: CanFrame) -> None:
         """Carry out a command frame from the bus; ignore other frames."""
@@ -67,7 +63,7 @@ class ForceBoard:
         """The frames of the round that is due at `t_s`; none while the board is stopped."""
         if not self.streaming:
             return
-        fault = self._faults.popleft() if self._faults else None
+        fault = self.next_fault()
         if fault is ForceFault.SILENCE:
             return
         if fault in (ForceFault.BUS_OFF, ForceFault.BUS_ERROR):

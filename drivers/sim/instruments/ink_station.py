@@ -8,7 +8,7 @@ import select
 import tempfile
 import threading
 import tty
-from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
@@ -53,7 +53,8 @@ class PtyLine:
         self.instrument = instrument
         self.path = ""
         self._late_s = late_s
-        self._faults: deque[InkFault] = deque()
+        self.next_fault: Callable[[], InkFault | None] = lambda: None
+        """Asked in the instrument's thread for the fault of each request."""
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._wake: tuple[int, int] = (-1, -1)
@@ -88,10 +89,6 @@ class PtyLine:
             self._link.cleanup()
             self._link = None
 
-    def fail(self, *faults: InkFault) -> None:
-        """Apply these faults to the next requests, one each."""
-        self._faults.extend(faults)
-
     def unplug(self) -> None:
         """Pull the cable now; returns when the port is gone."""
         self._stopping.set()
@@ -116,7 +113,7 @@ class PtyLine:
             os.close(master)
 
     def _meet(self, master: int, request: bytes) -> None:
-        fault = self._faults.popleft() if self._faults else None
+        fault = self.next_fault()
         if fault is InkFault.UNPLUG:
             self._stopping.set()
             return

@@ -12,7 +12,7 @@ from collect.engine.control import State
 from collect.errors import ForceTooHigh, NeedsOperator
 from drivers.errors import ConnectionLost, Stuck
 from drivers.ink.port import InkRefused
-from drivers.sim.faults.kinds import ForceFault
+from drivers.sim.faults.kinds import Device, Fault
 from sessions.journal.journal import replay
 from sessions.recording.schemas import Topic
 from tests.collect.until import until, wait_for_end
@@ -85,14 +85,13 @@ def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_cell
 def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_done_again_elsewhere(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert lab.rig.force is not None
-    board, push_n = lab.rig.force.board, lab.rig.world.reaction.push_n
+    push_n = lab.rig.world.reaction.push_n
     silenced: list[float] = []
 
     def silent_once(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 4.0 and not silenced:
             silenced.append(depth_mm)
-            board.fail(*[ForceFault.SILENCE] * 4000)  # 20 s
+            lab.rig.faults.hang(Fault(device=Device.FORCE, kind="silence", for_s=20.0))
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", silent_once)
@@ -102,7 +101,7 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.voids > 0)
-    board._faults.clear()
+    lab.rig.faults.board.clear()
     wait_for_end(engine)
 
     now = engine.snapshot()
@@ -113,14 +112,13 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
 def test_a_sensor_that_is_stuck_in_mid_press_stops_the_arm_and_ends_the_run_with_its_name(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert lab.rig.force is not None
-    board, push_n = lab.rig.force.board, lab.rig.world.reaction.push_n
+    push_n = lab.rig.world.reaction.push_n
     stuck: list[float] = []
 
     def stick_once(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 2.0 and not stuck:
             stuck.append(depth_mm)
-            board.fail(*[ForceFault.STUCK] * 400)  # 2 s
+            lab.rig.faults.hang(Fault(device=Device.FORCE, kind="stuck", for_s=2.0))
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", stick_once)
@@ -134,12 +132,11 @@ def test_a_sensor_that_is_stuck_in_mid_press_stops_the_arm_and_ends_the_run_with
 
 
 def test_a_bus_that_goes_off_ends_the_run_with_the_arm_parked(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert lab.rig.force is not None
-    board, push_n = lab.rig.force.board, lab.rig.world.reaction.push_n
+    push_n = lab.rig.world.reaction.push_n
 
     def off(depth_mm: float, tilt_deg: float) -> float:
         if depth_mm > 4.0:
-            board.fail(ForceFault.BUS_OFF)
+            lab.rig.faults.hang(Fault(device=Device.FORCE, kind="bus-off"))
         return push_n(depth_mm, tilt_deg)
 
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", off)

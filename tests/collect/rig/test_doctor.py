@@ -11,7 +11,7 @@ from collect.rig.config import load_rig
 from collect.rig.doctor import examine
 from drivers.arcs.codes import SafetyMode
 from drivers.clock import HostClock
-from drivers.sim.faults.kinds import ForceFault, InkFault
+from drivers.sim.faults.kinds import Device, Fault
 from tests.command import brushloop
 
 if TYPE_CHECKING:
@@ -41,10 +41,8 @@ async def test_an_instrument_that_was_unplugged_is_reported_and_the_others_are_s
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("collect.rig.devices.FORCE_CONNECT_S", 2.0)
-    assert lab.rig.ink is not None
-    assert lab.rig.force is not None
-    lab.rig.ink.fail(*[InkFault.DEAF] * 100)
-    lab.rig.force.board.fail(*[ForceFault.NO_SECOND] * 10_000)
+    lab.rig.faults.hang(Fault(device=Device.INK, kind="deaf", count=100))
+    lab.rig.faults.hang(Fault(device=Device.FORCE, kind="no-second", count=10_000))
     camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
     assert camera.well
     assert robot.well

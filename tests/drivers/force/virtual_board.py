@@ -17,6 +17,7 @@ import can
 from drivers.force.rounds import Wrench
 from drivers.sim.faults.kinds import ForceFault
 from drivers.sim.instruments.force_board import CanFrame, ForceBoard
+from tests.drivers.failing import fail_rounds
 
 
 class SimForceSensor:
@@ -64,7 +65,7 @@ class SimForceSensor:
 
     def fail(self, *faults: ForceFault) -> None:
         """Let the next rounds meet these, one each."""
-        self.board.fail(*faults)
+        fail_rounds(self.board, *faults)
 
     def _run(self, bus: can.BusABC) -> None:
         began_s = due_s = time.monotonic()

@@ -24,6 +24,7 @@ from drivers.protocols import Ink
 from drivers.sim.faults.kinds import InkFault
 from drivers.sim.instruments.ink_station import PtyLine
 from drivers.sim.instruments.modbus_pump import PumpFirmware
+from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3
 """Long enough for a busy machine to answer where an answer comes."""
@@ -151,7 +152,7 @@ async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
     dosing = asyncio.create_task(pump.dose(2.0))
     while not firmware.running:
         await asyncio.sleep(0.01)
-    line.fail(InkFault.LATE)
+    fail_requests(line, InkFault.LATE)
     for _ in range(times):
         dosing.cancel()
         await asyncio.sleep(0.02)
@@ -182,7 +183,7 @@ async def test_a_fault_anywhere_leaves_the_pump_stopped(
     fault: InkFault, at: str, firmware: PumpFirmware, line: PtyLine, pump: ModbusPump
 ):
     before = {"start": 1, "stop": 2}[at]
-    line.fail(*[InkFault.SPLIT] * before, fault)
+    fail_requests(line, *[InkFault.SPLIT] * before, fault)
     if at == "stop":
         await pump.dose(0.01)  # the second stop is confirmed
     else:
@@ -196,7 +197,7 @@ async def test_a_fault_anywhere_leaves_the_pump_stopped(
 async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmware, line: PtyLine, wait_s: float):
     pump = pump_at(line.path)
     await pump.connect()
-    line.fail(*[InkFault.SPLIT] * 3)
+    fail_requests(line, *[InkFault.SPLIT] * 3)
     dosing = asyncio.create_task(pump.dose(0.01))
     await asyncio.sleep(wait_s)
     await pump.close()
@@ -208,7 +209,7 @@ async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmwar
 async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
     pump = pump_at(line.path)
     await pump.connect()
-    line.fail(InkFault.SPLIT, InkFault.SPLIT, InkFault.UNPLUG)
+    fail_requests(line, InkFault.SPLIT, InkFault.SPLIT, InkFault.UNPLUG)
     with pytest.raises(ConnectionLost, match=r"stop: .*may still be running.*Check cable"):
         await pump.dose(0.01)
     with pytest.raises(ConnectionLost):
@@ -216,7 +217,7 @@ async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
 
 
 async def test_a_late_reply_does_not_pass_for_the_next(line: PtyLine, firmware: PumpFirmware, pump: ModbusPump):
-    line.fail(InkFault.LATE)
+    fail_requests(line, InkFault.LATE)
     with pytest.raises(DeviceTimeout, match="not started"):
         await pump.dose(0.01)
     await pump.dose(0.01)

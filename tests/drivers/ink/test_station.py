@@ -23,6 +23,7 @@ from drivers.ink.station import InkStation, StationOptions, seal, unseal
 from drivers.protocols import Ink
 from drivers.sim.faults.kinds import InkFault
 from drivers.sim.instruments.ink_station import PtyLine, StationFirmware
+from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3
 """Long enough for a busy machine to answer where an answer comes."""
@@ -177,7 +178,7 @@ async def test_the_loopback_station_says_that_it_is_one(line: PtyLine):
 async def test_one_fault_of_any_kind_gives_the_dose_once(
     fault: InkFault, line: PtyLine, firmware: StationFirmware, station: InkStation
 ):
-    line.fail(fault)
+    fail_requests(line, fault)
     await station.dose(1.0)
     assert firmware.well.ml == 11.0
     assert await station.level() == 0.55
@@ -197,7 +198,7 @@ async def test_one_fault_of_any_kind_gives_the_dose_once(
 async def test_a_fault_that_lasts_is_an_error_in_time_and_the_next_request_works(
     fault: InkFault, error: type[DeviceError], line: PtyLine, firmware: StationFirmware, station: InkStation
 ):
-    line.fail(fault, fault)
+    fail_requests(line, fault, fault)
     with pytest.raises(error, match="may be in the well"):
         await station.dose(1.0)
     assert firmware.well.ml == (10.0 if fault is InkFault.DEAF else 11.0)
@@ -205,7 +206,7 @@ async def test_a_fault_that_lasts_is_an_error_in_time_and_the_next_request_works
 
 
 async def test_a_pulled_cable_is_a_lost_connection_at_once_and_stays_one(line: PtyLine, station: InkStation):
-    line.fail(InkFault.UNPLUG)
+    fail_requests(line, InkFault.UNPLUG)
     with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
         await station.dose(1.0)
     assert lost.value.op == "dose"
@@ -238,7 +239,7 @@ async def test_a_port_that_somebody_else_holds_is_not_shared(line: PtyLine, stat
 
 
 async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkStation):
-    line.fail(InkFault.MUTE, InkFault.MUTE)
+    fail_requests(line, InkFault.MUTE, InkFault.MUTE)
     slow = station_at(line.path, timeout_s=30.0)
     await station.close()
     waiting = asyncio.create_task(slow.connect())
@@ -250,7 +251,7 @@ async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkSt
 
 
 async def test_the_event_loop_runs_on_while_the_station_is_silent(line: PtyLine, station: InkStation):
-    line.fail(InkFault.MUTE, InkFault.MUTE)
+    fail_requests(line, InkFault.MUTE, InkFault.MUTE)
     turns = 0
     asking = asyncio.create_task(station.level())
     while not asking.done():
@@ -262,7 +263,7 @@ async def test_the_event_loop_runs_on_while_the_station_is_silent(line: PtyLine,
 
 
 async def test_a_cancelled_request_does_not_disturb_the_next(line: PtyLine, station: InkStation):
-    line.fail(InkFault.LATE)
+    fail_requests(line, InkFault.LATE)
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.03):
             await station.light(1.0)
@@ -296,7 +297,7 @@ async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(lin
     await station.connect()
     await station.dose(2.0)
     clock.ns = 30 * 10**9
-    line.fail(InkFault.DEAF)
+    fail_requests(line, InkFault.DEAF)
     with pytest.raises(DeviceTimeout):
         await station.dose(2.0)
     with pytest.raises(LimitExceeded, match=r"dose per minute = 5\.500"):

@@ -105,11 +105,10 @@ def test_faults_of_other_devices_and_kinds_wait(world: Scripted):
     "fault",
     [
         Fault(device=Device.ROBOT, kind="protective-stop", phase=Phase.LIFTING),
-        Fault(device=Device.INK, kind="garbage", phase=Phase.LIFTING, count=3),
-        Fault(device=Device.FORCE, kind="bus-off", phase=Phase.LIFTING),
+        Fault(device=Device.ROBOT, kind="emergency-stop", phase=Phase.LIFTING),
     ],
 )
-def test_what_waits_for_no_request_begins_by_itself_and_once(world: Scripted, fault: Fault):
+def test_a_stop_begins_by_itself_and_once(world: Scripted, fault: Fault):
     world.board.hang(fault)
     assert world.board.waits_by_itself
     assert world.board.meet(fault.device, "x", KINDS[fault.device]) is None
@@ -118,6 +117,28 @@ def test_what_waits_for_no_request_begins_by_itself_and_once(world: Scripted, fa
     assert world.board.due() == [fault]
     assert world.board.due() == []
     assert not world.board.waits_by_itself
+
+
+def test_a_fault_of_ink_begins_by_itself_and_strikes_the_requests_that_follow(world: Scripted):
+    world.board.hang(Fault(device=Device.INK, kind="garbage", phase=Phase.LIFTING, count=2))
+    assert world.board.due() == []
+    assert world.board.meet(Device.INK, "", KINDS[Device.INK]) is None
+    world.doing = Phase.LIFTING
+    world.board.due()
+    world.doing = Phase.PARKED
+    assert not world.board.waits_by_itself
+    strikes = [world.board.meet(Device.INK, "", KINDS[Device.INK]) is not None for _ in range(3)]
+    assert strikes == [True, True, False]
+
+
+@pytest.mark.parametrize("device", [Device.INK, Device.FORCE])
+def test_clearing_ends_a_fault_that_has_begun(world: Scripted, device: Device):
+    kind = min(KINDS[device])
+    world.board.hang(Fault(device=device, kind=kind, count=1000))
+    world.board.due()
+    assert world.board.meet(device, "", KINDS[device]) is not None
+    assert world.board.clear() == 1
+    assert world.board.meet(device, "", KINDS[device]) is None
 
 
 def test_a_stop_on_a_method_waits_for_it(world: Scripted):

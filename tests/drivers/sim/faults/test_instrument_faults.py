@@ -19,7 +19,7 @@ from drivers.sim.rig import HOST, Faults, LoopbackRig
 
 async def begun(rig: LoopbackRig) -> None:
     async with asyncio.timeout(10.0):
-        while rig.faults.board.hanging:
+        while rig.faults.board.waits_by_itself:
             await asyncio.sleep(0.005)
 
 
@@ -93,6 +93,18 @@ async def test_a_sensor_can_be_stuck_for_a_while(rig: LoopbackRig, sensor: SriM8
     rig.faults.hang(Fault(device=Device.FORCE, kind="stuck", count=1000))
     with pytest.raises(Stuck, match="exactly alike"):
         await until_it_fails(sensor)
+
+
+async def test_a_sensor_that_was_silent_is_heard_again_as_soon_as_the_fault_is_cleared(
+    rig: LoopbackRig, sensor: SriM8123
+):
+    rig.faults.hang(Fault(device=Device.FORCE, kind="silence", count=1_000_000))
+    await asyncio.sleep(0.3)
+    assert rig.faults.board.clear() == 1
+    cleared = sensor.latest().stamp.seq
+    async with asyncio.timeout(4.0):
+        while sensor.latest().stamp.seq == cleared:
+            await asyncio.sleep(0.005)
 
 
 async def test_a_rig_without_the_instrument_refuses_its_faults(rig: LoopbackRig):

@@ -67,8 +67,7 @@ def one(**fields: object) -> str:
         (one(device="telemetry", on="moveLine"), "only the robot has methods"),
         (one(kind="protective-stop", count=2), "happens once"),
         (one(kind="emergency-stop", nth=2), "counts nothing here"),
-        (one(device="ink", kind="garbage", for_s=1.0), "for_s does not go with ink"),
-        (one(device="force", kind="nan", nth=2), "counts nothing here"),
+        (one(device="ink", kind="mute", nth=2), "counts nothing here"),
         (one(late_s=1.0), "late_s goes with device = 'robot', kind = 'late' only"),
     ],
 )

@@ -1,0 +1,19 @@
+"""Faults for a simulated instrument without a rig."""
+
+from __future__ import annotations
+
+from drivers.sim.faults.kinds import ForceFault, InkFault
+from drivers.sim.instruments.force_board import ForceBoard
+from drivers.sim.instruments.ink_station import PtyLine
+
+
+def fail_rounds(board: ForceBoard, *faults: ForceFault) -> None:
+    """Apply these faults to the board's next rounds, one each."""
+    coming = iter(faults)
+    board.next_fault = lambda: next(coming, None)
+
+
+def fail_requests(line: PtyLine, *faults: InkFault) -> None:
+    """Apply these faults to the next requests on the line, one each."""
+    coming = iter(faults)
+    line.next_fault = lambda: next(coming, None)
