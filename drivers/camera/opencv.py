@@ -24,14 +24,52 @@ if TYPE_CHECKING:
 
 REOPEN_AFTER_S = 0.5
 LASTING_NS = 1_000_000_000
+JOIN_S = 5.0
 
 
 class OpenCvCamera:
-    """`Camera` over one source; the grabber thread owns it from open to release."""
+    """`Camera` over one source. Each connection has its own grabber, so no frame outlives its connection."""
 
     def __init__(
         self, options: CameraOptions, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None
     ) -> None:
+        self._options = options
+        self._clock = clock
+        self._on_notice = on_notice
+        self._grabber: _Grabber | None = None
+
+    async def connect(self) -> Identity:
+        """Start the grabber and wait for its first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
+        grabber = self._grabber = _Grabber(self._options, self._clock, self._on_notice)
+        grabber.thread.start()
+        try:
+            frame = await self.fresh(Stamp(0))
+        except BaseException:
+            await self.close()
+            raise
+        height, width = frame.image.shape[:2]
+        locked = "".join(f", {name} {value:g}" for name, value in grabber.settings.items())
+        return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", grabber.simulated)
+
+    async def fresh(self, after: Stamp) -> Frame:
+        """The first valid frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
+        if self._grabber is None:
+            raise NotConnected(DEVICE, "fresh", "not connected")
+        return await asyncio.to_thread(self._grabber.wait_for, after.host_ns)
+
+    async def close(self) -> None:
+        """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
+        grabber = self._grabber
+        if grabber is not None:
+            grabber.end()
+            await asyncio.to_thread(grabber.thread.join, JOIN_S)
+            self._grabber = None
+
+
+class _Grabber:
+    """The frames of one connection; its thread owns the source from open to release."""
+
+    def __init__(self, options: CameraOptions, clock: Clock, on_notice: Callable[[str], None]) -> None:
         self._options = options
         self._clock = clock
         self._on_notice = on_notice
@@ -41,49 +79,26 @@ class OpenCvCamera:
         """Why no valid frame arrives, for the message of a timeout."""
         self._reported = False
         self._ended: DeviceError | None = None
-        self._closing = threading.Event()  # one for each grabber: an old grabber that hangs must not resume
-        self._thread: threading.Thread | None = None
+        self._closing = threading.Event()
+        self.thread = threading.Thread(target=self._grab, name="camera grabber", daemon=True)
         self.settings: dict[str, float] = {}
-        self._simulated = False
+        self.simulated = False
 
-    async def connect(self) -> Identity:
-        """Start the grabber and wait for its first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
-        self._newest, self._ended, self._trouble, self._closing = None, None, "", threading.Event()
-        self._thread = threading.Thread(target=self._grab, args=(self._closing,), name="camera grabber", daemon=True)
-        self._thread.start()
-        try:
-            frame = await self.fresh(Stamp(0))
-        except BaseException:
-            await self.close()
-            raise
-        height, width = frame.image.shape[:2]
-        locked = "".join(f", {name} {value:g}" for name, value in self.settings.items())
-        return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", self._simulated)
-
-    async def fresh(self, after: Stamp) -> Frame:
-        """The first valid frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
-        if self._thread is None:
-            raise NotConnected(DEVICE, "fresh", "not connected")
-        return await asyncio.to_thread(self._wait_for, after.host_ns)
-
-    async def close(self) -> None:
-        """End the grabber and wait for it; a read that hangs is left to the daemon thread."""
+    def end(self) -> None:
+        """Wake up whoever waits for a frame, and let the thread end after its current read."""
         self._closing.set()
         with self._condition:
             self._condition.notify_all()
-        if self._thread is not None:
-            await asyncio.to_thread(self._thread.join, 5.0)
-            self._thread = None
 
-    def _wait_for(self, after_ns: int) -> Frame:
-        closing = self._closing
+    def wait_for(self, after_ns: int) -> Frame:
+        """The first frame exposed after `after_ns`; blocks. Raises `DeviceTimeout`, `ConnectionLost`."""
 
         def late_enough() -> Frame | None:
             frame = self._newest
             return frame if frame is not None and frame.exposed_after_ns >= after_ns else None
 
         def over() -> bool:
-            return self._ended is not None or closing.is_set()
+            return self._ended is not None or self._closing.is_set()
 
         with self._condition:
             if not self._condition.wait_for(lambda: late_enough() or over(), self._options.timeout_s):
@@ -95,46 +110,46 @@ class OpenCvCamera:
                     remedy="Check cable, light and stream; the arm does not move meanwhile.",
                 )
             frame = late_enough()
-            if frame is not None and not closing.is_set():
+            if frame is not None and not self._closing.is_set():
                 return frame
             raise self._ended or ConnectionLost(DEVICE, "fresh", "closed while waiting")
 
-    def _grab(self, closing: threading.Event) -> None:
+    def _grab(self) -> None:
         lost_ns: int | None = None
         try:
-            while not closing.is_set():
+            while not self._closing.is_set():
                 opening_ns = self._clock.now_ns()
                 try:
                     source = open_source(self._options)
                 except ConnectionLost:
                     if lost_ns is None:
                         raise
-                    closing.wait(REOPEN_AFTER_S)
+                    self._closing.wait(REOPEN_AFTER_S)
                     continue
                 try:
                     if lost_ns is not None:
                         self._on_notice(f"camera is back after {(self._clock.now_ns() - lost_ns) / 1e9:.1f} s")
-                    self._read_all(source, closing, opening_ns)
+                    self._read_all(source, opening_ns)
                 finally:
                     source.release()
-                if closing.is_set():
+                if self._closing.is_set():
                     return
                 if not source.live:
                     raise ConnectionLost(DEVICE, "read", f"{self._options.source} ended")
                 lost_ns = self._clock.now_ns()
                 self._report("the stream ended and is opened again")
-                closing.wait(REOPEN_AFTER_S)
+                self._closing.wait(REOPEN_AFTER_S)
         except DeviceError as error:
-            self._end(error, closing)
+            self._fail(error)
         except BaseException as error:
-            self._end(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"), closing)
+            self._fail(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"))
             raise
 
-    def _read_all(self, source: Source, closing: threading.Event, opening_ns: int) -> None:
+    def _read_all(self, source: Source, opening_ns: int) -> None:
         """Read until the source ends; only valid frames are kept."""
         import cv2
 
-        self.settings, self._simulated = source.settings, source.simulated
+        self.settings, self.simulated = source.settings, source.simulated
         latency_ns = round(self._options.latency_ms * 1e6)
         health = FrameHealth(
             latency_ns=latency_ns,
@@ -143,7 +158,7 @@ class OpenCvCamera:
             independent=source.independent,
         )
         first, valid_ns = True, opening_ns
-        while not closing.is_set():
+        while not self._closing.is_set():
             image = source.read()
             arrival_ns = self._clock.now_ns()
             if image is None:
@@ -170,13 +185,12 @@ class OpenCvCamera:
     def _report(self, text: str, *, aloud: bool = True) -> None:
         with self._condition:
             self._trouble = text
-            notify = aloud and not self._reported
+            notify = aloud and not self._reported and not self._closing.is_set()
             self._reported = self._reported or notify
         if notify:
             self._on_notice(f"camera: {text}")
 
-    def _end(self, error: DeviceError, closing: threading.Event) -> None:
+    def _fail(self, error: DeviceError) -> None:
         with self._condition:
-            if not closing.is_set():
-                self._ended = error
+            self._ended = error
             self._condition.notify_all()

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.camera import CameraOptions, OpenCvCamera
+from drivers.camera import CameraOptions, OpenCvCamera, opencv
 from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
 from drivers.protocols import Camera
@@ -170,3 +170,43 @@ async def test_a_camera_opened_again_shows_nothing_from_before(camera: OpenCvCam
     closed_ns = time.time_ns()
     await camera.connect()
     assert read_strip((await camera.fresh(Stamp(0))).image) >= closed_ns
+
+
+class OneFrame:
+    """A source that gives one frame of this brightness, and a second one, 40 levels lighter, once it is let go."""
+
+    live, independent, simulated = True, False, True
+
+    def __init__(self, level: int) -> None:
+        self._level = level
+        self.settings: dict[str, float] = {}
+        self._reads = 0
+        self.let_go, self.released = threading.Event(), threading.Event()
+
+    def read(self) -> np.ndarray | None:
+        self._reads += 1
+        if self._reads > 1:
+            self.let_go.wait()
+        noise = np.random.default_rng(self._reads).integers(0, 20, (48, 64), np.uint8)
+        return noise + np.uint8(self._level + 40 * (self._reads - 1)) if self._reads < 3 else None
+
+    def release(self) -> None:
+        self.released.set()
+
+
+async def test_a_read_that_hangs_beyond_the_end_of_its_connection_gives_the_next_one_no_frame(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    before, after = OneFrame(50), OneFrame(150)
+    sources = iter([before, after])
+    monkeypatch.setattr(opencv, "open_source", lambda _options: next(sources))
+    monkeypatch.setattr(opencv, "JOIN_S", 0.01, raising=False)
+    camera = OpenCvCamera(CameraOptions("rtsp://camera"), CLOCK)
+    await camera.connect()
+    await camera.close()
+    await camera.connect()
+    before.let_go.set()
+    await asyncio.to_thread(before.released.wait)
+    assert (await camera.fresh(Stamp(0))).image.mean() > 140
+    after.let_go.set()
+    await camera.close()
