@@ -15,6 +15,7 @@ DeviceError
       +-- MotionFailed      accepted, but the arm did not arrive
       +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
       +-- ArmMoved          another client or a person has moved the arm, or is moving it
+      +-- PathDisturbed     another client interfered with lines that were being carried out
       +-- SettingsChanged   the tool offset, or another setting that a press depends on, has changed
 """
 
@@ -144,6 +145,19 @@ class ArmMoved(MotionError):
             remedy="Wait until it rests, and close the other client."
             if moving
             else "Nothing may stand in the way of the brush: the first motion is back along the tool axis.",
+        )
+
+
+class PathDisturbed(MotionError):
+    """The controller held lines that are not ours, or the tip left the path of ours; the arm was stopped."""
+
+    def __init__(self, device: str, op: str, what: str) -> None:
+        super().__init__(
+            device,
+            op,
+            what,
+            condition="Another client of the controller, or a person at the pendant, interfered; a stop was sent.",
+            remedy="Close the other client: a script, another program, a second brushloop.",
         )
 
 

@@ -62,6 +62,13 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
     return Pose(x, y, z, *turned)
 
 
+def from_line(a: Pose, b: Pose, pose: Pose) -> tuple[float, float]:
+    """(mm, deg) from the nearest place of the straight line from a to b to `pose`."""
+    way, gone = np.subtract(b.position_mm, a.position_mm), np.subtract(pose.position_mm, a.position_mm)
+    share = float(way @ gone) / max(float(way @ way), 1e-12)
+    return distance(interpolate(a, b, min(max(share, 0.0), 1.0)), pose)
+
+
 def _turn(a: Pose, b: Pose) -> rotation.Quaternion:
     """The rotation from a to b, in a's own axes."""
     return rotation.product(rotation.inverse(rotation.unit(a.quaternion)), rotation.unit(b.quaternion))

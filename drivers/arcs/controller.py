@@ -125,6 +125,11 @@ class Controller:
         """True when the queue is empty and the arm is steady."""
         return await self.ask("MotionControl.getExecId") == -1 and await self.ask("RobotState.isSteady") is True
 
+    async def rest(self) -> tuple[bool, Pose]:
+        """Whether the arm rests, and where its tip is. Raises `RobotNotSafe`."""
+        await self.require_safe("moveLine")
+        return await self.at_rest(), await self.pose()
+
     async def queue(self) -> tuple[int, int]:
         """(id of the running line, -1 for none; lines queued, the running one included). Raises `ProtocolViolation`."""
         running, size = await self.ask("MotionControl.getExecId"), await self.ask("MotionControl.getQueueSize")

@@ -5,12 +5,15 @@ arm run dry with the brush on the paper.
 
 A press is queued as a whole. A program that dies in mid-press must not leave the brush down, so the lift is queued
 before the descent begins. The controller holds its path meanwhile (`stopMove`) and is released by one request
-(`startMove`): before it nothing moves, and after it nothing more has to come from here.
+(`startMove`): before it nothing moves, and after it nothing more has to come from here. The controller takes lines from
+any client, so its queue must hold ours and no other; see `OwnPath`.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -18,8 +21,16 @@ from drivers.arcs.codes import QueueFull
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.waiting import RESTS_ELSEWHERE_S, STUCK_S, Tolerance, planned_s
-from drivers.errors import MotionFailed
-from drivers.geometry import distance
+from drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    MotionError,
+    MotionFailed,
+    PathDisturbed,
+    ProtocolViolation,
+)
+from drivers.geometry import distance, from_line
 from drivers.limits import Limits
 from drivers.samples import Pose, QueuedLine
 
@@ -125,8 +136,7 @@ def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
         DEVICE,
         "follow",
         f"{why}, after {sent} of {legs} points were sent",
-        condition="A stop was sent to the arm, and the brush may be down.",
-        remedy="Lift the brush before anything else.",
+        condition="A stop was sent to the arm.",
     )
 
 
@@ -156,7 +166,7 @@ async def queue_all(
     """Queue every line on an arm that rests at `start`, then release it; return once it may have begun.
 
     Raises `RobotNotSafe`, `MotionRefused`, and `MotionFailed` where the arm was stopped meanwhile, or where the
-    controller does not hold all lines: then the arm is not released.
+    controller does not hold all lines, and `PathDisturbed` where it holds more: then the arm is not released.
     """
 
     def require_not_stopped() -> None:
@@ -170,14 +180,87 @@ async def queue_all(
     for line in lines:
         require_not_stopped()
         await controller.move_line(line.target, line.speed_mm_s, acc_mm_s2, least_s=line.least_s)
-    _, size = await controller.queue()
     rests = tolerance.holds(await controller.pose(), start)
+    _, size = await controller.queue()  # last: what another client sends after this answer comes after our lift
+    if size > len(lines):
+        raise PathDisturbed(DEVICE, "sequence", f"the controller holds {size} lines, {len(lines)} were sent")
     if size < len(lines):
         raise _not_begun(f"the controller holds {size} of {len(lines)} lines")
     if not rests:
         raise _not_begun("the controller does not hold its path: the arm moved before it was released")
     require_not_stopped()
-    await controller.go_on()
+    # Without a readable answer the arm may have begun, and a stop would leave the brush down: what it does will tell.
+    with contextlib.suppress(ConnectionLost, DeviceTimeout, ProtocolViolation):
+        await controller.go_on()
+
+
+PATH_MM, PATH_DEG = 0.5, 0.5
+"""Largest distance of the tip from its path: larger than the error of an arm that follows a slow straight line, smaller
+than any drag that a mark would show."""
+
+
+class OwnPath:
+    """Watches the controller carry out our lines, from their release on, for anything that another client does."""
+
+    def __init__(self, controller: Controller, start: Pose, lines: Sequence[QueuedLine], seen: Sequence[Pose]) -> None:
+        """`seen` grows meanwhile by the poses that telemetry receives."""
+        self._controller = controller
+        self._corners = [start, *(line.target for line in lines)]
+        self._seen = seen
+        self._judged = 0
+        self._begun = False
+        self._most = self._lines = len(lines)
+        self._ids: set[int] = set()
+
+    async def look(self) -> tuple[bool, Pose] | DeviceError:
+        """Whether the arm rests, and where; the error, if an answer could not be read. That says nothing about the arm,
+        which carries out all lines by itself.
+
+        Raises `RobotNotSafe` and `PathDisturbed`.
+        """
+        self.require_followed()
+        controller = self._controller
+        try:
+            if controller.connection.lost:
+                await controller.connection.reopen()
+            running, size = await controller.queue()
+            state = await controller.rest()
+        except MotionError:
+            raise
+        except DeviceError as error:
+            return error
+        self._require_ours(running, size)
+        self._require_near(state[1])
+        return state
+
+    def require_followed(self) -> None:
+        """Raise `PathDisturbed` if telemetry has shown the tip beside the path since it was first seen on it."""
+        for pose in self._seen[self._judged :]:
+            self._judged += 1
+            if self._begun:
+                self._require_near(pose)
+            else:  # poses of an earlier move may still arrive
+                self._begun = self._off(pose) is None
+
+    def _require_ours(self, running: int, size: int) -> None:
+        """The queue only shrinks, and every line but the running one of those seen so far has left it."""
+        if running >= 0:
+            self._ids.add(running)
+        self._most = min(self._most, self._lines - max(len(self._ids) - 1, 0))
+        if size > self._most:
+            what = f"the controller holds {size} lines, at most {self._most} of ours are left"
+            raise PathDisturbed(DEVICE, "sequence", what)
+        self._most = size
+
+    def _require_near(self, pose: Pose) -> None:
+        if (off := self._off(pose)) is not None:
+            what = f"the tip was {off[0]:.2f} mm and {off[1]:.2f} deg from its path"
+            raise PathDisturbed(DEVICE, "sequence", what)
+
+    def _off(self, pose: Pose) -> tuple[float, float] | None:
+        """How far a pose lies from the path, in mm and deg; None if it lies on it."""
+        off_mm, off_deg = min((from_line(a, b, pose) for a, b in itertools.pairwise(self._corners)), key=sum)
+        return None if off_mm <= PATH_MM and off_deg <= PATH_DEG else (off_mm, off_deg)
 
 
 def _not_begun(why: str) -> MotionFailed:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, TypeVar
 
 from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
 from drivers.arcs.controller import Condition, Controller
 from drivers.arcs.departure import Departure
-from drivers.arcs.queueing import capped, feed, legs_of, queue_all
+from drivers.arcs.queueing import OwnPath, capped, feed, legs_of, queue_all
 from drivers.arcs.rpc import DEVICE, RpcConnection, open_arcs
 from drivers.arcs.settings import ArcsOptions, make_ready, power_on
 from drivers.arcs.stopping import Stopper, Watchdog
 from drivers.arcs.telemetry import Telemetry
-from drivers.arcs.waiting import Messages, Tolerance, planned_s, until_settled
+from drivers.arcs.waiting import Look, Messages, Tolerance, planned_s, until_settled
 from drivers.cancellation import finished
 from drivers.clock import Clock
 from drivers.errors import DeviceError, MotionFailed, NotConnected
@@ -23,6 +24,7 @@ from drivers.samples import Identity, Pose, PoseSample, QueuedLine
 __all__ = ["ArcsOptions", "AuboArcs", "Condition"]
 
 AUBOPE_PORT = 8899
+_R = TypeVar("_R")
 
 
 class AuboArcs:
@@ -127,7 +129,8 @@ class AuboArcs:
         start = await self._depart("moveLine", [target])
         speed_mm_s = self._limits.turn_capped(start, target, speed_mm_s)
         expected_s = planned_s(start, target, speed_mm_s, acc_mm_s2)
-        await self._carry_out(self._motion.move_line(target, speed_mm_s, acc_mm_s2), target, expected_s)
+        moving = self._motion.move_line(target, speed_mm_s, acc_mm_s2)
+        await self._carry_out(self._settled(moving, target, expected_s), target)
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
         """Send lines through all poses without a halt between them, then wait as `move` does at the last.
@@ -151,12 +154,14 @@ class AuboArcs:
             poll_s=self._options.poll_s,
             notice=self._notice,
         )
-        await self._carry_out(feeding, poses[-1], sum(leg.seconds for leg in legs))
+        expected_s = sum(leg.seconds for leg in legs)
+        await self._carry_out(self._settled(feeding, poses[-1], expected_s), poses[-1])
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         """Queue all lines while the controller holds its path, release it, and wait as `move` does.
 
-        Raises ValueError for no lines and for lines that end where the arm is.
+        After the release, answers that cannot be read do not stop the arm. Raises `PathDisturbed` if another client
+        interferes, and ValueError for no lines and for lines that end where the arm is.
         """
         for line in lines:
             self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
@@ -164,26 +169,43 @@ class AuboArcs:
         tolerance = self._tolerance
         if not lines or tolerance.holds(start, lines[-1].target):
             raise ValueError("sequence: it must not end where it begins")
-        stops = self._stops
         lines, expected_s = capped(start, lines, self._limits, acc_mm_s2)
+        return await self._carry_out(self._pressed(start, lines, acc_mm_s2, expected_s), lines[-1].target)
+
+    async def _pressed(
+        self, start: Pose, lines: Sequence[QueuedLine], acc_mm_s2: float, expected_s: float
+    ) -> list[Pose]:
+        stops, target, tolerance = self._stops, lines[-1].target, self._tolerance
         self._held = True
-        queueing = queue_all(
-            self._motion, start, lines, acc_mm_s2, stopped=lambda: self._stops != stops, tolerance=tolerance
-        )
         with self._telemetry.seeing() as seen:
-            await self._carry_out(queueing, lines[-1].target, expected_s)
+            path = OwnPath(self._motion, start, lines, seen)
+            queueing = queue_all(
+                self._motion, start, lines, acc_mm_s2, stopped=lambda: self._stops != stops, tolerance=tolerance
+            )
+            await self._settled(queueing, target, expected_s, path.look)
             self._held = False
-            await self._telemetry.reaching(lines[-1].target, tolerance)
+            await self._telemetry.reaching(target, tolerance)
+            path.require_followed()
             return [*seen]
 
-    async def _carry_out(self, command: Coroutine[None, None, None], target: Pose, expected_s: float) -> None:
+    async def _settled(
+        self, command: Coroutine[Any, Any, None], target: Pose, expected_s: float, look: Look | None = None
+    ) -> None:
+        await command
+        await until_settled(
+            look or self._motion.rest,
+            target,
+            self._tolerance,
+            planned_s=expected_s,
+            poll_s=self._options.poll_s,
+        )
+
+    async def _carry_out(self, motion: Coroutine[Any, Any, _R], target: Pose) -> _R:
         self._unsettled, self._departure.left = True, None
         try:
-            await command
-            await until_settled(
-                self._motion, target, self._tolerance, planned_s=expected_s, poll_s=self._options.poll_s
-            )
+            result = await motion
             self._unsettled, self._departure.left = False, target
+            return result
         except BaseException as error:
             note = ""
             try:

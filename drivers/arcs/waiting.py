@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,24 +55,37 @@ async def until_mode(controller: Controller, wanted: set[RobotMode], *, timeout_
         ) from None
 
 
-async def until_settled(
-    controller: Controller, target: Pose, tolerance: Tolerance, *, planned_s: float, poll_s: float
-) -> None:
-    """Return once the queue is empty, the arm steady and the pose within tolerance.
+Look = Callable[[], Awaitable[tuple[bool, Pose] | DeviceError]]
+"""Asks whether the arm rests, and where its tip is. An error that it returns, it does not raise: it is to ask again."""
 
-    Raises `RobotNotSafe`; `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it
-    comes no nearer. An arm whose speed was turned down on the pendant is slow, not stuck.
+
+async def until_settled(
+    look: Look,
+    target: Pose,
+    tolerance: Tolerance,
+    *,
+    planned_s: float,
+    poll_s: float,
+) -> None:
+    """Return once `look` reports that the arm rests, at a pose within tolerance.
+
+    Raises `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it comes no nearer: an
+    arm whose speed was turned down on the pendant is slow, not stuck. An error that `look` returns, instead of raising
+    it, is raised only if it still returns one `STUCK_S` after the planned time.
     """
     loop = asyncio.get_running_loop()
-    allowed_s = 2.0 * planned_s + 3.0
-    deadline = loop.time() + allowed_s
+    begun_at, allowed_s = loop.time(), 2.0 * planned_s + 3.0
     idle_since: float | None = None
-    nearest, nearer_at = math.inf, loop.time()
+    nearest, nearer_at = math.inf, begun_at
     while True:
-        await controller.require_safe("moveLine")
-        steady = await controller.at_rest()
-        off_mm, off_deg = distance(await controller.pose(), target)
-        now = loop.time()
+        state, now = await look(), loop.time()
+        if isinstance(state, DeviceError):
+            if now > begun_at + planned_s + STUCK_S:
+                raise state
+            await asyncio.sleep(poll_s)
+            continue
+        steady, here = state
+        off_mm, off_deg = distance(here, target)
         if off_mm + off_deg < nearest - PROGRESS:
             nearest, nearer_at = off_mm + off_deg, now
         if steady and off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
@@ -79,7 +93,7 @@ async def until_settled(
         idle_since = (idle_since or now) if steady else None
         if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
             raise _not_arrived(f"rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
-        if now > deadline and now - nearer_at > STUCK_S:
+        if now > begun_at + allowed_s and now - nearer_at > STUCK_S:
             raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg to go")
         await asyncio.sleep(poll_s)
 
@@ -101,7 +115,7 @@ def _not_arrived(what: str) -> MotionFailed:
         "moveLine",
         what,
         condition="A stop was sent to the arm.",
-        remedy="Check on the pendant whether the target is within reach.",
+        remedy="Check on the pendant whether the target is within reach, and that no other client stops the arm.",
     )
 
 
