@@ -26,6 +26,7 @@ from drivers.errors import (
     LimitExceeded,
     MotionRefused,
     NotConnected,
+    PathDisturbed,
     RobotNotSafe,
     SettingsChanged,
 )
@@ -132,9 +133,10 @@ class Parked(CollectAborted):
 def arm_at_fault(error: BaseException) -> bool:
     """Whether the arm failed, or the brush met something hard: then the arm must not move before a person has looked.
 
-    A line that was refused for a limit is no fault of the arm, which may still be lifted.
+    After a line that was refused for a limit, or a press that another client disturbed, the arm may still be lifted.
     """
-    robots = isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, LimitExceeded)
+    lifted = LimitExceeded | PathDisturbed
+    robots = isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, lifted)
     return robots or isinstance(error, ForceTooHigh)
 
 
@@ -143,8 +145,19 @@ def rest_is_unknown(error: BaseException | None) -> bool:
     stop."""
     if isinstance(error, ArmMoved):
         return error.moving
+    if isinstance(error, PathDisturbed):
+        return hasattr(error, "__notes__")  # the stop failed, or the lift after it
     known = RobotNotSafe | LimitExceeded | MotionRefused | NotConnected | SettingsChanged
     return isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, known)
+
+
+def brush_may_be_down(above_mm: float) -> str:
+    """What a run says that ends with the tip below travel height, last seen `above_mm` above the paper."""
+    where = f"{abs(above_mm):.1f} mm {'above' if above_mm > 0.0 else 'below'} the height of the paper"
+    return (
+        f"The brush may be down: its tip was last seen {where}. Clear the way above it, then start the same command "
+        "again, which first lifts the brush along its axis; or lift it with the pendant."
+    )
 
 
 def describe(error: BaseException) -> str:

@@ -25,7 +25,7 @@ from collect.engine.set_up import board_first, listed
 from collect.engine.snapshot import SetUpStep, Snapshot
 from collect.engine.steps.context import RunContext, uninterrupted
 from collect.engine.telemetry import Telemetry, noting_targets, previewing
-from collect.errors import CollectAborted, ConfigError, Parked, describe, rest_is_unknown
+from collect.errors import CollectAborted, ConfigError, Parked, brush_may_be_down, describe, rest_is_unknown
 from collect.motion.procedures import Procedures
 from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from collect.planning.walk import layout_of, sheet_of, steps_on
@@ -114,7 +114,7 @@ class Engine:
         no_pose_s, state = 0.0, self._control.state
         if (rig := self._rig) is not None:
             try:
-                tip_mm = self._telemetry.tip_mm = rig.robot.latest().pose.position_mm
+                tip_mm = self._see_tip(rig)
             except Stale as stale:
                 no_pose_s = stale.age_ms / 1e3
             except DeviceError:
@@ -135,6 +135,10 @@ class Engine:
             set_up=self._set_up(),
             no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
         )
+
+    def _see_tip(self, rig: Rig) -> tuple[float, float, float]:
+        self._telemetry.tip_mm = rig.robot.latest().pose.position_mm
+        return self._telemetry.tip_mm
 
     def _parked(self) -> bool:
         tip_mm, motion = self._telemetry.tip_mm, self._rig_config.motion
@@ -202,11 +206,11 @@ class Engine:
         except asyncio.CancelledError:
             await self._stopped()
         except Parked as error:
-            self._end(State.STOPPED, describe(error))
+            self._end(State.STOPPED, error)
             raise
         except Exception as error:
             self._rest_unknown = rest_is_unknown(error)
-            self._end(State.FAILED, describe(error))
+            self._end(State.FAILED, error)
             raise
         finally:
             if self._stopper is not None:
@@ -219,10 +223,11 @@ class Engine:
         if self._stop_failure is not None and not isinstance(self._stop_failure, NotConnected):
             # Not reported as stopped: the arm was not seen at rest.
             self._rest_unknown = True
-            self._end(State.FAILED, describe(self._stop_failure))
+            self._end(State.FAILED, self._stop_failure)
             raise self._stop_failure
-        self._end(State.STOPPED, "stopped by the operator")
-        raise CollectAborted("stopped; the same command resumes from here")
+        stopped = CollectAborted("stopped; the same command resumes from here")
+        self._end(State.STOPPED, stopped)
+        raise stopped
 
     async def _session(self) -> None:
         self._progress.doing("connect")
@@ -245,6 +250,8 @@ class Engine:
                 final = await uninterrupted(store.close)
                 self._progress.closed(f"closed: {final}")
             finally:
+                with contextlib.suppress(DeviceError):
+                    self._see_tip(rig)
                 store.release()
         self._control.end(State.DONE)
 
@@ -279,6 +286,10 @@ class Engine:
         steps = steps_on(self._rig_config, self._protocol_config)
         await run.protocol(board_first(steps) if self._guided else steps)
 
-    def _end(self, state: State, why: str) -> None:
+    def _end(self, state: State, error: BaseException) -> None:
+        """End the run with `error`, whose message says so if the brush may be down."""
+        tip_mm, config = self._telemetry.tip_mm, self._rig_config
+        if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):
+            error.add_note(brush_may_be_down(tip_mm[2] - config.paper.touch_z_mm))
         self._control.end(state)
-        self._progress.ended(why)
+        self._progress.ended(describe(error))

@@ -7,7 +7,16 @@ from enum import StrEnum
 from collect.errors import BadPicture, ForceTooHigh, JogGivenUp, NeedsOperator, SheetFull, StepError, StepVoid, describe
 from collect.operator import Choice, Prompt
 from collect.protocols.steps import Step, StepKind
-from drivers.errors import ArmMoved, DeviceError, DeviceTimeout, MotionError, RobotNotSafe, SettingsChanged, Stuck
+from drivers.errors import (
+    ArmMoved,
+    DeviceError,
+    DeviceTimeout,
+    MotionError,
+    PathDisturbed,
+    RobotNotSafe,
+    SettingsChanged,
+    Stuck,
+)
 from drivers.ink.port import InkRefused
 
 MAX_FAILURES = 3
@@ -36,7 +45,7 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe() | Stuck():
             return Action.ASK
         # Another client controlled the arm.
-        case _, ArmMoved() | SettingsChanged():
+        case _, ArmMoved() | SettingsChanged() | PathDisturbed():
             return Action.ASK
         case StepKind.ZERO_TOUCH, JogGivenUp():
             return Action.ASK
@@ -68,7 +77,7 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
             go_on = "there is ink: dip again"
         case ForceTooHigh():
             go_on = "nothing is under the brush: lift it and go on"
-        case ArmMoved():
+        case ArmMoved() | PathDisturbed():
             go_on = "nobody else uses the arm: lift it and go on"
         case SettingsChanged():
             go_on = "nobody else uses the arm: restore the settings, lift it and go on"

@@ -71,7 +71,7 @@ async def until_settled(
 
     Raises `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it comes no nearer: an
     arm whose speed was turned down on the pendant is slow, not stuck. An error that `look` returns, instead of raising
-    it, is raised only if it still returns one `STUCK_S` after the planned time.
+    it, is raised only if it still returns one after twice the planned time.
     """
     loop = asyncio.get_running_loop()
     begun_at, allowed_s = loop.time(), 2.0 * planned_s + 3.0
@@ -80,7 +80,7 @@ async def until_settled(
     while True:
         state, now = await look(), loop.time()
         if isinstance(state, DeviceError):
-            if now > begun_at + planned_s + STUCK_S:
+            if now > begun_at + allowed_s:
                 raise state
             await asyncio.sleep(poll_s)
             continue

@@ -12,7 +12,7 @@ from collect.engine.control import State
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.waiting import Tolerance, until_settled
-from drivers.errors import MotionFailed, SettingsChanged
+from drivers.errors import MotionFailed, PathDisturbed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean, to_wire
 from sessions.journal.lines import read_lines
 from tests.collect.until import until, wait_for_end
@@ -216,3 +216,39 @@ def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
     assert engine.snapshot().strokes_done == 2
     assert lab.rig.arcs.cabinet.tcp_offset[2] == 0.18
     assert max(press.depth_mm for press in lab.rig.world.presses) < 11.1, "none went deeper than asked"
+
+
+@pytest.mark.parametrize("moment", ["moveLine", "startMove"], ids=["between our lines", "as the path is released"])
+def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_new_patch(lab: Lab, moment: str) -> None:
+    lab.write_protocol("[11.0]", "[0.0]")
+    methods, world = lab.rig.arcs._methods, lab.rig.world
+    method = f"rob1.MotionControl.{moment}"
+    carry_out = methods[method]
+    sent: list[bool] = []
+
+    def tampered(params: dict[str, Any]) -> Any:
+        into_paper = moment == "startMove" or from_wire(params["pose"]).z_mm < PAPER_Z_MM - 10.0
+        if into_paper and not sent and world.motion.held and world.motion.size:
+            sent.append(world.motion.add(UNDER, 200.0, 800.0, world.clock.now_s()))
+        return carry_out(params)
+
+    methods[method] = tampered
+    engine = lab.engine()
+    engine.start()
+    with pytest.raises(PathDisturbed, match="nother client"):
+        wait_for_end(engine)
+    now = engine.snapshot()
+    assert sent == [True]
+    assert (now.state, now.strokes_done, now.rest_unknown, now.parked) == (State.FAILED, 0, False, True)
+    assert not world.drags
+
+    methods[method] = carry_out
+    again = lab.engine()
+    again.start()
+    wait_for_end(again)
+    [folder] = lab.sessions.iterdir()
+    lines = list(read_lines(folder / "journal.jsonl"))
+    begun = [line["cell"] for line in lines if line["event"] == "begin" and line["kind"] == "press"]
+    assert len(set(begun)) == 2
+    assert any("nother client" in line["why"] for line in lines if line["event"] == "void")
+    assert again.snapshot().strokes_done == 1

@@ -106,15 +106,29 @@ LOST = Outcome("`ConnectionLost`, stopped", ConnectionLost, "robot")
 UNSAFE = Outcome("`RobotNotSafe`, stopped", RobotNotSafe, "robot")
 BLIND = Outcome("camera `DeviceTimeout`, parked", DeviceTimeout, "camera")
 
+
+PRESSING = ("descent", "at depth", "lift")
+
+
+def carried_out(name: str, phase: str) -> bool:
+    """Whether the controller makes the whole press, lift included, although the fault strikes it."""
+    return phase in PRESSING and TABLE[name][list(PHASES).index(phase)] in (DONE, SILENT)
+
+
+def but_for_a_press(outcome: Outcome) -> list[Outcome]:
+    """The controller carries out a press that it was released for, and answers that are lost are asked for again."""
+    return [outcome] * 6 + [DONE] * 3 + [outcome]
+
+
 TABLE: dict[str, list[Outcome]] = {
     # connecting and powering, then the eight phases in which the arm moves or has just moved
     "mute": [TIMEOUT] * 2 + [SILENT] * 8,
-    "late": [TIMEOUT] * 10,
+    "late": but_for_a_press(TIMEOUT),
     "split": [DONE] * 10,
     "duplicate": [DONE] * 10,
-    "wrong id": [TIMEOUT] * 10,
-    "malformed": [VIOLATION] * 10,
-    "drop": [LOST] * 10,
+    "wrong id": but_for_a_press(TIMEOUT),
+    "malformed": but_for_a_press(VIOLATION),
+    "drop": but_for_a_press(LOST),
     "protective stop": [UNSAFE] * 10,
     "emergency stop": [UNSAFE] * 10,
     "frozen camera": [BLIND] * 10,
@@ -193,8 +207,9 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
             return result
         if not targets or moment.method not in (LINE, WAITING) or name == "frozen camera":
             stage.gears.shift(FAST)
-        elif TABLE[name][0] is DONE:
-            stage.loop.call_later(2.5 if phase == "at depth" else 0.3, stage.gears.shift, FAST)
+        elif TABLE[name][0] is DONE or carried_out(name, phase):
+            wait_s = 1.6 / slow if phase == "at depth" else 1.0 if phase in PRESSING else 0.3
+            stage.loop.call_later(wait_s, stage.gears.shift, FAST)
         return result
 
     let_go: Callable[[dict[str, Any]], Any] = methods[LET_GO]
@@ -237,7 +252,7 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     board = stage.rig.faults.board
     assert any(hung.struck for hung in (*board.hanging, *board.over)), "the fault has struck"
     now = engine.snapshot()
-    assert now.state is (State.DONE if expected is DONE else State.FAILED), now
+    assert now.state is (State.DONE if expected is DONE else State.FAILED), now.error
     assert type(ended) is (expected.error or type(None)), repr(ended)
     assert not isinstance(ended, DeviceError) or ended.device == expected.device
     assert ("may still be moving. Use the emergency stop" in now.error) is expected.alarm, now.error
@@ -251,6 +266,8 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     [target] = targets
     if expected in (DONE, BLIND):
         assert stage.rig.faults.truth.phase() is Phase.PARKED
+    elif carried_out(name, phase):
+        assert stage.rig.world.tool().z_mm > stage.rig.config.table.paper_z_mm + 7.0, "lifted"
     elif target is not None and phase != "at depth":
         assert sum(distance(stage.rig.world.tool(), target)) > 0.5, "stopped on its way"
     assert_it_stays_at_rest(stage)
@@ -302,7 +319,7 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "phase"), [("drop", "descent"), pytest.param("protective stop", "lift", marks=pytest.mark.soak)]
+    ("name", "phase"), [("drop", "travel"), pytest.param("protective stop", "lift", marks=pytest.mark.soak)]
 )
 def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: str, phase: str) -> None:
     engine = stage.engine()

@@ -7,7 +7,6 @@ import asyncio
 
 import pytest
 
-from drivers.arcs import waiting
 from drivers.arcs.robot import AuboArcs
 from drivers.arcs.rpc import RpcConnection
 from drivers.errors import DeviceTimeout, MotionFailed, RobotNotSafe
@@ -62,9 +61,8 @@ async def test_a_release_whose_answer_cannot_be_read_is_carried_out(
 
 
 async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_press(
-    arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
+    arm: AuboArcs, cabinet: ArcsServer
 ) -> None:
-    monkeypatch.setattr(waiting, "STUCK_S", 0.5)
     quick = [QueuedLine(line.target, 250.0, 0.2 if line.least_s else 0.0) for line in PRESS]
     press = asyncio.create_task(arm.sequence(quick, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
