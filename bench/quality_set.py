@@ -23,6 +23,7 @@ from collect.rig.config import PaperConfig
 from collect.rig.paper import Cell, Sheet
 from drivers.geometry import brush_pose
 from drivers.sim.brush.brush import BrushSpec, Flaw
+from drivers.sim.brush.drag import Waypoint
 from drivers.sim.brush.paper import PX_PER_MM, Footprint
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
@@ -114,7 +115,7 @@ class Bench:
         rng = self.rng
         height_mm, tilt_deg = round(rng.uniform(11.0, 20.0), 1), round(rng.uniform(0.0, 10.0), 1)
         load, flaw, severity = rng.uniform(0.8, 1.0), None, 0.0
-        off_mm = np.array(cell.anchor_mm) + np.clip(rng.normal(0.0, 0.2, 2), -0.5, 0.5)
+        aside_mm = off_mm = np.array(cell.anchor_mm) + np.clip(rng.normal(0.0, 0.2, 2), -0.5, 0.5)
         pressed = True
         match label:
             case Failure.BLANK:
@@ -138,13 +139,25 @@ class Bench:
                 off_mm = off_mm + severity * np.array([math.cos(turn), math.sin(turn)])
                 if not self._on_sheet(off_mm):
                     return None
+            case Failure.SMEARED:
+                severity = rng.uniform(15.0, 40.0)
+                turn = math.radians(rng.uniform(50.0, 130.0)) * rng.choice([-1.0, 1.0])
+                aside_mm = off_mm + severity * np.array([math.cos(turn), math.sin(turn)])
+                if not self._on_sheet(aside_mm):
+                    return None
             case Failure.NEIGHBOUR if rng.random() < 0.5:
                 self._overrun(cell)
                 self.still = self._render()
             case _:
                 pass
         already = self.world.paper.density.copy()
-        if pressed:
+        if label is Failure.SMEARED:
+            deep = Waypoint(float(off_mm[0]), float(off_mm[1]), height_mm)
+            away = Waypoint(float(aside_mm[0]), float(aside_mm[1]), height_mm * rng.uniform(0.3, 1.0))
+            path = (dataclasses.replace(deep, depth_mm=0.0), deep, away, deep, dataclasses.replace(deep, depth_mm=0.0))
+            mark = self.world.brush.drag(path, tilt_deg, 0.0, ink_load=load, press_seed=self._next_seed())
+            self.world.paper.lay(mark, deep.x_mm, deep.y_mm, 0.0)
+        elif pressed:
             mark = self._press(height_mm, tilt_deg, load, flaw, severity if flaw else 1.0)
             self.world.paper.lay(mark, float(off_mm[0]), float(off_mm[1]), 0.0)
         own = self.world.paper.density - already
@@ -263,9 +276,12 @@ class Bench:
         return float(np.count_nonzero(density[rows, columns] > INK)) / PX_PER_MM**2
 
     def _press(self, height_mm: float, tilt_deg: float, load: float, flaw: Flaw | None, severity: float) -> Footprint:
-        self._presses += 1
-        seed = self.world.config.seed * 1009 + self._presses
+        seed = self._next_seed()
         return self.world.brush.press(height_mm, tilt_deg, ink_load=load, press_seed=seed, flaw=flaw, severity=severity)
+
+    def _next_seed(self) -> int:
+        self._presses += 1
+        return self.world.config.seed * 1009 + self._presses
 
     def _on_sheet(self, place: NDArray[np.float64]) -> bool:
         width, height = self.table.sheet_mm

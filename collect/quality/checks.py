@@ -27,6 +27,8 @@ FAR_MM = 45.0
 """Margin around the cell in which a press that left nothing in it is looked for."""
 LIGHT_MM = 22.0
 """Margin around the cell that shows enough paper to tell glare from the light."""
+LONGEST, WIDEST = 1.6, 0.65
+"""Length and width of the largest mark per depth of its press; a few mm more come from the tip."""
 CROSSING_MM = 4.0
 """Length of ink across the edge of a cell, in mm; the end of one stroke that goes too far covers less."""
 
@@ -159,7 +161,7 @@ def _ink_checks(press: _Press, ink: Ink) -> list[Check]:
     checks += [enough, dry(mark, limits)]
     if checks[-1].passed:
         # The head, tip and tone of a dry brush's mark mean nothing.
-        checks += [check(mark, limits) for check in MARK_CHECKS]
+        checks += [smeared(mark, press.height_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
     return checks
 
 
@@ -272,6 +274,16 @@ def misplaced(mark: Mark, limits: QualityConfig) -> Check:
     off_mm = math.hypot(along - limits.head_mm, aside)
     reason = f"The stroke begins {off_mm:.1f} mm from where the tip should have touched. {_WHERE}"
     return _below(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
+
+
+def smeared(mark: Mark, height_mm: float, limits: QualityConfig) -> Check:
+    """The mark is no larger than a press of its depth makes it: a brush that moves sideways leaves more."""
+    excess_mm = max(mark.length_mm - LONGEST * height_mm, mark.width_mm - WIDEST * height_mm)
+    reason = (
+        f"The stroke is smeared: {mark.length_mm:.0f} by {mark.width_mm:.0f} mm at a depth of {height_mm:g} mm. Did "
+        "another client move the arm, or did the sheet slip?"
+    )
+    return _below(Failure.SMEARED, excess_mm, "mm", limits.smeared_mm, reason)
 
 
 def faint(mark: Mark, limits: QualityConfig) -> Check:

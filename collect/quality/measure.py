@@ -135,6 +135,9 @@ class Mark:
     """Widest gap between two groups of hairs, averaged over 2 mm of length."""
     bent_deg: float
     """Angle between the heading and the direction from its head to its tip."""
+    length_mm: float
+    """Along the heading."""
+    width_mm: float
 
 
 def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
@@ -166,6 +169,8 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
         head_mm=(float(left_mm if flip else right_mm), head),
         gap_mm=_gap_mm(hairs),
         bent_deg=float(np.degrees(np.arctan2(abs(tip - head), reach_mm))),
+        length_mm=length / PX_PER_MM,
+        width_mm=own.shape[0] / PX_PER_MM,
     )
 
 

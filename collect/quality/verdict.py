@@ -43,6 +43,7 @@ class Failure(StrEnum):
     NEIGHBOUR = "neighbour", Family.PLACE
     BLANK = "blank", Family.INK
     DRY = "dry", Family.INK
+    SMEARED = "smeared", Family.PLACE
     MISPLACED = "misplaced", Family.PLACE
     FAINT = "faint", Family.INK
     SPLIT = "split", Family.SHAPE

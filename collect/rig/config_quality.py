@@ -45,6 +45,8 @@ class QualityConfig(BaseModel):
     """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
     misplaced_mm: Length = 1.6
     """Distance of the mark's head from where it should begin."""
+    smeared_mm: Length = 4.0
+    """How much longer than 1.6 times its depth, or wider than 0.65 times, a mark may be."""
     faint_tone: Share = 0.77
     """Darkness of the ink, 1 = reflects nothing, below which it is faint."""
     split_mm: Length = 0.3
