@@ -93,7 +93,6 @@ def _ink(config: RigConfig) -> Iterator[Check]:
 def _places(config: RigConfig) -> Iterator[Check]:
     limits, places = limits_of(config), places_of(config)
     box_mm = (limits.x_mm, limits.y_mm, limits.z_mm)
-    yield from plausible.in_reach(places)
     yield from plausible.in_box(places, box_mm)
     yield plausible.box_not_loose(places, box_mm)
     park = to_paper(config.paper, *config.motion.park_mm[:2])

@@ -7,8 +7,6 @@ from typing import Literal
 
 from collect.rig.config import RigConfig
 from collect.rig.paper import to_base, to_paper
-from collect.rig.reach import reach_left_mm, tool_of
-from drivers.geometry import brush_pose
 
 Kind = Literal["sheet", "touch", "well", "rim", "pot", "park"]
 
@@ -25,8 +23,6 @@ class Place:
     """The same point in the paper frame, seen from above."""
     top_mm: float
     """Height in the base frame from which the tip comes down to it."""
-    reach_left_mm: float
-    """Distance of the wrist from the limit of the arm's reach, at the worse height; negative is out of reach."""
 
 
 def places_of(config: RigConfig) -> tuple[Place, ...]:
@@ -48,7 +44,7 @@ def places_of(config: RigConfig) -> tuple[Place, ...]:
         places.append(_over(config, "pot", "wash pot", ink.wash.pot_mm, ink.wash.dip_z_mm))
     park = config.motion.park_mm
     at = to_paper(paper, park[0], park[1])
-    places.append(Place("park", "park", park, at, max(park[2], safe_z_mm), _left_mm(config, park, park[2])))
+    places.append(Place("park", "park", park, at, max(park[2], safe_z_mm)))
     touched = config.touch.points_mm or [paper.touch_point_mm]
     places += [
         _over(config, "touch", f"touch point {number}", point, paper.touch_z_mm)
@@ -59,11 +55,4 @@ def places_of(config: RigConfig) -> tuple[Place, ...]:
 
 def _over(config: RigConfig, kind: Kind, name: str, paper_mm: tuple[float, float], z_mm: float) -> Place:
     at_mm = (*to_base(config.paper, *paper_mm), z_mm)
-    top_mm = config.motion.safe_z_mm
-    return Place(kind, name, at_mm, paper_mm, top_mm, _left_mm(config, at_mm, top_mm))
-
-
-def _left_mm(config: RigConfig, at_mm: tuple[float, float, float], top_mm: float) -> float:
-    tool = tool_of(config.robot)
-    ends = (at_mm, (at_mm[0], at_mm[1], top_mm))
-    return min(reach_left_mm(brush_pose(*end, heading_deg=config.paper.yaw_deg), tool) for end in ends)
+    return Place(kind, name, at_mm, paper_mm, config.motion.safe_z_mm)

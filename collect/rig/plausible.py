@@ -141,22 +141,10 @@ def touch_height(points: int, method: str) -> Check:
 
 # Places and limits
 
-LEAST_REACH_MM = 10.0
-"""The dimensions of an arm differ from the nominal ones by a millimetre or so; a stretched arm is also weak."""
 LOOSE_MM = 250.0
 """Room beyond the outermost place, in mm, from which on the box no longer protects anything."""
 PARK_CLEAR_MM = 40.0
 """Half the width of a holder and a part of the wrist, which must be out of the picture."""
-
-
-def in_reach(places: Sequence[Place]) -> list[Check]:
-    """Whether the arm reaches every place with the brush upright, from the nominal dimensions of the i5."""
-    remedy = "Out of the arm's reach: move it toward the arm's middle reach (rig show --picture) and teach it again."
-    return _worst(
-        "reach",
-        [within(f"reach, {p.name}", p.reach_left_mm, LEAST_REACH_MM, math.inf, "mm", remedy) for p in places],
-        min(places, key=lambda p: p.reach_left_mm),
-    )
 
 
 def in_box(places: Sequence[Place], box_mm: Box) -> list[Check]:

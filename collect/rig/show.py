@@ -28,11 +28,11 @@ def rig_table(config: RigConfig) -> Group:
     about.add_row("speed", f"travel {motion.travel_speed_mm_s:g}, press {motion.press_speed_mm_s:g} mm/s")
     above_mm = motion.safe_z_mm - paper.touch_z_mm
     about.add_row("travel height", f"{motion.safe_z_mm:.1f} mm, {above_mm:.1f} mm above the paper")
-    table = Table("place", "base x", "y", "z", "paper x", "y", "reach left")
+    table = Table("place", "base x", "y", "z", "paper x", "y")
     for column in table.columns[1:]:
         column.justify = "right"
     for place in places_of(config):
-        table.add_row(place.name, *(f"{v:.1f}" for v in (*place.at_mm, *place.paper_mm, place.reach_left_mm)))
+        table.add_row(place.name, *(f"{v:.1f}" for v in (*place.at_mm, *place.paper_mm)))
     return Group(about, table)
 
 
@@ -42,10 +42,7 @@ def rig_json(config: RigConfig) -> dict[str, Any]:
     return {
         "name": config.name,
         "limits": {"x_mm": limits.x_mm, "y_mm": limits.y_mm, "z_mm": limits.z_mm, "tilt_deg": limits.tilt_deg},
-        "places": [
-            {"name": p.name, "at_mm": p.at_mm, "paper_mm": p.paper_mm, "reach_left_mm": p.reach_left_mm}
-            for p in places_of(config)
-        ],
+        "places": [{"name": p.name, "at_mm": p.at_mm, "paper_mm": p.paper_mm} for p in places_of(config)],
     }
 
 
