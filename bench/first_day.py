@@ -135,13 +135,13 @@ class _Person:
         return next((answer for part, answer in answers.items() if part in words), "")
 
     def _chosen(self, question: Question) -> str:
-        """The key that lets the arm move, and what fills the well; otherwise what is offered."""
+        """The key that lets the arm move, what fills the well, and yes to what is offered; otherwise no."""
         if "moves by itself" in question.text:
             return "a"
         if "well filled" in question.text:
             ink = self._lab.seen().ink
             return "n" if ink is None else "i" if ink[0] == "ink-station" else "p"
-        return "enter"
+        return "enter" if question.default else "y" if "Agreed?" in question.text else "n"
 
 
 async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop, out: Path) -> int:

@@ -13,7 +13,6 @@ import typer
 from sessions.terminal import say
 
 if TYPE_CHECKING:
-    from collect.teach.day import Day
     from collect.tui.teach_guide import ScreenGuide
 
 app = typer.Typer(
@@ -25,7 +24,6 @@ RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limit
 Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")]
 
 
-Plain = Annotated[bool, typer.Option("--plain", help="Ask line by line in the terminal, without a screen.")]
 Arm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")]
 
 
@@ -34,74 +32,44 @@ def new(
     rig: Annotated[Path, typer.Argument(help="The rig.toml to make; what is taught is kept beside it.")] = Path(
         "rig.toml"
     ),
-    plain: Plain = False,
     arm: Arm = False,
 ) -> None:
     """Guide you through the first day, from an unboxed arm to a rig.toml. Run it again to resume."""
-    _teach(rig, None, plain=plain, arm=arm)
+    _teach(rig, None, arm=arm)
 
 
 @app.command()
 def teach(
     step: Annotated[str, typer.Argument(help="arm, camera, tip, sheet, places, brush, force, limits or proof.")],
     rig: Annotated[Path, typer.Option(help="The rig.toml; what was taught is kept beside it.")] = Path("rig.toml"),
-    plain: Plain = False,
     arm: Arm = False,
 ) -> None:
     """Teach one step again. Only its values change, and those that depend on them; the changes are listed."""
-    _teach(rig, step, plain=plain, arm=arm)
+    _teach(rig, step, arm=arm)
 
 
-def _teach(rig: Path, step: str | None, *, plain: bool, arm: bool) -> None:
-    import asyncio
+def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
     import sys
 
-    from collect.teach.day import Day
+    from collect.errors import ConfigError
+    from collect.tui.teach_app import run_teaching
     from drivers.clock import HostClock
 
-    if plain or not (sys.stdin.isatty() and sys.stdout.isatty()):
-        from collect.teach.plain import PlainGuide
-
-        day = Day(PlainGuide(rig.with_name(f"{rig.stem}.pictures")), rig, HostClock(), armed=arm)
-        asyncio.run(_until_signalled(day, step))
-        return
-    from collect.tui.teach_app import run_teaching
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
 
     async def watched_day(guide: ScreenGuide) -> Path | None:
+        from collect.teach.day import Day
         from collect.teach.watch import watched
+        from collect.teach.wizard import Wizard
 
         day = Day(guide, rig, HostClock(), armed=arm)
         async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
-            return await _taught(day, step)
+            wizard = Wizard(day)
+            return await (wizard.run() if step is None else wizard.again(step))
 
     if (written := run_teaching(watched_day, str(rig))) is not None:
         say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
-
-
-async def _until_signalled(day: Day, step: str | None) -> None:
-    """Teach; SIGTERM and a lost terminal stop the arm and end it, as Ctrl-C does by itself. Raises `CollectAborted`."""
-    import asyncio
-    import signal
-
-    from collect.errors import CollectAborted
-    from collect.headless import stop_signals
-
-    loop, teaching = asyncio.get_running_loop(), asyncio.ensure_future(_taught(day, step))
-    with stop_signals(lambda _: loop.call_soon_threadsafe(teaching.cancel), (signal.SIGTERM, signal.SIGHUP)):
-        try:
-            await teaching
-        except asyncio.CancelledError:
-            this = asyncio.current_task()
-            if this is not None and this.cancelling():
-                raise  # by Ctrl-C
-            raise CollectAborted("stopped; the same command resumes from there") from None
-
-
-async def _taught(day: Day, step: str | None) -> Path | None:
-    from collect.teach.wizard import Wizard
-
-    wizard = Wizard(day)
-    return await (wizard.run() if step is None else wizard.again(step))
 
 
 @app.command()

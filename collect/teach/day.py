@@ -10,7 +10,8 @@ from typing import Protocol
 from collect.errors import CannotTeach, StepError
 from collect.operator import Choice
 from collect.teach.arm_reader import Address, ArmReader, reading
-from collect.teach.guide import Guide, Picture, Shown, Tone, WentBack
+from collect.teach.back import BackGuide
+from collect.teach.guide import Guide, Picture, Shown, Tone
 from collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc
 from drivers.clock import Clock
 
@@ -24,7 +25,9 @@ class Day:
 
     def __init__(self, guide: Guide, rig_path: Path, clock: Clock, *, armed: bool) -> None:
         """`armed`: the command line allows motion; the person is asked again each time. Raises `ConfigError`."""
-        self.guide = guide
+        self.person = guide
+        """Asked directly where an answer cannot be taken back."""
+        self.guide = BackGuide(guide, lambda: self.notebook)
         self.rig_path = rig_path
         self.clock = clock
         self.armed = armed
@@ -74,9 +77,16 @@ class Day:
         """Show what is being done until the next finding or question."""
         await self.say(what, tone="progress")
 
-    async def yes(self, question: str, *, default: bool) -> bool:
-        """Ask for yes or no."""
-        return await self.guide.choose(question, (YES, NO), "y" if default else "n") == "y"
+    async def yes(self, question: str) -> bool:
+        """Ask for yes or no; Enter is neither."""
+        return await self.guide.choose(question, (YES, NO), "") == YES.key
+
+    def back(self) -> bool:
+        """Restore the notebook of the last answered question, so that it is asked again; False if there is none."""
+        if (notebook := self.guide.take_back()) is None:
+            return False
+        self.save(notebook)
+        return True
 
     async def may_move(self, what: str) -> None:
         """Ask for the key that lets the arm move. Raises `CannotTeach` unless both it and `--arm` are given."""
@@ -84,7 +94,8 @@ class Day:
             raise CannotTeach(f"{what}: this moves the arm.", "Start the same command again with --arm.")
         question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
         if await self.guide.choose(question, (ARM, STAY), STAY.key) != ARM.key:
-            raise WentBack
+            raise CannotTeach("the arm was left where it is.", "Try this step again once it may move.")
+        self.guide.settle()
 
     @contextlib.asynccontextmanager
     async def arm(self) -> AsyncGenerator[ArmReader]:

@@ -1,4 +1,4 @@
-"""What the first day asks of a person, and what it shows: one protocol for the terminal, the screen and the tests."""
+"""What the first day asks of a person, and what it shows: one protocol for the screen and the tests."""
 
 from __future__ import annotations
 
@@ -49,8 +49,6 @@ class Brought(StrEnum):
     """How a person answered a request."""
 
     DONE = "done"
-    BACK = "back"
-    """Leave this step; what it had measured so far is forgotten."""
     SKIP = "skip"
     """Go on without it; only where the target may be skipped."""
     JOG = "jog"
@@ -122,7 +120,7 @@ class LeftOff(Exception):
 
 
 class WentBack(Exception):
-    """The person left a step from one of its questions; its unfinished values are forgotten."""
+    """The person wants to go back one question: what was answered before this one is taken back, and asked again."""
 
 
 class Guide(Protocol):
@@ -137,7 +135,7 @@ class Guide(Protocol):
         ...
 
     async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        """The key of one of the choices."""
+        """The key of one of the choices; `default` is taken for an empty answer, which is none if it is empty."""
         ...
 
     async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from scipy.spatial.transform import Rotation
 
+from collect.errors import CannotTeach
 from collect.rig.devices import sole_driver
 from collect.teach.arm_reader import ArmReader
 from collect.teach.day import Day
@@ -42,7 +43,6 @@ async def touch(day: Day, reader: ArmReader, target: Target, how: str, name: str
     """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
 
     A thing that was touched before is not asked for again. The person may jog to it where the arm is armed.
-    Raises `WentBack`.
     """
     if name in day.notebook.touches:
         return day.notebook.touches[name].pose()
@@ -51,30 +51,26 @@ async def touch(day: Day, reader: ArmReader, target: Target, how: str, name: str
     while brought is Brought.JOG:
         if not target.may_jog:
             await day.say("Nothing is moved without --arm: guide the arm by hand.", tone="warning")
-        elif await jogged(day, how) is Brought.DONE:
+        elif await jogged(day, how):
             break
         brought = await day.guide.bring(target, how)
-    match brought:
-        case Brought.BACK:
-            raise WentBack
-        case Brought.SKIP:
-            return None
-        case Brought.DONE | Brought.JOG:
-            flange = await reader.flange()
-            day.save(day.notebook.with_touch(name, touch_of(flange)))
-            return flange
+    if brought is Brought.SKIP:
+        return None
+    flange = await reader.flange()
+    day.save(day.notebook.with_touch(name, touch_of(flange)))
+    return flange
 
 
-async def jogged(day: Day, what: str) -> Brought:
-    """Let the person jog until the tip is there: DONE, or BACK where the person leaves the jog.
+async def jogged(day: Day, what: str) -> bool:
+    """Let the person jog until the tip is there; False where the person goes back to the hand.
 
-    Asks for the key that lets the arm move. Raises `CannotTeach` without `--arm`, `ConfigError`, and `DeviceError`
-    where the arm cannot make a step that the box allows.
+    Asks for the key that lets the arm move. Raises `ConfigError`, and `DeviceError` where the arm cannot make a step
+    that the box allows.
     """
     try:
         await day.may_move(f"Jog in steps of at most {STEPS_MM[-1]:g} mm, at {SPEED_MM_S:g} mm/s")
-    except WentBack:
-        return Brought.BACK
+    except (CannotTeach, WentBack):
+        return False
     await day.working("powering the arm")
     async with _enabled(day) as robot:
         began, refused = await robot.where(), ""
@@ -84,9 +80,9 @@ async def jogged(day: Day, what: str) -> Brought:
             try:
                 answer = await day.guide.jog(JogView(what, (x, y, z), STEPS_MM, refused))
             except WentBack:
-                return Brought.BACK
+                return False
             if isinstance(answer, Brought):
-                return answer
+                return True
             refused = await _step(robot, answer)
 
 

@@ -16,7 +16,9 @@ from collect.teach.steps import all_steps
 from collect.teach.store import Notebook, StepName, Value
 from drivers.errors import DeviceError
 
-AGAIN, LEAVE = Choice("a", "try this step again"), Choice("q", "stop here; what was taught is kept")
+AGAIN, LEAVE = Choice("a", "try this step again, where it was"), Choice("q", "stop here; what was taught is kept")
+AFRESH, EARLIER = Choice("f", "teach this step from its beginning"), Choice("b", "teach the step before it again")
+STOPPED = "stopped; the same command resumes from there"
 SAME = 1e-6
 Refused = CannotTeach | DeviceError | CalibrationError | StepError | ConfigError
 
@@ -34,12 +36,10 @@ class Wizard:
         It is written before the proof too, and says then that it is not proven. Raises `CollectAborted` where the
         person stops: the same command resumes from there.
         """
-        for step in self._steps:
-            if step.name in self._day.notebook.done:
-                continue
+        while (step := self._open()) is not None:
             if step.name == "proof":
                 await self._written()
-            await self._taught(step)
+            await self._attempt(step, self._before(step))
         await self._overview(None)
         return await self._written()
 
@@ -56,37 +56,62 @@ class Wizard:
             raise CollectAborted(
                 f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
-        if name in self._day.notebook.done:
-            self._day.save(step.forget(self._day.notebook).reopened(step.name))
-        await self._taught(step)
+        self._day.guide.mark()
+        self._day.save(step.forget(self._day.notebook).reopened(step.name))
+        while step.name not in self._day.notebook.done:
+            await self._attempt(step, None)
         rest = [one.name for one in self._steps if one.name not in self._day.notebook.done]
         if rest and rest != ["proof"]:
             return None
         return await self._written()
 
-    async def _taught(self, step: Step) -> None:
-        while True:
-            await self._overview(step.name)
-            before = self._day.notebook
-            try:
-                await step.teach(self._day)
-                await self._derive(step, before)
-                return
-            except LeftOff:
-                raise CollectAborted("stopped; the same command resumes from there") from None
-            except WentBack:
-                await self._day.say("The step was interrupted; it will go on where it was.")
-            except (CannotTeach, DeviceError, CalibrationError, StepError, ConfigError) as error:
-                await self._day.say(*_in_lines(error), tone="trouble")
-            await self._ask_again()
+    def _open(self) -> Step | None:
+        """The first step that is not done."""
+        return next((step for step in self._steps if step.name not in self._day.notebook.done), None)
 
-    async def _ask_again(self) -> None:
+    def _before(self, step: Step) -> Step | None:
+        """The step before this one."""
+        number = self._steps.index(step)
+        return self._steps[number - 1] if number else None
+
+    async def _attempt(self, step: Step, earlier: Step | None) -> None:
+        """Teach a step once. Where the person goes back, or where it fails, the notebook says what comes next.
+
+        Raises `CollectAborted` where the person stops.
+        """
+        day = self._day
+        await self._overview(step.name)
+        before = day.notebook
         try:
-            answer = await self._day.guide.choose("How do you want to go on?", (AGAIN, LEAVE), AGAIN.key)
-        except (LeftOff, WentBack):
+            await step.teach(day)
+            await self._derive(step, before)
+            return
+        except LeftOff:
+            raise CollectAborted(STOPPED) from None
+        except WentBack:
+            if day.back():
+                return
+        except (CannotTeach, DeviceError, CalibrationError, StepError, ConfigError) as error:
+            await day.say(*_in_lines(error), tone="trouble")
+        await self._ask_how(step, earlier)
+
+    async def _ask_how(self, step: Step, earlier: Step | None) -> None:
+        """Ask how to go on with a step that could not be finished."""
+        day, choices = self._day, (AGAIN, AFRESH, *((EARLIER,) if earlier is not None else ()), LEAVE)
+        try:
+            answer = await day.person.choose("How do you want to go on?", choices, AGAIN.key)
+        except LeftOff:
             answer = LEAVE.key
+        except WentBack:
+            day.back()
+            return
         if answer == LEAVE.key:
-            raise CollectAborted("stopped; the same command resumes from there")
+            raise CollectAborted(STOPPED)
+        day.guide.settle()
+        if answer != AGAIN.key:
+            day.guide.mark()
+            one = earlier if answer == EARLIER.key and earlier is not None else step
+            day.save(one.forget(day.notebook).reopened(one.name))
 
     async def _derive(self, step: Step, before: Notebook) -> None:
         """Finish a step: compute again what depends on it, list what changed, and void an earlier proof."""

@@ -27,7 +27,7 @@ STOPPED = "Stopped. Look at the arm before you go on.\ng  go on from the last qu
 DONE = "This is done.   q  leave"
 HELP = f"""\
 enter     accept the suggested answer, or confirm that the tip is there
-esc       leave this step; it can be taken up again where it was
+esc       go back one question: the answer or touch before it is taken back
 k         skip this point, where the step can do without it
 q         leave; everything taught is kept, the same command resumes
 ctrl-q    the same while you type

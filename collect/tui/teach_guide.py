@@ -160,7 +160,7 @@ class ScreenGuide:
         self._settle(number, lambda future: future.set_result(answer))
 
     def back(self, number: int) -> None:
-        """Leave the step from its question."""
+        """Go back to the question before."""
         self._settle(number, lambda future: future.set_exception(WentBack()))
 
     def leave(self) -> None:

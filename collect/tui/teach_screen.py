@@ -226,6 +226,8 @@ def _finding(shown: Shown) -> Content:
 
 def _keys_of(question: Question) -> tuple[Key, ...]:
     keys = KEYS[question.kind]
+    if question.kind == "choose" and not question.default:
+        keys = tuple(key for key in keys if key[0] != "enter")
     more = (*((JOG,) if question.may_jog else ()), *((SKIP,) if question.may_skip else ()))
     return (*keys[:2], *more, *keys[2:])
 

@@ -55,7 +55,7 @@ class BrushStep(Step):
             )
 
     async def _ink(self, day: Day) -> None:
-        kind = await day.guide.choose("What keeps the ink well filled?", (NONE, STATION, PUMP), NONE.key)
+        kind = await day.guide.choose("What keeps the ink well filled?", (NONE, STATION, PUMP), "")
         config: InkDeviceConfig | None = None
         if kind != NONE.key:
             port = (await day.guide.text("Its serial line, such as /dev/serial/by-id/usb-…", "")).strip()
@@ -96,9 +96,8 @@ class BrushStep(Step):
             level = await device.level()
             gauge = "no gauge" if level is None else f"well {level:.0%} full"
             await day.say(f"{identity.model} {identity.firmware}: {gauge}")
-            while await day.yes(
-                f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it.", default=False
-            ):
+            while await day.yes(f"Give {PRIME_ML:g} ml, to fill its tube? The well must stand under it."):
+                day.guide.settle()
                 await day.working(f"giving {PRIME_ML:g} ml")
                 await device.dose(min(PRIME_ML, config.dose_ml))
                 level = await device.level()

@@ -30,14 +30,16 @@ from collect.teach.cameras import (
     taught_camera,
 )
 from collect.teach.day import Day, Step
-from collect.teach.guide import Brought, Target, WentBack
+from collect.teach.guide import Brought, Target
 from collect.teach.maths.coverage import coverage_picture, still_missing
 from collect.teach.steps.sheet import board_of
 from collect.teach.store import Notebook, StepName
 from drivers.errors import DeviceError
 
 Take = Callable[[], Awaitable[Gray]]
-ASIDE = ("aside.frame_rate_hz", "aside.lens_folder")
+VIEW = "aside.lens_view_"
+"""Beginning of the names of the photographs of the held board: their digests."""
+ASIDE = ("aside.frame_rate_hz", "aside.lens_folder", VIEW)
 MOST_VIEWS = 20
 HOLD = (
     "flat in the middle of the picture",
@@ -195,11 +197,11 @@ class CameraStep(Step):
         None if the person skips it from the start: a lens without distortion needs no file.
         """
         spec, views = board_of(day.notebook), list[BoardView]()
-        for path in sorted(folder.glob("*.png")):
-            views.append(await asyncio.to_thread(find_board, read_gray(path), spec, path.name))
+        for name in taken(day.notebook, folder):
+            views.append(await asyncio.to_thread(find_board, read_gray(folder / name), spec, name))
         for index in range(MOST_VIEWS):
             name = f"{index:02d}.png"
-            if (folder / name).exists():
+            if name in taken(day.notebook, folder):
                 continue
             if len(views) >= GOOD_VIEWS and not still_missing(views):
                 break
@@ -219,10 +221,7 @@ class CameraStep(Step):
         """Take one photograph of the held board; False where the person skips it."""
         target = Target("hold-board", int(path.stem), may_skip=True)
         how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
-        brought = await day.guide.bring(target, how)
-        if brought is Brought.BACK:
-            raise WentBack
-        if brought is not Brought.DONE:
+        if await day.guide.bring(target, how) is not Brought.DONE:
             return False
         await day.working("looking for the board in the picture")
         picture = await take()
@@ -234,11 +233,12 @@ class CameraStep(Step):
             await day.say(f"not used: {error.what}", picture=picture, tone="warning")
             return True
         await asyncio.to_thread(cv2.imwrite, str(path), picture)
+        day.keep("camera", VIEW + path.stem, digest(path), "photograph of the board held in hand")
         views.append(view)
         return True
 
     async def _keep_lens(self, day: Day, folder: Path, fitted: Fitted) -> None:
-        digests = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("*.png"))}
+        digests = {name: digest(folder / name) for name in taken(day.notebook, folder)}
         software = f"brushloop {version('brushloop')}"
         file = lens_file(fitted, describe(board_of(day.notebook)), digests, RMS_LIMIT_PX, software)
         path = file.save(day.rig_path.parent)
@@ -262,3 +262,18 @@ class CameraStep(Step):
     def summary(self, notebook: Notebook) -> str:
         """Source and rate."""
         return f"{notebook.get('camera.source')}, {notebook.number('aside.frame_rate_hz'):.0f} frames/s"
+
+
+def taken(notebook: Notebook, folder: Path) -> list[str]:
+    """Names of the photographs of the held board that are still as they were taken, and were not taken back."""
+    names = [f"{field.removeprefix(VIEW)}.png" for field in notebook.values if field.startswith(VIEW)]
+    return sorted(
+        name
+        for name in names
+        if (folder / name).is_file() and digest(folder / name) == notebook.get(VIEW + name.removesuffix(".png"))
+    )
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

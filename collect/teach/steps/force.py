@@ -13,7 +13,7 @@ from collect.errors import CannotTeach
 from collect.rig.config_devices import ForceConfig
 from collect.rig.devices import make_force
 from collect.teach.day import Day, Step
-from collect.teach.guide import Brought, Target, WentBack
+from collect.teach.guide import Target
 from collect.teach.maths.sheet import corners_of
 from collect.teach.store import Notebook, StepName, Taught, now_utc
 from drivers.force.rounds import LOOPBACK_CHANNEL
@@ -81,8 +81,7 @@ class ForceStep(Step):
                 "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
                 "then take the finger away."
             )
-            if await day.guide.bring(Target("push-sensor"), how) is not Brought.DONE:
-                raise WentBack
+            await day.guide.bring(Target("push-sensor"), how)
             await day.working("waiting for the end of the push")
             force_n = await self._push(samples)
         finally:

@@ -54,7 +54,7 @@ class LimitsStep(Step):
         for axis, field in zip("xyz", _box_fields(), strict=True):
             taught = found[field]
             question = f"The box along base {axis}: {taught.value} {taught.unit} ({taught.how}; {field}). Agreed?"
-            if not await day.yes(question, default=True):
+            if not await day.yes(question):
                 raise CannotTeach(
                     f"{field} was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",

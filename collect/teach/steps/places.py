@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import base64
 import math
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,9 +13,9 @@ from collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumb
 from collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
 from collect.rig.paper import to_base, to_paper
 from collect.teach.arm_reader import ArmReader
-from collect.teach.cameras import still, taught_camera
+from collect.teach.cameras import side_by_side, still, taught_camera
 from collect.teach.day import Day, Step
-from collect.teach.guide import Target
+from collect.teach.guide import Target, TargetKind
 from collect.teach.jog import touch
 from collect.teach.maths.sheet import Point, corners_of
 from collect.teach.maths.tip import tip_of
@@ -29,6 +29,10 @@ WIPE_PAST_MM, WIPE_BELOW_MM = 6.0, 1.5
 """A wipe ends so far beyond the rim, with the tip so far below it: the hair is drawn over the rim."""
 LEAST_RADIUS_MM, MOST_RADIUS_MM = 5.0, 100.0
 """From the rim of a well to its middle."""
+APART_MM = 150.0
+"""Between two places of the arm: farther apart, no part of it that is in both pictures hides the same in both."""
+VIEW: dict[TargetKind, str] = {"park": "aside.view_parked", "clear-view": "aside.view_elsewhere"}
+"""The small picture that was taken with the arm there."""
 
 
 class PlacesStep(Step):
@@ -50,20 +54,21 @@ class PlacesStep(Step):
             await day.say(found)
             await self._wipe(day, reader)
             await self._wash(day, reader)
-            if not (clear := _clear_view(day.rig_path)).exists() or "clear-view 0" not in day.notebook.touches:
-                how = "Guide the arm so far away that neither it nor its shadow is in the camera's picture."
-                await touch(day, reader, Target("clear-view"), how, "clear-view 0")
-                cv2.imwrite(str(clear), (await self._seen(day)).astype(np.uint8))
             how = "Bring the arm to its waiting place: brush upright, above everything, out of the camera's picture."
-            await touch(day, reader, Target("park"), how, "park 0")
-            await self._look(day, clear)
+            await self._out_of_picture(day, reader, Target("park"), how)
+            how = (
+                f"Now guide the arm to another place out of the camera's picture, {APART_MM:g} mm or more from there: "
+                "two pictures that agree show the arm in neither."
+            )
+            await self._out_of_picture(day, reader, Target("clear-view"), how)
+            await self._compare(day)
 
     async def _wipe(self, day: Day, reader: ArmReader) -> None:
         """Have the side of the rim touched at which a drop is wiped off, if there is to be a wipe."""
         if "aside.wipe" in day.notebook.values:
             return
         wipe = "well-rim 1" in day.notebook.touches or await day.yes(
-            "Shall each dip end with a wipe across the rim of the well, which takes the drop off?", default=False
+            "Shall each dip end with a wipe across the rim of the well, which takes the drop off?"
         )
         if wipe:
             how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
@@ -77,9 +82,7 @@ class PlacesStep(Step):
         """Have rim and middle of a pot of water touched, if there is one."""
         if "aside.wash" in day.notebook.values:
             return
-        wash = "wash-rim 0" in day.notebook.touches or await day.yes(
-            "Is there a pot of water to wash the brush in?", default=False
-        )
+        wash = "wash-rim 0" in day.notebook.touches or await day.yes("Is there a pot of water to wash the brush in?")
         if wash:
             await touch(day, reader, Target("wash-rim"), "Bring the tip to the rim of the pot of water.", "wash-rim 0")
             how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
@@ -88,23 +91,38 @@ class PlacesStep(Step):
                 check_pot(day.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
         day.keep("places", "aside.wash", wash, "answered")
 
-    async def _seen(self, day: Day) -> Thumbnail:
-        async with taught_camera(day.notebook, day.clock) as camera:
-            return thumbnail(await still(camera, day.clock))
+    async def _out_of_picture(self, day: Day, reader: ArmReader, target: Target, how: str) -> None:
+        """Have the arm brought out of the picture, and keep pose and picture together: one says nothing alone."""
+        if VIEW[target.kind] not in day.notebook.values:
+            with day.together():
+                day.save(day.notebook.without_touches(target.kind))
+                await touch(day, reader, target, how, f"{target.kind} 0")
+                await day.working("waiting for a picture without the arm")
+                async with taught_camera(day.notebook, day.clock) as camera:
+                    picture = thumbnail(await still(camera, day.clock))
+                day.keep("places", VIEW[target.kind], text_of(picture), "a small picture, as PNG in base64")
 
-    async def _look(self, day: Day, clear: Path) -> None:
-        """Compare the picture with the one without the arm. Raises `CannotTeach` where the parked arm is seen."""
-        without = np.asarray(cv2.imread(str(clear), cv2.IMREAD_GRAYSCALE), np.float32)
-        now = await self._seen(day)
-        share = changed_share(now, without)
+    async def _compare(self, day: Day) -> None:
+        """Compare the two pictures. Raises `CannotTeach` unless they show the same, with the arm at two places."""
+        offset_mm, touches = day.notebook.numbers("robot.tcp_offset_mm"), day.notebook.touches
+        parked_mm, away_mm = (tip_of(touches[f"{kind} 0"].pose(), offset_mm) for kind in ("park", "clear-view"))
+        if (apart_mm := math.dist(parked_mm, away_mm)) < APART_MM:
+            day.save(without_views(day.notebook, "clear-view"))
+            raise CannotTeach(
+                f"the arm is {apart_mm:.0f} mm from its waiting place: two pictures of it there show the same.",
+                f"Guide it {APART_MM:g} mm or more away; only this place is asked again.",
+            )
+        pictures = [picture_of(str(day.notebook.get(VIEW[kind]))) for kind in ("park", "clear-view")]
+        share = changed_share(*pictures)
         if share >= ARM_SHARE:
-            await day.say("The picture now:", picture=now.astype(np.uint8))
-            with day.touched_again_if_refused("park"):
-                raise CannotTeach(
-                    f"the parked arm, or its shadow, is in the picture: {100 * share:.0f} % of it changed.",
-                    "Park it farther from the sheet, or higher; only the park position is asked again.",
-                )
-        await day.say(f"At the park position {100 * share:.1f} % of the picture changed: the arm is out of it.")
+            beside = side_by_side([picture.astype(np.uint8) for picture in pictures])
+            await day.say("The arm parked (1), and elsewhere (2):", picture=beside)
+            day.save(without_views(day.notebook, "park", "clear-view"))
+            raise CannotTeach(
+                f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
+                "Park it farther from the sheet, or higher; both places are asked again.",
+            )
+        await day.say(f"With the arm at both places {100 * share:.1f} % of the picture differs: it is out of both.")
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Places in the sheet's frame, and the travel height."""
@@ -149,7 +167,7 @@ class PlacesStep(Step):
     def forget(self, notebook: Notebook) -> Notebook:
         """Without what was touched here."""
         cleared = notebook.without("aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
-        return cleared.without_touches("well-rim", "well", "wash-rim", "wash-pot", "park", "clear-view")
+        return without_views(cleared.without_touches("well-rim", "well", "wash-rim", "wash-pot"), "park", "clear-view")
 
     def summary(self, notebook: Notebook) -> str:
         """Well and park."""
@@ -224,6 +242,17 @@ def check_wipe(notebook: Notebook) -> None:
         )
 
 
-def _clear_view(rig_path: Path) -> Path:
-    """A small picture without the arm, kept beside the notebook."""
-    return rig_path.with_name(f"{rig_path.stem}.clear-view.png")
+def without_views(notebook: Notebook, *kinds: TargetKind) -> Notebook:
+    """The notebook without the arm at these places, and without the pictures from there."""
+    return notebook.without_touches(*kinds).without(*(VIEW[kind] for kind in kinds))
+
+
+def text_of(picture: Thumbnail) -> str:
+    """A small picture as PNG in base64."""
+    return base64.b64encode(cv2.imencode(".png", picture.astype(np.uint8))[1].tobytes()).decode()
+
+
+def picture_of(text: str) -> Thumbnail:
+    """The picture again."""
+    coded = np.frombuffer(base64.b64decode(text), np.uint8)
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.float32)

@@ -115,7 +115,7 @@ class ProofStep(Step):
                 doing = now.step
                 await day.working(f"run: {doing}")
             if (asked := now.prompt) is not None:
-                engine.answer(asked.number, await day.guide.choose(asked.question, asked.choices, asked.default))
+                engine.answer(asked.number, await day.person.choose(asked.question, asked.choices, asked.default))
             await asyncio.sleep(POLL_S)
 
     async def _keep(self, day: Day, proven: Proven) -> None:

@@ -122,8 +122,10 @@ class Aims:
                 return in_base(table, *facts.wash_mm, DIP_ABOVE_BOTTOM_MM)
             case "park" if facts.parks_in_picture:
                 return over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
-            case "park" | "clear-view":
+            case "park":
                 return facts.park_mm
+            case "clear-view":
+                return facts.clear_mm
             case "upright":
                 return over_sheet(table, UPRIGHT_ABOVE_MM)
             case _:

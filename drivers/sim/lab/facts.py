@@ -37,6 +37,8 @@ LIFT_MM = 60.0
 PIN_TILT_DEG = 38.0
 CLEAR_OF_PICTURE_MM = 75.0
 """More than the arm hides around the tip."""
+CLEAR_APART_MM = 160.0
+"""Between two places out of the picture."""
 BASE_CLEAR_MM = 230.0
 """Least distance from the axis of the base that a straight way may have."""
 
@@ -53,6 +55,8 @@ class Facts:
     """Centre of a pot of water like the well, in the paper frame."""
     park_mm: Place
     """A place for the tip outside the picture."""
+    clear_mm: Place
+    """Another one."""
     cabinet_tcp: tuple[float, ...] = (0.0,) * 6
     """Tool offset that somebody once typed at the pendant: x, y, z in m and three angles in rad."""
     payload_kg: float = 0.0
@@ -114,12 +118,15 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     park = _park(rng, config)
     if park is None or min(math.dist(pin, wash), math.dist(pin, table.well_mm), math.dist(wash, table.well_mm)) < 60.0:
         return None
+    if (clear := _park(np.random.default_rng([seed, 43]), config, away_from=park, tries=400)) is None:
+        return None
     return Facts(
         seed,
         replace(config, home_mm=park),
         in_base(table, *pin, float(rng.uniform(20, 60))),
         wash,
         park,
+        clear,
         typed,
         payload_kg,
         sheet_camera,
@@ -199,16 +206,18 @@ def _typed_tcp(rng: np.random.Generator, config: SimConfig) -> tuple[float, ...]
     return ((0.0,) * 6, (0.0, 0.03, other_m, 0.0, 0.0, 0.5), (0.0, 0.0, ruler_m, 0.0, 0.0, 0.0))[rng.integers(3)]
 
 
-def _park(rng: np.random.Generator, config: SimConfig) -> Place | None:
+def _park(rng: np.random.Generator, config: SimConfig, away_from: Place | None = None, tries: int = 40) -> Place | None:
     """A place that the arm reaches and the camera does not see, and a straight way from the sheet past the base."""
     table = config.table
     middle = over_sheet(table)
-    for _ in range(40):
+    for _ in range(tries):
         reach_mm = rng.uniform(300, 600)
         bearing = math.radians(azimuth_deg(middle) + rng.uniform(-80, 80))
         z_mm = config.table.paper_z_mm + float(rng.uniform(110, 180))
         place = (float(reach_mm * math.cos(bearing)), float(reach_mm * math.sin(bearing)), z_mm)
         if in_picture(config, place) or _nearest_mm(middle, place) < BASE_CLEAR_MM:
+            continue
+        if away_from is not None and math.dist(away_from, place) < CLEAR_APART_MM:
             continue
         if abs(math.degrees(bearing)) < 150.0 and reaches(config, [brush_pose(*place)]):
             return place

@@ -13,7 +13,6 @@ from collect.operator import Choice
 from collect.teach.day import Day
 from collect.teach.guide import Brought, JogStep, JogView, Shown, Target
 from collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S, touch
-from collect.teach.plain import PlainGuide
 from collect.teach.store import touch_of
 from collect.tui.teach_app import TeachApp
 from collect.tui.teach_guide import ScreenGuide
@@ -166,14 +165,6 @@ async def test_on_the_screen_the_tip_is_jogged_by_keys(server: ArcsServer, tmp_p
     app.teaching.join()
     x, y, z = HOME_MM
     assert made[0].notebook.touches["well 0"].position_mm == pytest.approx((x + 5.0, y, z + 178.0), abs=0.05)
-
-
-async def test_in_lines_the_tip_is_jogged_by_words(server: ArcsServer, tmp_path: Path) -> None:
-    typed = iter(["jog", "a", "x 5", "z 7", "z -2", ""])
-    day = day_of(server.port, PlainGuide(tmp_path, lambda: next(typed)), tmp_path, armed=True)
-    await touched(day)
-    x, y, z = HOME_MM
-    assert day.notebook.touches["well 0"].position_mm == pytest.approx((x + 5.0, y, z + 178.0), abs=0.05)
 
 
 def test_a_jog_is_slower_than_50_mm_s() -> None:

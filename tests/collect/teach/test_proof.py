@@ -12,7 +12,7 @@ from collect.errors import CannotTeach, ConfigError
 from collect.operator import Choice
 from collect.rig.config import load_rig
 from collect.teach.day import Day
-from collect.teach.guide import Shown, WentBack
+from collect.teach.guide import Shown
 from collect.teach.steps import proof
 from collect.teach.steps.proof import ProofStep, folder_beside, slowly
 from drivers.clock import HostClock
@@ -42,9 +42,9 @@ class Refusing:
         return default
 
 
-@pytest.mark.parametrize(("armed", "ended"), [(False, CannotTeach), (True, WentBack)])
+@pytest.mark.parametrize(("armed", "said"), [(False, "with --arm"), (True, "left where it is")])
 async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators_key(
-    armed: bool, ended: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    armed: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def no_run(*_: object, **__: object) -> Path:
         raise AssertionError("the arm would have moved")
@@ -56,7 +56,7 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
     monkeypatch.setattr(ProofStep, "_doctor", answered)
     monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
     person = Refusing()
-    with pytest.raises(ended):
+    with pytest.raises(CannotTeach, match=said):
         await ProofStep().teach(Day(person, tmp_path / "rig.toml", HostClock(), armed=armed))  # type: ignore[arg-type]
     assert len(person.asked) == armed
     assert all("The arm moves by itself, slower than 50 mm/s" in question for question in person.asked)

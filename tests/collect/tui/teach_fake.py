@@ -59,6 +59,8 @@ class Asking:
         match kind:
             case "choose":
                 return await guide.choose("Take this tip?", (YES, NO), "y")
+            case "no default":
+                return await guide.choose("Is there a pot of water?", (YES, NO), "")
             case "number":
                 return await guide.number("Squares along its longer side", "squares", 3, 50, None)
             case "text":

@@ -19,12 +19,13 @@ from collect.tui.teach_app import TeachApp
 from collect.tui.teach_guide import Teaching
 from tests.collect.tui.screen_text import shown
 from tests.collect.tui.teach_fake import Asking, app_of
+from tests.waiting import PATIENCE_S
 
 SIZE = (80, 24)
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(PATIENCE_S):
         while not condition():
             await asyncio.sleep(0.01)
 
@@ -52,6 +53,7 @@ async def seen(app: TeachApp, pilot: Pilot[None], condition: Callable[[], bool])
     [
         ("choose", ["n"], "n"),
         ("choose", ["enter"], "y"),
+        ("no default", ["enter", "n"], "n"),
         ("number", ["2", "6", "enter"], 26.0),
         ("text", ["enter"], "192.0.2.7"),
         ("empty", ["enter"], ""),
@@ -91,7 +93,7 @@ async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
 
 
 @pytest.mark.parametrize(("keys", "raised"), [(["escape"], WentBack), (["q"], LeftOff)])
-async def test_escape_leaves_the_step_and_q_the_day(keys: list[str], raised: type[Exception]) -> None:
+async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Exception]) -> None:
     async with running(Asking("bring")) as (app, pilot):
         await pilot.press(*keys)
         await seen(app, pilot, lambda: app.teaching.finished)
