@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import sys
+from io import TextIOWrapper
 from pathlib import Path
 from traceback import format_exc
 from typing import Annotated, Any, cast
@@ -45,13 +47,27 @@ class OptionRefused(Exception):
     exit_code = 2
 
 
+class NameRefused(Exception):
+    """A name on the command line is not text, so that no report or message could repeat it."""
+
+    exit_code = 2
+
+
+class OutputClosed(Exception):
+    """Whoever read the output, such as `head`, has ended; there is nobody left to tell."""
+
+    exit_code = 4
+
+
 class FrontDoor(TyperGroup):
     """Reports the given number and both ends of its range; typer itself names only one end, and allows `nan`."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command. Raises `OptionRefused`."""
+        """Run the command. Raises `OptionRefused`, and `OutputClosed`, where typer itself would end with code 1."""
         try:
             return super().invoke(ctx)
+        except BrokenPipeError:
+            raise OutputClosed from None
         except typer.BadParameter as error:
             param, cause = error.param, error.__cause__
             ends = {word: getattr(param, name, None) for word, name in (("from", "min"), ("to", "max"))}
@@ -234,26 +250,45 @@ def demo(
 
 def main() -> None:
     """Run the app; an error with an exit code becomes one line on stderr, any other a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # for a terminal that cannot show every character
     try:
+        for word in sys.argv:
+            if any("\ud800" <= char <= "\udfff" for char in word):
+                raise NameRefused(f"{word}: is not UTF-8; give the file or folder another name")
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
             collect.cli.browse()
         else:
             app(prog_name="brushloop")
     except Exception as error:
-        code, message = getattr(error, "exit_code", None), str(error)
-        if code is None and isinstance(error, OSError) and error.filename:
-            # A path given by the user that cannot be read or written is no defect.
-            code, message = 2, f"{error.filename}: {error.strerror}"
-        if isinstance(code, int):
-            words = " ".join(["brushloop:", message, *getattr(error, "__notes__", [])])
-        else:
-            code, words = 1, format_exc().rstrip()  # a defect
+        code, words = _told(error)
         try:
             # A changed configuration is listed in several lines.
-            sys.stderr.write(plain(words, keep="\n") + "\n")
+            if words and sys.stderr is not None:
+                sys.stderr.write(plain(words, keep="\n") + "\n")
         except OSError:
             sys.stderr = None  # the terminal is gone; Python would write again at its exit, and change the exit code
+        if isinstance(error, OSError | OutputClosed):
+            sys.stdout = None  # likewise, should it be the output that cannot be written
         sys.exit(code)
+
+
+def _told(error: Exception) -> tuple[int, str]:
+    """Exit code of an error, and what is said about it: nothing, one line, or the traceback of a defect."""
+    code, message = getattr(error, "exit_code", None), str(error)
+    if isinstance(error, MemoryError):
+        code, message = 4, "not enough memory"
+    elif code is None and isinstance(error, OSError):
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            code, message = 4, f"{error.filename or 'the output'}: {error.strerror}"
+        elif error.filename:
+            # A path given by the user that cannot be read or written is no defect.
+            code, message = 2, f"{error.filename}: {error.strerror}"
+    if not isinstance(code, int):
+        return 1, format_exc().rstrip()
+    notes = getattr(error, "__notes__", [])
+    return code, " ".join(["brushloop:", message, *notes]) if message else ""
 
 
 if __name__ == "__main__":

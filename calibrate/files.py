@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calibrate.errors import CalibrationError
+from sessions import disk
 from sessions.disk import unwritable
+from sessions.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,6 +52,9 @@ def replacing(path: Path) -> Generator[Path]:
     try:
         yield part
         part.replace(path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a full disk does not say which file it had no room for
+        raise
     finally:
         part.unlink(missing_ok=True)
 
@@ -66,20 +71,11 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
-    """Read a file of at most `most_bytes` bytes. Raises `CalibrationError` if it is larger or cannot be read.
-
-    Reading stops at that length even if the file grows meanwhile, or has no size, like a pipe.
-    """
+    """Read a file of at most `most_bytes` bytes. Raises `CalibrationError` if it is larger or cannot be read."""
     try:
-        if not path.is_file() and path.exists():
-            raise CalibrationError(str(path), "is not a file")
-        with path.open("rb") as file:
-            data = file.read(most_bytes + 1)
-    except OSError as error:
-        raise CalibrationError(str(path), error.strerror or str(error)) from None
-    if len(data) > most_bytes:
-        raise CalibrationError(str(path), f"is larger than {most_bytes} bytes")
-    return data
+        return disk.read_bounded(path, most_bytes)
+    except InputError as error:
+        raise CalibrationError(str(path), error.what) from None
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
+from sessions.errors import InputError
+
 ABSENT = object()
 """Placeholder for the value of a field that one of the two configurations does not have."""
 
@@ -34,8 +37,8 @@ def differences(folder: Path, snapshots: Mapping[str, str]) -> list[Difference]:
     found: list[Difference] = []
     for name, text in snapshots.items():
         try:
-            old = json.loads((folder / name).read_text(encoding="utf-8"))
-        except (FileNotFoundError, ValueError, RecursionError):
+            old = json.loads(read_bounded(folder / name, MAX_SNAPSHOT_BYTES))
+        except (InputError, ValueError, RecursionError):
             found.append(Difference(name, (), ABSENT, ABSENT))
         else:
             found += _compared(name, (), old, json.loads(text))

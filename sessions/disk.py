@@ -14,6 +14,8 @@ from sessions.errors import DiskFull, InputError, SessionError, disk_error, in_o
 
 SPARE_BYTES = 16 * 1024 * 1024
 """Space that is always kept free, so that the journal's last lines fit."""
+MAX_SNAPSHOT_BYTES = 64 * 1024 * 1024
+"""Limit of a file of a session that holds its configuration, with the rows of its tables."""
 _PIECE_BYTES = 1 << 20
 
 
@@ -36,16 +38,25 @@ def check_room(folder: Path, need_bytes: int) -> None:
 def read_bounded(path: Path, max_bytes: int) -> bytes:
     """Bytes of a file from a person or from elsewhere. Raises `InputError` where it is larger or cannot be read.
 
-    Never more than `max_bytes` + 1 are read, whatever size the file system or a pipe claims.
+    At most `max_bytes` + 1 are read, even where the file grows meanwhile.
     """
     try:
+        if not path.is_file() and path.exists():
+            raise InputError(path, "is not a file")
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
+    except FileNotFoundError:
+        raise InputError(path, "no such file") from None
     except OSError as error:
         raise InputError(path, f"cannot read: {in_one_line(error)}") from None
     if len(data) > max_bytes:
-        raise InputError(path, f"is larger than {max_bytes} bytes, the most that is read")
+        raise InputError(path, f"is larger than {max_bytes} bytes")
     return data
+
+
+def holds(path: Path, data: bytes) -> bool:
+    """Whether a file is there and holds exactly these bytes. Raises `InputError` where it cannot be read."""
+    return path.is_file() and path.stat().st_size == len(data) and read_bounded(path, len(data)) == data
 
 
 def sync(file: IO[Any]) -> None:

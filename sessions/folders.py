@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from pathlib import Path
 
-from sessions.errors import InputError, SessionDamaged
+from sessions.errors import InputError, SessionError
 from sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from sessions.names import SEGMENT_NAME, check_folder
 
@@ -54,7 +54,7 @@ def not_a_session(folder: Path) -> InputError:
 def _is_open(folder: Path) -> bool:
     try:
         return (folder / JOURNAL_NAME).is_file() and is_open(replay(folder / JOURNAL_NAME))
-    except SessionDamaged:
+    except SessionError:
         return False
 
 
@@ -68,8 +68,16 @@ def next_session_id(root: Path, label: str, today: dt.date) -> str:
 
 
 def open_sessions(root: Path) -> list[Path]:
-    """Folders under `root` whose journal was opened and has no `closed` event, oldest first."""
-    folders = sorted(path.parent for path in root.glob(f"*/{JOURNAL_NAME}"))
-    for folder in folders:
-        check_folder(folder)
-    return [folder for folder in folders if is_open(replay(folder / JOURNAL_NAME))]
+    """Folders under `root` whose journal was opened and has no `closed` event, oldest first.
+
+    A session that is damaged or holds links is left out, so that it stands in no other's way.
+    """
+    found: list[Path] = []
+    for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")):
+        try:
+            check_folder(journal.parent)
+            if is_open(replay(journal)):
+                found.append(journal.parent)
+        except SessionError:
+            continue
+    return found

@@ -62,6 +62,9 @@ def plain_console(*, stderr: bool = False) -> Console:
             # Escaped before the layout, so that columns are as wide as what is shown.
             return super().render_str(plain(text, keep="\n"), **options)
 
+        def on_broken_pipe(self) -> None:
+            raise  # rich would exit with the code of a defect
+
         def _render_buffer(self, buffer: Iterable[Segment]) -> str:
             # Texts and columns that were not made by `render_str` pass here too.
             return super()._render_buffer(

@@ -110,7 +110,7 @@ def read_rig(path: Path) -> RigFile:
 def _tables(text: str, path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
         raise CalibrationError(str(path), f"is not TOML: {error}") from None
 
 

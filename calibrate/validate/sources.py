@@ -1,4 +1,4 @@
-"""Open sessions from local folders and files, or from any URL that fsspec opens.
+"""Open sessions from local folders and files, or from a URL of one of `SCHEMES`.
 
 A remote recording is copied once, up to a size limit, and accepted only with the expected SHA-256, which is given as
 `#sha256=...` after the URL or in a file `<recording>.mcap.sha256` beside it.
@@ -41,6 +41,10 @@ FORBIDDEN = 403
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 EXTRAS = {"http": "remote", "https": "remote", "s3": "s3", "s3a": "s3", "gs": "gs", "gcs": "gs"}
 """URL scheme -> the extra that supports it."""
+SCHEMES = ("file", "memory", *EXTRAS)
+"""Others of fsspec, such as archives and repositories, fail in ways of their own and unpack without limit."""
+STALL_S = 60.0
+"""Longest wait for the next bytes of a web server."""
 BACKEND_ERRORS = (
     ("aiohttp", "ClientError"),
     ("botocore.exceptions", "BotoCoreError"),
@@ -123,15 +127,18 @@ def _check_journal(recording: Recording, digest: str) -> None:
 def fetched(url: str, folder: Path) -> Path:
     """Copy a remote recording to `folder`, with its calibration and fit. Raises `CalibrationError`."""
     address, _, fragment = url.partition("#")
+    scheme = address.partition(":")[0].lower()
+    if scheme not in SCHEMES or "::" in address:
+        raise CalibrationError(address, f"cannot be opened, allowed: {', '.join(f'{one}://' for one in SCHEMES)}")
     try:
         untyped: Any = importlib.import_module("fsspec")  # without type stubs
     except ImportError:
         raise CalibrationError(address, "a URL needs fsspec: pip install 'brushloop[remote]'") from None
     try:
-        system, where = untyped.core.url_to_fs(address)
+        system, where = untyped.core.url_to_fs(address, **_limits(scheme))
         system.invalidate_cache()  # fsspec caches listings per address for the life of the process
     except (ImportError, ValueError) as error:
-        extra = EXTRAS.get(address.partition(":")[0].lower()) if isinstance(error, ImportError) else None
+        extra = EXTRAS.get(scheme) if isinstance(error, ImportError) else None
         how = f": pip install 'brushloop[{extra}]'" if extra else ""
         raise CalibrationError(address, f"cannot be opened: {one_line(error)}{how}") from None
     try:
@@ -146,6 +153,14 @@ def fetched(url: str, folder: Path) -> Path:
     except (OSError, ValueError, NotImplementedError, *_backend_errors()) as error:
         raise CalibrationError(address, f"cannot be read: {one_line(error)}") from None
     return target
+
+
+def _limits(scheme: str) -> dict[str, Any]:
+    """Options of fsspec: a web server that stalls is given up, however long a whole recording takes."""
+    if not scheme.startswith("http"):
+        return {}
+    untyped: Any = importlib.import_module("aiohttp")
+    return {"client_kwargs": {"timeout": untyped.ClientTimeout(total=None, sock_connect=STALL_S, sock_read=STALL_S)}}
 
 
 @lru_cache(maxsize=8)

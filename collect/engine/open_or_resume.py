@@ -23,7 +23,7 @@ from collect.rig.devices import Rig
 from drivers.clock import Clock
 from drivers.samples import Identity
 from sessions.difference import ABSENT, Difference, differences
-from sessions.disk import unwritable
+from sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unwritable
 from sessions.errors import SessionError
 from sessions.folders import next_session_id, open_sessions
 from sessions.journal.journal import JOURNAL_NAME, replay
@@ -98,8 +98,8 @@ class Opening:
         if not self.self_check_left_out:
             return self
         try:
-            begun = json.loads((folder / RIG_EFFECTIVE).read_text(encoding="utf-8"))["self_check"]["enabled"]
-        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            begun = json.loads(read_bounded(folder / RIG_EFFECTIVE, MAX_SNAPSHOT_BYTES))["self_check"]["enabled"]
+        except (SessionError, ValueError, LookupError, TypeError, RecursionError):
             return self
         rig = self.rig.checking_itself(begun is True)
         return replace(self, rig=rig, snapshots={**self.snapshots, RIG_EFFECTIVE: _effective(rig)})
@@ -130,12 +130,21 @@ def find_resumable(opening: Opening) -> Path | None:
 
 
 def check_fresh_sheet(root: Path, sheet: int | None) -> None:
-    """Raise `ConfigError` if a new session under `root` might press on a used sheet; `sheet` is what was confirmed."""
-    if sheet is None and any(map(_has_pressed, root.glob(f"*/{JOURNAL_NAME}"))):
+    """Raise `ConfigError` if a new session under `root` might press on a used sheet; `sheet` is what was confirmed.
+
+    A session that cannot be read may have pressed; it is named, because the user may have meant to resume it.
+    """
+    pressed, unreadable = False, ""
+    for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")) if sheet is None else ():
+        try:
+            pressed = pressed or bool(replay(journal).used_cells)
+        except SessionError as error:
+            unreadable = f" One cannot be resumed as it is: {error}; see `brushloop sessions verify {journal.parent}`."
+    if pressed or unreadable:
         raise ConfigError(
             root,
             "",
-            "holds earlier sessions, and a new one would press on whatever sheet is in. "
+            f"holds earlier sessions, and a new one would press on whatever sheet is in.{unreadable} "
             "Put a fresh sheet in, then confirm it with --sheet 1",
         )
     if sheet not in (None, 1):
@@ -173,7 +182,7 @@ def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], 
     options = [
         _option(folder / name, given[name])
         for name, text in texts.items()
-        if name in differing and (folder / name).is_file() and (folder / name).read_text(encoding="utf-8") != text
+        if name in differing and (folder / name).is_file() and not holds(folder / name, text.encode())
     ]
     old = " ".join(options)
     if variables:
@@ -195,7 +204,8 @@ def _of_this_version(one: Difference, found: Sequence[Difference]) -> bool:
 
 def _option(old: Path, given: Path) -> str:
     """The option that names the old file. A file that names side files must be copied next to them first."""
-    beside = f" (copied beside {given}: it names other files)" if SIDE_FILE.search(old.read_text("utf-8")) else ""
+    text = read_bounded(old, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace")
+    beside = f" (copied beside {given}: it names other files)" if SIDE_FILE.search(text) else ""
     return f"{OPTIONS[old.name]} {old}{beside}"
 
 
@@ -203,13 +213,6 @@ def check_writable(folder: Path) -> None:
     """Raise `ConfigError` unless `folder` can be written to or created. Called before anything is connected."""
     if (found := unwritable(folder)) is not None:
         raise ConfigError(found[0], "", found[1])
-
-
-def _has_pressed(journal: Path) -> bool:
-    try:
-        return bool(replay(journal).used_cells)
-    except SessionError:
-        return True  # unknown: ask the operator
 
 
 def put_in_sheet(store: SessionStore, sheet: int | None) -> None:

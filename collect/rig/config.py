@@ -21,7 +21,7 @@ from pydantic_settings import (
 from calibrate.board.spec import BoardSpec
 from collect.errors import ConfigError
 from collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
-from collect.rig.config_file import Config, Finite, Positive, models_at, nearest, paths, place, read_toml, refusal
+from collect.rig.config_file import Config, Finite, PaperSide, models_at, nearest, paths, place, read_toml, refusal
 from collect.rig.config_quality import QualityConfig
 from collect.rig.config_touch import SelfCheckConfig, TouchConfig
 from collect.rig.optics import with_optics
@@ -48,14 +48,14 @@ def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
     return found
 
 
-def unreadable(settings: type[BaseSettings], error: SettingsError) -> ConfigError:
+def unreadable(settings: type[BaseSettings], error: Exception) -> ConfigError:
     """The error for a variable that must hold a list or a table and is not JSON."""
     for path, name in overrides(settings).items():
         source = EnvSettingsSource(settings)
         source.env_vars = {name.lower(): os.environ[name]}
         try:
             source()
-        except SettingsError:
+        except (SettingsError, RecursionError):
             shown = os.environ[name]
             shown = shown if len(shown) <= 80 else shown[:77] + "..."
             return ConfigError(place(name), ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})")
@@ -87,8 +87,8 @@ class PaperConfig(Config):
     """Angle from base x to paper x."""
     touch_z_mm: Finite
     """Height in the base frame at which the tip of the vertical brush just touches: taught by the operator."""
-    size_mm: tuple[Positive, Positive]
-    cell_mm: tuple[Positive, Positive] = (40.0, 24.0)
+    size_mm: tuple[PaperSide, PaperSide]
+    cell_mm: tuple[PaperSide, PaperSide] = (40.0, 24.0)
     """Width and height of the patch for one press."""
     touch_point_mm: tuple[Finite, Finite] = (4.0, 4.0)
     """Where each run first goes to the taught height, in the paper frame; clear of every cell's ink."""
@@ -223,7 +223,7 @@ def load_rig(path: Path) -> RigConfig:
     environment = overrides(RigConfig)
     try:
         rig = RigConfig(**values)
-    except SettingsError as error:
+    except (SettingsError, RecursionError) as error:
         raise unreadable(RigConfig, error) from None
     except ValidationError as error:
         raise refusal(path, error, RigConfig, environment=environment) from None

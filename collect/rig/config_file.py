@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import stat
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, cast, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from collect.errors import ConfigError
+from sessions.disk import read_bounded
+from sessions.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -22,6 +24,8 @@ MOST = 1e6
 Positive = Annotated[float, Field(gt=0.0, le=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 Range = tuple[Finite, Finite]
+PaperSide = Annotated[float, Field(ge=2.0, le=2000.0, allow_inf_nan=False)]
+"""Width or height of a sheet or a patch in mm: at most a million patches fit on a sheet."""
 
 
 class Config(BaseModel):
@@ -38,16 +42,10 @@ def place(name: str) -> str:
 def read_text(path: Path, max_bytes: int, encoding: str = "utf-8") -> str:
     """The text of a plain file. Raises `ConfigError` that names the file."""
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ConfigError(path, "", "is not a file")
-        if status.st_size > max_bytes:
-            raise ConfigError(path, "", f"is larger than {max_bytes} bytes")
-        return path.read_text(encoding=encoding)
-    except FileNotFoundError:
-        raise ConfigError(path, "", "no such file") from None
-    except OSError as error:
-        raise ConfigError(path, "", error.strerror or str(error)) from None
+        # Line ends of any system, as in a file opened as text.
+        return re.sub("\r\n?", "\n", read_bounded(path, max_bytes).decode(encoding))
+    except InputError as error:
+        raise ConfigError(path, "", error.what) from None
     except UnicodeDecodeError as error:
         raise ConfigError(path, "", f"is not UTF-8 at byte {error.start}") from None
 
@@ -56,7 +54,7 @@ def read_toml(path: Path, max_bytes: int) -> dict[str, Any]:
     """The tables of a TOML file. Raises `ConfigError` that names the file."""
     try:
         return tomllib.loads(read_text(path, max_bytes))
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also for a number of thousands of digits
         raise ConfigError(path, "", f"is not TOML: {error}") from None
     except RecursionError:
         raise ConfigError(path, "", "is not TOML: nested too deeply") from None

@@ -27,14 +27,16 @@ class SimFileError(Exception):
 def load_described(path: Path, model: type[Described]) -> Described:
     """Read and check the file. Raises `SimFileError`, naming file, field and range."""
     try:
-        if path.stat().st_size > MAX_BYTES:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
             raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(data.decode("utf-8"))
     except FileNotFoundError:
         raise SimFileError(path, "", "no such file") from None
     except OSError as error:
         raise SimFileError(path, "", error.strerror or str(error)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
         raise SimFileError(path, "", f"is not TOML: {error}") from None
     try:
         return model.model_validate(values)

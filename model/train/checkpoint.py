@@ -26,6 +26,8 @@ from model.train.config import MAX_BYTES, MAX_WEIGHTS, TrainConfig, checked
 from model.train.errors import TrainError
 
 CHECKPOINT, GENERATOR = "brushloop-checkpoint-1", "brushloop-generator-1"
+MAX_HEADER_BYTES = 4 * 1024 * 1024
+"""Largest header of a safetensors file; it holds the names of the tensors, and the configuration."""
 _MAX_FILE_BYTES = 3 * 4 * MAX_WEIGHTS + 2**26
 COLUMNS = ("step", "mse", "iou", "csim")
 """Columns of the validation history."""
@@ -165,6 +167,10 @@ def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str,
     if size > most_bytes:
         raise TrainError(path, f"holds {size:,} bytes; at most {most_bytes:,} are read")
     try:
+        with path.open("rb") as opened:
+            header = int.from_bytes(opened.read(8), "little")
+        if header > MAX_HEADER_BYTES:
+            raise TrainError(path, f"has a header of {header:,} bytes; at most {MAX_HEADER_BYTES:,} are read")
         with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
             untyped: Any = file
             return dict(untyped.metadata() or {}), {name: untyped.get_tensor(name) for name in untyped.keys()}  # noqa: SIM118

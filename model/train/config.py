@@ -159,14 +159,15 @@ def preset(name: str, **changes: Any) -> TrainConfig:
 def load_config(path: Path) -> TrainConfig:
     """Read a TOML file. Raises TrainError with file, field and allowed values."""
     try:
-        data = path.read_bytes()[: MAX_BYTES + 1]
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise TrainError(path, error.strerror or "cannot be read") from error
     if len(data) > MAX_BYTES:
         raise TrainError(path, f"is larger than {MAX_BYTES} bytes")
     try:
         return checked(path, tomllib.loads(data.decode("utf-8")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
         raise TrainError(path, f"is not TOML: {error}") from error
 
 

@@ -145,9 +145,9 @@ class Account:
     """`done` lines of steps that were done already."""
 
 
-def account(data: bytes) -> Account:
-    """Read the bytes of a journal and apply its events to a new state. Never raises."""
-    found = Account(read(data))
+def account(data: bytes, session: str = "") -> Account:
+    """Read the bytes of a journal and apply its events, those of `session` if it is given, to a new state."""
+    found = Account(read(data, session))
     found.faults += found.reading.faults
     found.damaged += [span for _, span in found.reading.damaged]
     for entry in found.reading.entries:

@@ -12,10 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sessions.errors import SessionDamaged, SessionError, in_one_line
+from sessions.disk import read_bounded
+from sessions.errors import InputError, SessionDamaged
 from sessions.journal.codec import BadLine, Entry, Line, decode_line, digest, has_crc, lines_within
 from sessions.names import check_file
 
+MAX_JOURNAL_BYTES = 256 * 1024 * 1024
+"""Several times the journal of 20,000 strokes."""
 MAX_STRANGE_BYTES = 30
 """Most bytes in which a rebuilt line may differ from the damaged one: its time (19), its CRC (8), and the damage."""
 
@@ -67,24 +70,28 @@ def read_lines(path: Path) -> Iterator[Line]:
 
 
 def read_journal(path: Path) -> bytes:
-    """Bytes of a journal. Raises `SessionError`, and `InputError` where it is a link."""
+    """Bytes of a journal. Raises `SessionDamaged` where it is too large, and `InputError` where it is a link."""
     check_file(path)
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise SessionError(path, f"cannot read: {in_one_line(error)}") from None
+        return read_bounded(path, MAX_JOURNAL_BYTES)
+    except InputError as error:
+        raise SessionDamaged(path, error.what) from None
 
 
-def read(data: bytes) -> Reading:
-    """Read whatever can still be trusted in the bytes of a journal."""
+def read(data: bytes, session: str = "") -> Reading:
+    """Read whatever can still be trusted in the bytes of a journal.
+
+    Lines of another session than `session` are never trusted; without it, those of the session with most lines are.
+    """
     *pieces, tail = data.split(b"\n")
     reading = Reading()
     entries = _decoded(reading, pieces, tail)
     first = next((entry for entry in entries if entry.chain is not None), None)
-    if first is None or _is_perfect(entries, first, data):
+    ours = first is not None and session in ("", _session_of([first]))
+    if first is None or (ours and _is_perfect(entries, first, data)):
         reading.entries = entries
     else:
-        _link(reading, entries, data)
+        _link(reading, entries, data, session or _session_of(entries))
         reading.faults.sort(key=lambda fault: fault.number)
     return reading
 
@@ -151,10 +158,15 @@ def _before(entry: Entry, data: bytes) -> bytes:
     return data[:at]
 
 
-def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
-    """Find lines that break the chain: foreign, doubled, displaced, changed and missing ones."""
+def _session_of(entries: list[Entry]) -> str:
+    """Session that most lines name."""
     sessions = Counter(entry.chain.session for entry in entries if entry.chain is not None)
-    session = sessions.most_common(1)[0][0]
+    return sessions.most_common(1)[0][0]
+
+
+def _link(reading: Reading, entries: list[Entry], data: bytes, session: str) -> None:
+    """Find lines of `session` that break its chain: doubled, displaced, changed and missing ones; and foreign lines."""
+    foreign: dict[str, list[int]] = {}
     before: list[Entry] = []
     by_seq: dict[int, list[Entry]] = {}
     for entry in entries:
@@ -164,9 +176,15 @@ def _link(reading: Reading, entries: list[Entry], data: bytes) -> None:
             else:
                 reading.fault(entry.number, "has no chain: another program inserted it")
         elif entry.chain.session != session:
-            reading.fault(entry.number, f"is of another session, {entry.chain.session[:100]!r}")
+            foreign.setdefault(entry.chain.session, []).append(entry.number)
         else:
             by_seq.setdefault(entry.chain.seq, []).append(entry)
+    for other, numbers in foreign.items():
+        more = f", as are {len(numbers) - 1} more" if len(numbers) > 1 else ""
+        reading.fault(numbers[0], f"is of another session, {other[:100]!r}{more}")
+    if not by_seq:
+        reading.entries = before
+        return
     held = _vouched(reading, by_seq)
     _misplaced(reading, held)
     first = held[0]

@@ -7,6 +7,7 @@ the offsets of the other chunks. A torn tail never yields a wrong record.
 from __future__ import annotations
 
 import io
+import json
 import re
 import struct
 import zlib
@@ -97,6 +98,27 @@ def scan(path: Path) -> Scan:
                     part if part.sound else Part(part.offset, _indexed_counts(file, found, part.offset), False)
                 )
     return found
+
+
+def recorded_in(found: Scan) -> str:
+    """Id of the session whose header a file holds; empty where it holds none that matches its CRC."""
+    metadata = found.metadata.get(HEADER_METADATA, {})
+    try:
+        session = json.loads(metadata.get("session_id", '""'))
+    except (ValueError, RecursionError):
+        return ""
+    return session if isinstance(session, str) and metadata.get("crc") == header_crc(metadata) else ""
+
+
+def session_of(path: Path) -> str:
+    """`recorded_in` of a file whose chunks are not read. Raises `InputError` where it cannot be opened."""
+    found = Scan(path)
+    with opened(path) as file:
+        try:
+            _walk(file, found)
+        except OSError:
+            return ""
+    return recorded_in(found)
 
 
 def _indexed_counts(file: BoundedFile, found: Scan, offset: int) -> Counter[str] | None:

@@ -6,6 +6,7 @@ of the journal are rebuilt from these word for word, and put back in their place
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
 from sessions.errors import SessionDamaged, SessionError
 from sessions.journal.codec import Line, encode_line, without_time
 from sessions.journal.events import NONSENSE, serial_of
@@ -21,7 +23,7 @@ from sessions.journal.lines import Fault, accounts_for, read_journal
 from sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
 from sessions.reader import parse_header
 from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, count_messages, file_sha256
-from sessions.recording.salvage import Scan, scan
+from sessions.recording.salvage import Scan, recorded_in, scan, session_of
 from sessions.recording.schemas import Header, Recorded, Topic
 from sessions.store import closed_line, done_line, open_line
 
@@ -48,6 +50,10 @@ class Evidence:
     """Files of attempts whose sheet and cell are unknown."""
     strays: list[str] = field(default_factory=list[str])
     """Files that hold a step which the journal lists under another file."""
+    session: str = ""
+    """Id of the session: neither lines nor files of another one are evidence of anything."""
+    foreign: dict[str, str] = field(default_factory=dict[str, str])
+    """Files of other sessions that the journal does not list, and the ids of those sessions."""
     state: Replay = field(default_factory=Replay)
     """State after all trusted and rebuilt lines."""
 
@@ -70,11 +76,15 @@ def gather(folder: Path) -> Evidence:
     path = folder / JOURNAL_NAME
     data = read_journal(path) if check_file(path) else None
     journal = account(data or b"")
+    session = _session(folder, journal.state)
+    if session and session != _named_in(journal.state):
+        journal = account(data or b"", session)
     found = Evidence(folder, data, journal.lines, journal.faults, journal.reading.torn, journal.reading.unchained)
+    found.session = session
     _lost_between(found, journal.twice)
     header = _from_files(found, journal.state.done)
     if journal.state.opened is None:
-        header = header or _from_any_segment(folder) or _from_final(folder)
+        header = header or _from_any_segment(found) or _from_final(found)
         if header is None:
             raise SessionDamaged(path, "has no `open` event, and no file holds its header")
         found.rebuilt.insert(0, {"t_ns": 0, **open_line(header, _snapshots(folder))})
@@ -82,6 +92,24 @@ def gather(folder: Path) -> Evidence:
     _closed(found)
     found.lost = _lost(journal, found.rebuilt)
     return found
+
+
+def _named_in(state: Replay) -> str:
+    header = (state.opened or {}).get("header", {})
+    return str(header.get("session_id", ""))
+
+
+def _session(folder: Path, state: Replay) -> str:
+    """Id of the session in a folder: its name, unless neither journal nor files say it; then the id of most files."""
+    named = _named_in(state)
+    if named == folder.name:
+        return named
+    finals = {f"{folder.name}.mcap", f"{folder.resolve().name}.mcap"}
+    paths = [path for path in folder.glob("*.mcap*") if SEGMENT_NAME.fullmatch(path.name) or path.name in finals]
+    files = Counter(session for path in paths if (session := session_of(path)))
+    if folder.name in files or not files:
+        return folder.name if files else named
+    return named if files[named] == max(files.values()) else files.most_common(1)[0][0]
 
 
 def _fold(found: Evidence) -> None:
@@ -143,6 +171,9 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
     header: Header | None = None
     strays: list[str] = []
     for path, name, seen in _uncovered(found.folder, begun, done):
+        if recorded_in(seen) not in ("", found.session):
+            found.foreign[path.name] = recorded_in(seen)
+            continue
         if path.name.removesuffix(".part") != name:
             strays.append(path.name)
         if name in begun and (name in done or path.name.endswith(".part")):
@@ -235,16 +266,16 @@ def _header(note: dict[str, Any]) -> Header | None:
         return None
 
 
-def _from_any_segment(folder: Path) -> Header | None:
-    for path in sorted(folder.glob("*.mcap*")):
+def _from_any_segment(found: Evidence) -> Header | None:
+    for path in sorted(found.folder.glob("*.mcap*")):
         header = _header(scan(path).notes.get(BEGIN_NOTE, {})) if SEGMENT_NAME.fullmatch(path.name) else None
-        if header is not None:
+        if header is not None and header.session_id == found.session:
             return header
     return None
 
 
-def _from_final(folder: Path) -> Header | None:
-    final = folder / f"{folder.name}.mcap"
+def _from_final(found: Evidence) -> Header | None:
+    final = found.folder / f"{found.folder.name}.mcap"
     if not final.is_file():
         return None
     metadata = scan(final).metadata.get(HEADER_METADATA)
@@ -253,19 +284,22 @@ def _from_final(folder: Path) -> Header | None:
 
 def _snapshots(folder: Path) -> dict[str, str]:
     present = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
-    return {path.name: path.read_text(encoding="utf-8", errors="replace") for path in present}
+    return {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace") for path in present}
 
 
 def _closed(found: Evidence) -> None:
-    """Rebuild the `closed` line if the merged file holds exactly the messages that the journal counts."""
+    """Rebuild the `closed` line if the merged file is sound and holds all messages that the journal counts, or more.
+
+    It holds more where the files of steps are lost with their lines: it is then the only copy.
+    """
     final = found.folder / f"{found.folder.name}.mcap"
-    if found.state.closed is not None or not final.is_file() or not found.state.segments:
+    if found.state.closed is not None or not final.is_file():
         return
     try:
-        complete = count_messages(final) == found.state.counts()
+        counts = count_messages(final)
     except SessionError:
         return
-    if complete:
-        line: Line = {"t_ns": found.state.last_ns, **closed_line(final, found.state.counts())}
+    if counts and Counter(counts) >= Counter(found.state.counts()) and session_of(final) in ("", found.session):
+        line: Line = {"t_ns": found.state.last_ns, **closed_line(final, counts)}
         found.rebuilt.append(line)
         fold(found.state, line)

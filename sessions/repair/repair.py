@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from sessions.disk import fsync_folder, set_aside
+from sessions.disk import fsync_folder, holds, set_aside
 from sessions.errors import SessionDamaged, SessionError, disk_error
 from sessions.folders import check_name, not_a_session
 from sessions.journal.codec import Line, without_time
@@ -22,7 +22,7 @@ from sessions.merge import REPAIRS_NOTE, merge_session
 from sessions.names import SEGMENT_NAME
 from sessions.recording.container import Record
 from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, check_digest, count_messages, file_sha256
-from sessions.recording.salvage import Scan, scan
+from sessions.recording.salvage import Scan, recorded_in, scan
 from sessions.recording.schemas import Topic
 from sessions.repair.evidence import gather
 from sessions.repair.journal import Report, kept_words, repaired_journal, write_anew
@@ -77,7 +77,8 @@ class FolderRepair:
         self._scans: dict[tuple[int, int, int], tuple[Scan, tuple[str, int] | None]] = {}
         """Content of each file that was read and the step it belongs to, by inode, size and time."""
         evidence = gather(folder)
-        self._strays = evidence.strays
+        self._strays = dict.fromkeys(evidence.strays, "it is a copy of another step")
+        self._strays |= {name: f"it is of another session, {other!r}" for name, other in evidence.foreign.items()}
         self._begins = [line for line in evidence.all_lines if line["event"] == "begin"]
         self._header = read_header(folder, evidence.state)
         self._journal = repaired_journal(evidence, self._header.session_id, now_ns, self._report)
@@ -96,9 +97,9 @@ class FolderRepair:
             self._snapshots()
             for line in list(self._state.segments):
                 self._segment(line)
-            for name in self._strays:
+            for name, why in self._strays.items():
                 kept = self._move_aside(self._folder / name)
-                self._report.did.append(f"put {name} aside: it is a copy of another step{kept_words(kept)}")
+                self._report.did.append(f"put {name} aside: {why}{kept_words(kept)}")
             if self._state.closed is None:
                 self._left_by_a_close()
             elif not self._final_sound:
@@ -124,7 +125,7 @@ class FolderRepair:
         for name, text in (self._state.opened or {}).get("snapshots", {}).items():
             path = self._folder / name
             data = text.encode()
-            if not path.is_file() or path.read_bytes() != data:
+            if not holds(path, data):
                 kept = write_anew(path, data)
                 self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
 
@@ -168,7 +169,7 @@ class FolderRepair:
                 found, whose = self._look(place)
                 if whose == identity:
                     yield Source(found, counts, nothing)
-            elif path.name in self._merged:
+            elif path.name in self._merged and self._is_ours(self._look(place)[0]):
                 yield Source(self._look(place)[0], self._totals, self._merged[path.name])
 
     def _look(self, path: Path) -> tuple[Scan, tuple[str, int] | None]:
@@ -177,9 +178,14 @@ class FolderRepair:
         known = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
         if known not in self._scans:
             found = scan(path)
-            self._scans[known] = found, None if path == self._final else identity_of(found)
+            whole = path == self._final or not self._is_ours(found)
+            self._scans[known] = found, None if whole else identity_of(found)
         self._scans[known][0].path = path
         return self._scans[known]
+
+    def _is_ours(self, found: Scan) -> bool:
+        """Whether a file may be evidence. Steps of another session of the same protocol have the same keys."""
+        return recorded_in(found) in ("", self._header.session_id)
 
     def _write_again(
         self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str
@@ -240,7 +246,11 @@ class FolderRepair:
     def _merge_again(self) -> None:
         """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
         found = self._look(self._final)[0] if self._final.is_file() else Scan(self._final)
-        if not self._merged and len(with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0):
+        if (
+            not self._merged
+            and self._is_ours(found)
+            and len(with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0)
+        ):
             self._lost_steps = self._rewrite_final(found)
             return
         why = "; ".join(found.damage) or ("has changed" if self._final.is_file() else "is missing")
@@ -264,8 +274,8 @@ class FolderRepair:
 
     def _left_by_a_close(self) -> None:
         """Put aside a damaged merged file of an open session, which is merged again when it closes."""
-        problems = file_problems(self._final)[1] if self._final.is_file() else []
-        if problems:
+        found, problems = file_problems(self._final) if self._final.is_file() else (Scan(self._final), [])
+        if problems or not self._is_ours(found):
             kept = self._move_aside(self._final)
             self._report.did.append(
                 f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}"

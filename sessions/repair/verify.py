@@ -9,6 +9,7 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
+from sessions.disk import holds
 from sessions.errors import InputError, SessionDamaged, SessionError
 from sessions.folders import check_name, not_a_session
 from sessions.journal.codec import Line
@@ -18,7 +19,7 @@ from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
 from sessions.recording.mcap_file import check_digest
 from sessions.recording.messages import decode_gray, decode_still
-from sessions.recording.salvage import Scan, salvaged, scan
+from sessions.recording.salvage import Scan, recorded_in, salvaged, scan
 from sessions.recording.schemas import Stroke, Topic
 from sessions.repair.evidence import Evidence, gather
 from sessions.show import details, step_words
@@ -98,12 +99,12 @@ def _verify_folder(folder: Path, progress: Progress) -> Verdict:
     _journal(verdict, evidence)
     state = evidence.state
     for line in counted(state.segments, "files of steps read", len(state.segments), progress):
-        verdict.findings += _segment(verdict, folder, line)
+        verdict.findings += _segment(verdict, evidence, line)
     for name, text in (state.opened or {}).get("snapshots", {}).items():
         path = folder / str(name)
         if not path.is_file():
             verdict.findings.append(Finding(str(name), "is missing, though the journal holds its text"))
-        elif path.read_bytes() != str(text).encode():
+        elif not holds(path, str(text).encode()):
             verdict.findings.append(Finding(str(name), "has changed since the session was started"))
     if state.closed is not None:
         verdict.state = "closed"
@@ -111,10 +112,11 @@ def _verify_folder(folder: Path, progress: Progress) -> Verdict:
     elif (final := folder / f"{folder.name}.mcap").is_file():
         # Left by an interrupted close, or by one whose line in the journal is lost.
         verdict.files += 1
-        verdict.findings += [Finding(final.name, problem) for problem in file_problems(final)[1]]
+        found, problems = file_problems(final)
+        verdict.findings += [Finding(final.name, problem) for problem in _foreign(found, evidence) or problems]
     if verdict.sound:
         _shown(verdict, folder)
-    _count(verdict, Counter(state.counts()))
+    _count(verdict, Counter((state.closed or {}).get("counts", state.counts())))
     verdict.notes += [f"{line['file']}: {_repair_words(line)}" for line in state.repairs]
     kept = [p for p in folder.iterdir() if ".damaged-" in p.name or ".superseded-" in p.name]
     if kept:
@@ -170,12 +172,14 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
                 verdict.findings.append(Finding(JOURNAL_NAME, "does not say how the session was opened"))
     for name in evidence.strays:
         verdict.findings.append(Finding(name, "holds a step that the journal lists under another file"))
+    for name, session in evidence.foreign.items():
+        verdict.findings.append(Finding(name, f"is of another session, {session[:100]!r}"))
     for name in evidence.doubtful:
         verdict.findings.append(Finding(name, "the cell and the sheet that it pressed are unknown"))
 
 
-def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
-    path, step = folder / str(line["file"]), step_words(line)
+def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:
+    path, step = evidence.folder / str(line["file"]), step_words(line)
     if "held" in line:
         return []
     verdict.files += 1
@@ -185,6 +189,7 @@ def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
         if not path.is_file():
             return [Finding(path.name, f"({step}) {error.what}")]
         found, problems = file_problems(path)
+        problems = _foreign(found, evidence) or problems
         lost = Counter[str](line["counts"]) - found.counts
         words = ", ".join(f"{count} of {topic}" for topic, count in lost.items()) or "none"
         why = "; ".join(problems) or error.what
@@ -193,6 +198,12 @@ def _segment(verdict: Verdict, folder: Path, line: Line) -> list[Finding]:
     if dict(found.counts) != line["counts"]:
         problems.append(f"holds {dict(found.counts)}, but the journal says {line['counts']}")
     return [Finding(path.name, f"({step}) {problem}") for problem in problems]
+
+
+def _foreign(found: Scan, evidence: Evidence) -> list[str]:
+    """What is wrong with a file of another session: nothing in it is evidence."""
+    session = recorded_in(found)
+    return [] if session in ("", evidence.session) else [f"is of another session, {session[:100]!r}"]
 
 
 def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progress) -> None:
@@ -210,6 +221,7 @@ def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progres
     if not path.is_file():
         return
     found, problems = file_problems(path, progress)
+    problems = _foreign(found, evidence) or problems
     expected = closed.get("counts", state.counts())
     if dict(found.counts) != expected and not problems:
         problems.append(f"holds {dict(found.counts)}, but the journal says {expected}")

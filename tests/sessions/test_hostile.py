@@ -207,8 +207,7 @@ def test_a_session_that_is_gone_on_with_holds_no_link(make, place):
     with pytest.raises(InputError, match=r"rig\.toml: is a link, which nothing in a session's folder may be") as caught:
         SessionStore(folder, None, make.clock())
     assert caught.value.exit_code == 2
-    with pytest.raises(InputError, match="is a link"):
-        open_sessions(folder.parent)
+    assert folder not in open_sessions(folder.parent)
 
 
 @pytest.mark.parametrize(

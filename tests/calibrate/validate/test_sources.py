@@ -7,6 +7,7 @@ import importlib
 import json
 import os
 import shutil
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -96,7 +97,10 @@ def test_of_several_calibrations_beside_the_pointed_one_is_used(session: Path, r
         ("memory://lab/presses", "has no checksum"),
         ("memory://lab/presses#sha256=" + "0" * 64, "0000 was expected"),
         ("memory://lab/nothing#sha256=" + "0" * 64, "cannot be read"),
-        ("nosuch://lab/presses#sha256=" + "0" * 64, "cannot be opened"),
+        *(
+            (f"{scheme}://lab/presses#sha256={'0' * 64}", "allowed: file://, memory://, http://")
+            for scheme in ("nosuch", "zip", "ftp", "github", "reference", "simplecache")
+        ),
     ],
 )
 def test_what_cannot_be_believed_is_refused_and_leaves_nothing(
@@ -173,6 +177,16 @@ def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_pat
         open_session(f"{web}/presses.mcap", tmp_path, None, None)
     with pytest.raises(CalibrationError, match="cannot be read"):
         open_session(f"{web}/nothing.mcap#sha256={digest(session)}", tmp_path, None, None)
+
+
+def test_a_web_server_that_stalls_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It accepts the connection and never answers."""
+    pytest.importorskip("aiohttp", reason="needs the extra [remote]")
+    monkeypatch.setattr(sources, "STALL_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/x.mcap#sha256={'0' * 64}"
+        with pytest.raises(CalibrationError, match="cannot be read"):
+            open_session(url, tmp_path, None, None)
 
 
 def test_a_recording_longer_than_a_block_comes_from_a_server_that_serves_no_ranges(
