@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import subprocess
 import sys
@@ -79,19 +78,6 @@ def test_names_that_are_no_text_may_lie_beside_a_session(folder: Path) -> None:
     assert (ran.returncode, "caf\\udce9" in ran.stdout) == (0, True)
     for words in ("sessions verify s", "sessions show s", "sessions repair s"):
         assert brushloop(*words.split(), cwd=folder).returncode == 0
-
-
-def test_a_full_disk_is_one_line_that_names_the_file(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    ran = brushloop("calibrate", "board", "--out", str(tmp_path / "board.pdf"), cwd=folder)
-    assert ran.returncode == 4, ran.stderr
-    assert ran.stderr.count("\n") == 1
-    assert "No space left on device" in ran.stderr
 
 
 def test_too_little_memory_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -170,7 +170,7 @@ def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str,
         with path.open("rb") as opened:
             header = int.from_bytes(opened.read(8), "little")
         if header > MAX_HEADER_BYTES:
-            raise TrainError(path, f"has a header of {header:,} bytes; at most {MAX_HEADER_BYTES:,} are read")
+            raise ValueError(f"its header has {header:,} bytes; at most {MAX_HEADER_BYTES:,} are read")
         with safe_open(path, framework="pt") as file:  # pyright: ignore[reportUnknownVariableType]
             untyped: Any = file
             return dict(untyped.metadata() or {}), {name: untyped.get_tensor(name) for name in untyped.keys()}  # noqa: SIM118

@@ -66,8 +66,8 @@ class Scan:
     stated: dict[str, int] | None = None
     """Number of messages by topic according to the index; None if it is damaged."""
     stated_attachments: int = 0
-    stated_notes: int = 0
-    """Notes listed in the index, without the header."""
+    stated_notes: frozenset[str] = frozenset()
+    """Names of the notes listed in the index, and of the header."""
     damage: list[str] = field(default_factory=list[str])
     """Descriptions of the damage; empty for an intact file."""
 
@@ -291,7 +291,7 @@ def _from_index(file: BoundedFile, found: Scan, known: array[int]) -> list[int]:
     counts = index.statistics.channel_message_counts
     found.stated = {found.channels[key].topic: count for key, count in counts.items() if key in found.channels}
     found.stated_attachments = len(index.attachments)
-    found.stated_notes = len({one.name for one in index.metadata} - {HEADER_METADATA})
+    found.stated_notes = frozenset(one.name for one in index.metadata)
     found.complete = True
     for one in index.metadata:
         if one.name not in found.metadata:

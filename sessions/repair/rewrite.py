@@ -134,7 +134,7 @@ def repair_file(path: Path) -> Report:
         report.lost.append("anything else behind the damage: without its index its amount is unknown")
     if found.stated is None:
         return report
-    if len(files) < found.stated_attachments or len(found.notes) < found.stated_notes:
+    if len(files) < found.stated_attachments or len(found.notes) < len(found.stated_notes - {HEADER_METADATA}):
         report.lost.append("an attached file, or a note of what was done to the recording")
     return report
 

@@ -17,7 +17,7 @@ from sessions.journal.journal import JOURNAL_NAME
 from sessions.names import SEGMENT_NAME
 from sessions.progress import Progress, counted, unseen
 from sessions.reader import Recording
-from sessions.recording.mcap_file import check_digest
+from sessions.recording.mcap_file import HEADER_METADATA, check_digest
 from sessions.recording.messages import decode_gray, decode_still
 from sessions.recording.salvage import Scan, recorded_in, salvaged, scan
 from sessions.recording.schemas import Stroke, Topic
@@ -59,7 +59,7 @@ class Verdict:
 def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
     """Check a session's folder, or one MCAP file.
 
-    Raises `InputError` where it is neither, was renamed, or holds links.
+    Raises `InputError` where it is neither, is of another program, was renamed, or holds links.
     """
     check_name(path)
     if path.is_file():
@@ -79,6 +79,8 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
 def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
     verdict = Verdict(name, "recording", files=1)
     found, problems = file_problems(path, progress)
+    if found.stated is not None and HEADER_METADATA not in found.stated_notes:
+        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_METADATA}")
     verdict.findings += [Finding(path.name, problem) for problem in problems]
     if not problems:
         try:

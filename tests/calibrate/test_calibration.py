@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +21,7 @@ from drivers.geometry import brush_pose
 from drivers.sim.camera.scene import Scene
 from drivers.sim.config import SimConfig, Table, View
 from drivers.sim.world import World
+from tests.command import brushloop
 
 if TYPE_CHECKING:
     from conftest import Photographed
@@ -82,6 +85,23 @@ def test_what_can_be_used_with_care_is_flagged_in_the_artefact(
     path = current(session)
     assert path is not None
     assert any(message in flag for flag in load_artefact(path, Calibration).flags)
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    photographed: Photographed, tmp_path: Path, board: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = photographed(tmp_path / "s", SPEC, [board], sheet_mm=SHEET_MM)
+    write_bytes = Path.write_bytes
+
+    def half_of_it(path: Path, data: bytes) -> int:
+        write_bytes(path, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", half_of_it)
+    ran = brushloop("calibrate", session)
+    assert (ran.returncode, ran.stdout) == (4, "")
+    assert re.fullmatch(r"brushloop: .*/calibration/\w+\.json: No space left on device\n", ran.stderr)
+    assert list((session / "calibration").iterdir()) == []
 
 
 def test_a_sound_board_has_no_flags(photographed: Photographed, tmp_path: Path, board: np.ndarray) -> None:

@@ -2,12 +2,15 @@
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 from typer.testing import CliRunner
 
 from sessions.cli import app
 from sessions.errors import InputError
 from sessions.journal.journal import JOURNAL_NAME
+from sessions.recording.mcap_file import HEADER_METADATA as HEADER
 from sessions.repair.verify import verify_session
+from tests.command import brushloop
 
 
 @pytest.fixture
@@ -100,3 +103,24 @@ def test_the_command_says_how_much_was_read(folder):
     ran = CliRunner().invoke(app, ["verify", str(folder)])
     assert ran.exit_code == 0
     assert "2026-01-02-grid-01 (closed) is sound: 6 files, 2 strokes, 25 messages" in ran.output
+
+
+@pytest.mark.parametrize("command", ["verify", "repair"])
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+def test_a_recording_of_another_program_is_no_session_and_not_damaged(tmp_path, command, compression):
+    path = tmp_path / "drive.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start("ros2", "another recorder")
+        schema = writer.register_schema("geometry_msgs/Pose", "ros2msg", b"float64 x")
+        channel = writer.register_channel("/stroke", "cdr", schema)
+        writer.add_message(channel, 1, b"\0\1\0\0", 1)
+        writer.add_metadata("trip", {"car": "blue"})
+        writer.finish()
+    before = path.read_bytes()
+    ran = brushloop("sessions", command, path)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert (
+        ran.stderr == f"brushloop: {path}: is an MCAP file, but not a brushloop session: its index lists no {HEADER}\n"
+    )
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])

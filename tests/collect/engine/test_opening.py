@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -65,6 +66,22 @@ def test_what_did_not_change_is_gone_on_with(lab: Path) -> None:
     edit("rig.toml", "port = 30004", "port = 31004")  # where a device is may change
     edit("rig.toml", "[paper]", "# measured again\n[paper]")
     assert find_resumable(opening()) == Path("sessions/grid-01")
+
+
+@pytest.mark.parametrize("trouble", ["damaged", "linked"])
+def test_an_unreadable_session_stands_in_no_others_way(lab: Path, trouble: str) -> None:
+    old = lab / "sessions" / "old"
+    old.mkdir()
+    if trouble == "damaged":
+        (old / "journal.jsonl").write_bytes(b"no line\n")
+    else:
+        (old / "journal.jsonl").symlink_to(lab / "sessions" / "grid-01" / "journal.jsonl")
+    assert find_resumable(opening()) == Path("sessions/grid-01")
+    shutil.rmtree(lab / "sessions" / "grid-01")
+    [line] = refused()
+    assert "One cannot be resumed as it is: sessions/old/journal.jsonl: " in line
+    assert "--sheet 1" in line
+    assert find_resumable(replace(opening(), sheet=1)) is None
 
 
 def test_file_field_old_and_new_value_are_reported_and_where_the_old_file_lies(lab: Path) -> None:

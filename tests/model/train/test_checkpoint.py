@@ -50,6 +50,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "pickle": (lambda p: torch.save({"a": torch.zeros(1)}, p), "is not a safetensors file"),
     "cut": (lambda p: p.write_bytes(p.read_bytes()[:-100]), "is not a safetensors file"),
     "endless header": (lambda p: p.write_bytes(struct.pack("<Q", 2**60) + b"{}"), "is not a safetensors file"),
+    "large header": (
+        lambda p: p.write_bytes(struct.pack("<Q", 5 * 2**20) + b'{"__metadata__":{}}'.ljust(5 * 2**20)),
+        "at most 4,194,304 are read",
+    ),
     "another kind": (lambda p: changed(p, format="brushloop-generator-1"), "format is 'brushloop-generator-1'"),
     "no config": (lambda p: changed(p, config=""), "config is not JSON"),
     "deep config": (lambda p: changed(p, config="[" * 60_000), "config is not JSON"),
