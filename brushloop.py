@@ -32,8 +32,8 @@ EXIT_CODES = {
     1: "a defect: please report it with its traceback",
     2: "input or configuration cannot be used; nothing half-written is left",
     3: "finished, but strokes were left out, or a repair lost something",
-    4: "stopped or aborted, also by a full disk, too little memory or an output that was closed; once the cause has been "
-    "removed, the same command continues",
+    4: "stopped or aborted, also by a full disk, too little memory or an output that was closed; once the cause has "
+    "been removed, the same command continues",
     5: "finished, but a required score was missed (`validate --gate`), the camera drifted, or the rig's settings "
     "contradict each other",
     6: "a recording is damaged: `brushloop sessions repair`",
