@@ -151,7 +151,6 @@ def sim(
     brush: Annotated[
         Path, typer.Option(help="A shipped brush, `loopback` or `paper`, or one described in a brush.toml.")
     ] = Path("loopback"),
-    faults: Annotated[Path | None, typer.Option(help="Script of faults, faults.toml.")] = None,
     control: Annotated[Path | None, typer.Option(help="Make a control socket here, for `fault` and `hand`.")] = None,
     unknown: Annotated[
         int | None, typer.Option(min=0, help="Serve a lab that nobody has measured, drawn from this seed.")
@@ -169,7 +168,7 @@ def sim(
     from drivers.sim.serve import LabRefused, serve, serve_unknown
 
     if unknown is not None:
-        if write_rig is not None or brush != Path("loopback") or faults is not None or arcs_port or camera_port:
+        if write_rig is not None or brush != Path("loopback") or arcs_port or camera_port:
             raise LabRefused("--unknown: can only be combined with --trap, --truth, --control, --rate and --idle-exit")
         serve_unknown(unknown, trap, rate, idle_exit, say, truth=truth, control=control)
         return
@@ -186,7 +185,7 @@ def sim(
         head=pressed.head,
         view=View(fps=fps) if pressed.noise_gray is None else View(fps=fps, noise=pressed.noise_gray),
     )
-    serve(config, write_rig, idle_exit, say, faults=faults, control=control)
+    serve(config, write_rig, idle_exit, say, control=control)
 
 
 @app.command()

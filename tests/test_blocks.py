@@ -16,7 +16,6 @@ import pytest
 
 from collect.protocols.config import load_protocol
 from drivers.sim.brush_file import load_brush
-from drivers.sim.faults.kinds import load_faults
 from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of
 
 TUTORIAL = ROOT / "docs" / "tutorial.md"
@@ -56,8 +55,6 @@ def test_a_block_of_toml_is_what_its_reader_accepts(block: Block, tmp_path: Path
     match tomllib.loads(block.text):
         case {"kind": _}:
             load_protocol(path)
-        case {"fault": _}:
-            load_faults(path)
         case {"brush": _}:
             load_brush(path)
 
@@ -111,12 +108,10 @@ class Reader:
 
 
 def new_lab(folder: Path) -> Reader:
-    """A clone as a reader has it, with a protocol and a script of faults."""
+    """A clone as a reader has it, with a protocol."""
     shutil.copytree(ROOT / "examples", folder / "examples")
     (folder / ".venv").symlink_to(sys.prefix)
     shutil.copy(ROOT / "examples" / "protocol-quick.toml", folder / "protocol.toml")
-    [script] = [b.text for b in blocks_of(ROOT / "docs" / "faults.md") if b.kind == "toml"]
-    (folder / "faults.toml").write_text(script, encoding="utf-8")
     return Reader(folder)
 
 

@@ -93,7 +93,7 @@ def test_a_protocol_kind_is_one_class() -> None:
 
 def test_a_quality_check_is_a_function_of_the_mark() -> None:
     flooded = recipe("quality_check").flooded
-    mark = Mark(tone=0.9, uneven=0.05, head_mm=(0.7, 0.0), gap_mm=0.0, bent_deg=0.0)
+    mark = Mark(tone=0.9, uneven=0.05, head_mm=(0.7, 0.0), gap_mm=0.0, bent_deg=0.0, length_mm=20.0, width_mm=8.0)
     assert flooded(mark, QualityConfig()).passed
     assert "Wipe the brush" in flooded(replace(mark, tone=0.99), QualityConfig()).reason
 

@@ -1,4 +1,4 @@
-"""TOML files that describe faults or a brush to the simulator: read completely, or refused with one line."""
+"""TOML files that describe a brush to the simulator: read completely, or refused with one line."""
 
 from __future__ import annotations
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from drivers.sim.config import SimConfig
 from drivers.sim.control import live_control
 from drivers.sim.described import SimFileError
-from drivers.sim.faults.kinds import hang_script, load_faults
 from drivers.sim.rig import LoopbackRig
 from drivers.sim.rig_toml import LOOPBACK_HEAD
 
@@ -25,15 +24,14 @@ def serve(
     idle_exit_s: float,
     tell: Callable[[str], None] = lambda _text: None,
     *,
-    faults: Path | None = None,
     control: Path | None = None,
 ) -> None:
-    """Serve until a signal, or until idle for `idle_exit_s` (0 means never); `faults` is an optional fault script.
+    """Serve until a signal, or until idle for `idle_exit_s` (0 means never).
 
-    Raises `SimFileError` for a fault script that cannot be used, a control socket that cannot be created, and rather
-    than overwrite a file that no loopback rig wrote.
+    Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
+    rig wrote.
     """
-    asyncio.run(_serve(config, write_rig, idle_exit_s, tell, faults, control))
+    asyncio.run(_serve(config, write_rig, idle_exit_s, tell, control))
 
 
 async def _serve(
@@ -41,16 +39,12 @@ async def _serve(
     write_rig: Path | None,
     idle_exit_s: float,
     tell: Callable[[str], None],
-    faults: Path | None,
     control: Path | None,
 ) -> None:
     over = _signalled()
     if write_rig is not None:
         _refuse_to_overwrite(write_rig)
-    script = load_faults(faults) if faults is not None else ()
     async with LoopbackRig(config) as rig, live_control(rig.faults, control):
-        if faults is not None:
-            hang_script(faults, rig.faults.hang, script)
         if write_rig is not None:
             _write_whole(write_rig, rig.toml())
         tell(f"{rig.where()}; Ctrl-C ends")

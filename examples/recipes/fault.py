@@ -1,8 +1,8 @@
 """A fault of the loopback rig: the camera's pictures are upside down, as after somebody has turned its mount.
 
 The kind goes into `KINDS` in `drivers/sim/faults/kinds.py`, what it does into the simulator of its device; for a fault
-of single pictures that is `SPOILED` in `drivers/sim/camera/mjpeg_server.py`. `faults.toml` and `brushloop fault` know
-it at once. `docs/faults.md` says what a run makes of it; `tests/collect/faults/test_matrix.py` holds that.
+of single pictures that is `SPOILED` in `drivers/sim/camera/mjpeg_server.py`. `brushloop fault` knows it at once.
+`docs/faults.md` says what a run makes of it; `tests/collect/faults/test_matrix.py` holds that.
 """
 
 from __future__ import annotations

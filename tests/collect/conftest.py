@@ -126,9 +126,9 @@ class Lab:
 
 
 @contextmanager
-def coarse(folder: Path) -> Iterator[Lab]:
+def coarse(folder: Path, rate: float = 60.0) -> Iterator[Lab]:
     """A camera too coarse to judge ink by, and two strokes."""
-    with serving(SimConfig(rate=60.0, view=SMALL_VIEW, force_hz=100.0)) as rig:
+    with serving(SimConfig(rate=rate, view=SMALL_VIEW, force_hz=100.0)) as rig:
         made = Lab(rig, folder)
         text = rig.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
         text += "\n[quality]\nenabled = false\n"
@@ -143,6 +143,13 @@ def coarse(folder: Path) -> Iterator[Lab]:
 @pytest.fixture
 def lab(tmp_path: Path) -> Iterator[Lab]:
     with coarse(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def slow_lab(tmp_path: Path) -> Iterator[Lab]:
+    """The same, slow enough that another client's line does not pass between two questions of the driver."""
+    with coarse(tmp_path, rate=10.0) as made:
         yield made
 
 

@@ -1,15 +1,13 @@
-"""Kinds of faults: one entry says what breaks, how, when it begins and how long it lasts; and `faults.toml`."""
+"""Kinds of faults: one entry says what breaks, how, when it begins and how long it lasts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from drivers.sim.described import SimFileError, complaint, load_described
+from drivers.sim.described import complaint
 from drivers.sim.faults.phases import Phase
 
 ALWAYS = 1_000_000
@@ -149,26 +147,6 @@ class Fault(BaseModel):
     def matches(self, op: str) -> bool:
         """Whether the fault waits for `op`, a method's full name."""
         return self.on is None or op == self.on or op.endswith(f".{self.on}")
-
-
-class _Script(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    fault: list[Fault] = Field(default_factory=list[Fault], max_length=1000)
-
-
-def load_faults(path: Path) -> tuple[Fault, ...]:
-    """Read the script. Raises `SimFileError` naming file, field and range."""
-    return tuple(load_described(path, _Script).fault)
-
-
-def hang_script(path: Path, hang: Callable[[Fault], int], faults: Iterable[Fault]) -> None:
-    """Add all faults of a script. Raises `SimFileError` for a fault of a device that the rig does not have."""
-    for index, fault in enumerate(faults):
-        try:
-            hang(fault)
-        except ValueError as error:
-            raise SimFileError(path, f"fault.{index}", str(error)) from None
 
 
 def fault_of(values: dict[str, Any]) -> Fault:

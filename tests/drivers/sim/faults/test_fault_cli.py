@@ -1,4 +1,4 @@
-"""`brushloop sim --faults --control` and `brushloop fault`, as processes."""
+"""`brushloop sim --control` and `brushloop fault`, as processes."""
 
 from __future__ import annotations
 
@@ -23,10 +23,8 @@ def brushloop(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Path]:
-    script = tmp_path / "faults.toml"
-    script.write_text('[[fault]]\ndevice = "camera"\nkind = "black"\nafter_s = 1000\n')
     path = tmp_path / "control"
-    command = [sys.executable, "-m", "brushloop", "sim", "--faults", str(script), "--control", str(path)]
+    command = [sys.executable, "-m", "brushloop", "sim", "--control", str(path)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_until(path.exists, "the control socket", process=process)
     yield path
@@ -36,17 +34,14 @@ def served(tmp_path: Path) -> Iterator[Path]:
     assert not path.exists()
 
 
-def test_a_script_is_served_and_a_person_breaks_more_and_mends_it(served: Path):
-    [scripted] = ask(served, {"do": "list"})["hanging"]
-    assert scripted["fault"] == {"device": "camera", "kind": "black", "after_s": 1000.0}
-
+def test_a_person_breaks_the_rig_and_mends_it(served: Path):
     added = brushloop("fault", served, "robot", "mute", "--on", "moveLine", "--count", "3")
-    assert json.loads(added.stdout) == {"id": 2}, added.stderr
+    assert json.loads(added.stdout) == {"id": 1}, added.stderr
     refused = brushloop("fault", served, "robot", "loud")
     assert refused.returncode == 2
     assert refused.stderr.startswith("brushloop: kind = 'loud' is not one of robot's")
     assert refused.stderr.count("\n") == 1
-    assert json.loads(brushloop("fault", served, "clear").stdout) == {"taken": 2}
+    assert json.loads(brushloop("fault", served, "clear").stdout) == {"taken": 1}
 
 
 def test_the_words_of_a_command_line_become_a_request():
@@ -73,17 +68,3 @@ def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):
     with pytest.raises(FaultRefused, match="no rig answers here") as caught:
         ask(tmp_path / "nobody", {"do": "state"})
     assert caught.value.exit_code == 2
-
-
-@pytest.mark.parametrize(
-    ("script", "words"),
-    [('[[fault]]\ndevice = "robot"\nkind = "loud"\n', "fault.0: kind = 'loud'"), (None, "no such file")],
-)
-def test_a_script_that_cannot_be_used_starts_no_rig(tmp_path: Path, script: str | None, words: str):
-    path = tmp_path / "faults.toml"
-    if script is not None:
-        path.write_text(script)
-    ran = brushloop("sim", "--faults", path)
-    assert (ran.returncode, ran.stdout) == (2, "")
-    assert words in ran.stderr
-    assert ran.stderr.count("\n") == 1
