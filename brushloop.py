@@ -49,7 +49,7 @@ class OptionRefused(Exception):
 
 
 class NameRefused(Exception):
-    """A name on the command line is not text, so that no report or message could repeat it."""
+    """A name on the command line, or of the working folder, cannot be used."""
 
     exit_code = 2
 
@@ -254,9 +254,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for a terminal that cannot show every character
     try:
-        for word in sys.argv:
-            if any("\ud800" <= char <= "\udfff" for char in word):
-                raise NameRefused(f"{word}: is not UTF-8; give the file or folder another name")
+        _check_names()
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
             collect.cli.browse()
         else:
@@ -272,6 +270,17 @@ def main() -> None:
         if isinstance(error, OSError | OutputClosed):
             sys.stdout = None  # likewise, should it be the output that cannot be written
         sys.exit(code)
+
+
+def _check_names() -> None:
+    """Raise `NameRefused` where an argument or the working folder cannot be written into a report."""
+    try:
+        here = str(Path.cwd())
+    except OSError:
+        raise NameRefused("the working folder no longer exists") from None
+    for name in (*sys.argv, here):
+        if any("\ud800" <= char <= "\udfff" for char in name):
+            raise NameRefused(f"{name}: is not UTF-8; give the file or folder another name")
 
 
 def _told(error: Exception) -> tuple[int, str]:

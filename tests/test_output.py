@@ -69,6 +69,14 @@ def test_a_name_that_is_no_text_is_refused_in_one_line(tmp_path: Path, words: st
     assert ran.stderr == "brushloop: caf\\udce9: is not UTF-8; give the file or folder another name\n"
 
 
+def test_nothing_is_done_in_a_folder_whose_name_is_no_text(tmp_path: Path) -> None:
+    here = tmp_path / os.fsdecode(b"caf\xe9")
+    here.mkdir()
+    ran = brushloop("sessions", "list", ".", cwd=here)
+    assert ran.returncode == 2
+    assert ran.stderr == f"brushloop: {tmp_path}/caf\\udce9: is not UTF-8; give the file or folder another name\n"
+
+
 def test_names_that_are_no_text_may_lie_beside_a_session(folder: Path) -> None:
     odd = folder / os.fsdecode(b"caf\xe9")
     odd.mkdir()

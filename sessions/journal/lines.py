@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sessions.disk import read_bounded
-from sessions.errors import InputError, SessionDamaged
+from sessions.errors import InputError, SessionDamaged, SessionError
 from sessions.journal.codec import BadLine, Entry, Line, decode_line, digest, has_crc, lines_within
 from sessions.names import check_file
 
@@ -70,12 +70,13 @@ def read_lines(path: Path) -> Iterator[Line]:
 
 
 def read_journal(path: Path) -> bytes:
-    """Bytes of a journal. Raises `SessionDamaged` where it is too large, and `InputError` where it is a link."""
-    check_file(path)
+    """Bytes of a journal. Raises `SessionError`, `SessionDamaged` if it is too large, and `InputError` for a link."""
+    if check_file(path) and path.stat().st_size > MAX_JOURNAL_BYTES:
+        raise SessionDamaged(path, f"is larger than {MAX_JOURNAL_BYTES} bytes")
     try:
         return read_bounded(path, MAX_JOURNAL_BYTES)
     except InputError as error:
-        raise SessionDamaged(path, error.what) from None
+        raise SessionError(path, error.what) from None
 
 
 def read(data: bytes, session: str = "") -> Reading:

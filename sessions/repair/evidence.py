@@ -74,12 +74,18 @@ class Evidence:
 def gather(folder: Path) -> Evidence:
     """Read the journal and the files. Raises `SessionDamaged` if not even a header is left."""
     path = folder / JOURNAL_NAME
-    data = read_journal(path) if check_file(path) else None
+    too_large: list[Fault] = []
+    try:
+        data = read_journal(path) if check_file(path) else None
+    except SessionDamaged as error:
+        data, too_large = b"", [Fault(1, error.what)]
     journal = account(data or b"")
     session = _session(folder, journal.state)
     if session and session != _named_in(journal.state):
         journal = account(data or b"", session)
-    found = Evidence(folder, data, journal.lines, journal.faults, journal.reading.torn, journal.reading.unchained)
+    found = Evidence(
+        folder, data, journal.lines, too_large + journal.faults, journal.reading.torn, journal.reading.unchained
+    )
     found.session = session
     _lost_between(found, journal.twice)
     header = _from_files(found, journal.state.done)
