@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
@@ -19,6 +20,10 @@ MOST_GAP_S = 1.0
 """After a longer silence of camera or arm, the time of an event is unknown."""
 SLACK_S = 0.05
 """How far a busy computer may shift the times of single poses and frames."""
+LEAST_ALIKE, ALIKE_SHARE = 4, 0.75
+"""Fewer trips may agree by chance on a busy computer, and so may a smaller share of them."""
+EXACT_S = 0.015
+"""Half width of the 95 % interval that is good enough for a short delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +63,24 @@ class CameraDelay:
     def delay_s(self) -> float:
         """Mean time from an event to the arrival of the first frame that shows it, without trips in which something
         stalled: those are farther from the median than the periods of camera and arm explain."""
+        return float(self._alike_s.mean())
+
+    @property
+    def _alike_s(self) -> Floats:
+        """Delays of the trips that agree with the median."""
         delays_s = np.array([look.delay_s for look in self.looks])
         off_s = np.abs(delays_s - np.median(delays_s))
         typical_s = float(np.median([look.resolution_s for look in self.looks]))
-        near = off_s <= max(2.0 * typical_s, GOOD_S, float(off_s.min()))
-        return float(delays_s[near].mean())
+        return delays_s[off_s <= max(2.0 * typical_s, GOOD_S, float(off_s.min()))]
+
+    @property
+    def exact(self) -> bool:
+        """Whether most of the trips agree, and by their spread the mean is known to a tenth of its value (95 %)."""
+        alike_s = self._alike_s
+        if len(alike_s) < max(LEAST_ALIKE, ALIKE_SHARE * len(self.looks)):
+            return False
+        reach_s = float(stdtrit(len(alike_s) - 1, 0.975) * alike_s.std(ddof=1) / len(alike_s) ** 0.5)
+        return reach_s <= max(GOOD_SHARE * self.delay_s, EXACT_S)
 
     @property
     def spread_s(self) -> float:

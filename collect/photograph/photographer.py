@@ -22,9 +22,11 @@ from drivers.errors import DeviceError
 from drivers.protocols import Camera, Robot
 from drivers.samples import Frame
 
-FEWEST_LOOKS, MOST_LOOKS = 2, 6
+FEWEST_LOOKS, MOST_LOOKS, MOST_EXACT_LOOKS = 2, 6, 8
 ATTEMPTS = 4
 """Most attempts at the measurement; another follows after one that a stall or an old picture made useless."""
+MOST_UNSURE = 2
+"""Measurements whose trips do not agree, after which an exact delay is refused."""
 PATIENCE_S = 1.5
 """Waiting time beyond the longest allowed delay: distinguishes a camera that is late from one that shows nothing."""
 STAY_S = 0.15
@@ -119,12 +121,12 @@ class Photographer:
 
         Returns the delay, and the view without the arm.
         """
-        shown = False
+        shown, exact, unsure = False, self._config.exact_delay, list[CameraDelay]()
         for attempt in range(ATTEMPTS):
             # The first view may have been old: after a failed attempt, wait until every old frame has passed.
             view = await self._view_without_arm(still_s=self._patience_s if attempt else 0.0)
             looks: list[Look] = []
-            for number in range(MOST_LOOKS):
+            for number in range(MOST_EXACT_LOOKS if exact else MOST_LOOKS):
                 # Trips of different lengths cannot be confused with each other.
                 seen = await self._trip(view, stay_s=number * STAY_S)
                 if seen is None:
@@ -136,11 +138,19 @@ class Photographer:
                 elif attempt == 0:
                     looks.clear()  # these pictures may all show what the arm did before
                     break
-                if len(looks) >= FEWEST_LOOKS and CameraDelay(tuple(looks)).known:
+                if len(looks) >= FEWEST_LOOKS and self._enough(CameraDelay(tuple(looks))):
                     break
             if len(looks) >= FEWEST_LOOKS:
-                return self._accepted(CameraDelay(tuple(looks))), view
+                delay = CameraDelay(tuple(looks))
+                if delay.exact or not exact:
+                    return self._accepted(delay), view
+                unsure.append(delay)
+                if len(unsure) == MOST_UNSURE:
+                    raise self._uneven(f"{delay}, and these do not agree")
         raise self._uneven() if shown else self._not_shown()
+
+    def _enough(self, delay: CameraDelay) -> bool:
+        return delay.exact if self._config.exact_delay else delay.known
 
     def _accepted(self, delay: CameraDelay) -> CameraDelay:
         if 1e3 * delay.delay_s > self._config.max_delay_ms:

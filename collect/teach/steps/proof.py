@@ -157,7 +157,7 @@ class ProofStep(Step):
 
 
 def slowly(rig: RigConfig) -> RigConfig:
-    """The same rig, with no move faster than 50 mm/s."""
+    """The same rig, with no move faster than 50 mm/s, and a delay of the camera that is measured to a tenth."""
     motion, limits = rig.motion, rig.robot.limits
     slow = motion.model_copy(
         update={
@@ -166,7 +166,8 @@ def slowly(rig: RigConfig) -> RigConfig:
         }
     )
     capped = limits.model_copy(update={"speed_mm_s": min(limits.speed_mm_s, 50.0)})
-    return rig.model_copy(update={"motion": slow, "robot": rig.robot.model_copy(update={"limits": capped})})
+    robot, camera = rig.robot.model_copy(update={"limits": capped}), rig.camera.model_copy(update={"exact_delay": True})
+    return rig.model_copy(update={"motion": slow, "robot": robot, "camera": camera})
 
 
 @dataclass(frozen=True, slots=True)

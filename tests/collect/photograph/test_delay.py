@@ -87,3 +87,18 @@ def test_a_trip_in_which_the_computer_stalled_does_not_make_the_camera_later() -
     assert delay.spread_s == pytest.approx(0.25), "it still counts as unsteady"
     assert delay.bound_s == pytest.approx(0.68), "and a photograph waits for the longest"
     assert CameraDelay((Look(0.40, 0.03), Look(0.65, 0.03))).delay_s == pytest.approx(0.525), "either may have stalled"
+
+
+@pytest.mark.parametrize(
+    ("delays_s", "exact"),
+    [
+        ((0.53, 0.54, 0.53, 0.53), True),
+        ((0.53, 0.54, 0.79, 0.53, 0.53), True),
+        ((0.66, 0.67), False),
+        ((0.43, 0.42, 0.44), False),
+        ((0.54, 0.56, 1.07, 0.55, 0.97, 0.55), False),
+        ((0.30, 0.38, 0.34, 0.27), False),
+    ],
+)
+def test_a_delay_is_exact_if_most_of_four_or_more_trips_agree(delays_s: tuple[float, ...], exact: bool) -> None:
+    assert CameraDelay(tuple(Look(delay_s, 0.03) for delay_s in delays_s)).exact is exact

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from collect.errors import ArmInPicture, CameraLate
@@ -136,3 +137,33 @@ async def test_a_delay_that_was_measured_wrongly_is_measured_again():
     await photographer.photograph()
     assert photographer.delay is not None
     assert photographer.delay.delay_s == pytest.approx(0.4, abs=PERIOD_S)
+
+
+def stalling(seed: int, share: float) -> Callable[[float], float]:
+    """A delay of 0.3 s, which stalls of a busy computer prolong for a while, by 0.2 s on average."""
+    rng = np.random.default_rng(seed)
+    extra_s = rng.exponential(0.2, 4000) * (rng.random(4000) < share)
+    return lambda t_s: 0.3 + float(extra_s[int(t_s / 0.5)])
+
+
+async def test_beside_a_busy_computer_an_exact_delay_is_right_or_refused():
+    found: list[float] = []
+    for seed in range(6):
+        photographer = Theatre(stalling(seed, 0.6)).photographer(
+            max_jitter_ms=2000, max_delay_ms=3000, exact_delay=True
+        )
+        try:
+            await photographer.photograph()
+        except CameraLate:
+            continue
+        assert photographer.delay is not None
+        found.append(photographer.delay.delay_s)
+    assert all(abs(delay_s - 0.3) <= 0.2 * 0.3 for delay_s in found), found
+    assert len(found) < 6
+
+
+async def test_a_few_stalls_do_not_keep_an_exact_delay_from_being_measured():
+    photographer = Theatre(stalling(3, 0.1)).photographer(max_jitter_ms=2000, max_delay_ms=3000, exact_delay=True)
+    await photographer.photograph()
+    assert photographer.delay is not None
+    assert photographer.delay.delay_s == pytest.approx(0.3, rel=0.1)
