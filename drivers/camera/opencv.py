@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 REOPEN_AFTER_S = 0.5
 LASTING_NS = 1_000_000_000
 JOIN_S = 5.0
+QUIET_NS = 30_000_000_000
+"""Time without a faulty frame after which faulty frames are worth another notice."""
 
 
 class OpenCvCamera:
@@ -157,7 +159,7 @@ class _Grabber:
             live=source.live,
             independent=source.independent,
         )
-        first, valid_ns = True, opening_ns
+        first, valid_ns, faulty_ns = True, opening_ns, opening_ns - QUIET_NS
         while not self._closing.is_set():
             image = source.read()
             arrival_ns = self._clock.now_ns()
@@ -169,6 +171,7 @@ class _Grabber:
             if fault is not None:
                 # Single faulty frames happen; one second without a valid frame is reported.
                 self._report(health.describe(fault), aloud=arrival_ns - valid_ns > LASTING_NS)
+                faulty_ns = arrival_ns
                 continue
             valid_ns = arrival_ns
             if health.repeated:
@@ -179,7 +182,7 @@ class _Grabber:
             with self._condition:
                 seq = self._newest.stamp.seq + 1 if self._newest is not None else 0
                 self._newest = Frame(Stamp(arrival_ns, None, seq), exposed_ns, image)
-                self._trouble, self._reported = "", False
+                self._trouble, self._reported = "", self._reported and arrival_ns - faulty_ns < QUIET_NS
                 self._condition.notify_all()
 
     def _report(self, text: str, *, aloud: bool = True) -> None:

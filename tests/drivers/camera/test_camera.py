@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from drivers.sim.camera.scene import Scene, read_strip
 from drivers.sim.config import SimConfig, View
 from drivers.sim.rig import HOST
 from drivers.sim.world import World
+from tests.waiting import PATIENCE_S
 
 CLOCK = HostClock()
 
@@ -112,6 +114,43 @@ async def test_a_stream_that_ends_is_opened_again_and_both_are_reported(small_vi
     assert notices[1].startswith("camera is back after")
     await camera.close()
     await second.stop()
+
+
+class Stuttering:
+    """A source that is dark for two seconds, then shows one frame, ten times; then shows frames for a minute, and is
+    dark again. A frame comes every tenth of a second of its own clock."""
+
+    live, independent, simulated = True, False, True
+    settings: ClassVar[dict[str, float]] = {}
+
+    def __init__(self) -> None:
+        self.t_ns, self.over = 0, threading.Event()
+        self._dark = iter(([False] + [True] * 20) * 10 + [False] * 600 + [True] * 20)
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+    def read(self) -> Any:
+        dark = next(self._dark, None)
+        if dark is None:
+            self.over.set()
+            time.sleep(0.01)
+        self.t_ns += 100_000_000
+        noise = np.random.default_rng(self.t_ns).integers(100, 200, (48, 64), np.uint8)
+        return np.zeros_like(noise) if dark else noise
+
+    def release(self) -> None:
+        pass
+
+
+async def test_frames_that_are_skipped_again_and_again_are_reported_once(monkeypatch: pytest.MonkeyPatch):
+    source, notices = Stuttering(), list[str]()
+    monkeypatch.setattr(opencv, "open_source", lambda _options: source)
+    camera = OpenCvCamera(CameraOptions("scripted"), source, notices.append)
+    await camera.connect()
+    await asyncio.to_thread(source.over.wait, PATIENCE_S)
+    await camera.close()
+    assert len(notices) == 2, notices
 
 
 async def test_a_stream_that_stays_away_is_a_timeout_that_says_so(stream: MjpegServer):
