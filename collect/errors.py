@@ -31,6 +31,8 @@ from drivers.errors import (
     SettingsChanged,
 )
 
+NOT_AT_REST = "The arm was not seen at rest: it may still be moving. If it moves, press the red button."
+
 
 class ConfigError(Exception):
     """A configuration cannot be used; nothing was powered and nothing moved."""

@@ -1,4 +1,4 @@
-"""Collection without a screen: a progress bar with an ETA, and signals that stop the arm."""
+"""Collection without a screen: a progress bar with an ETA, and signals that end the run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 from typing import Protocol
 
@@ -36,18 +37,23 @@ class RunnableEngine(EngineView, Protocol):
 
 
 def run_headless(engine: RunnableEngine) -> None:
-    """Run to the end; raise the error that ended the run. If the screen goes away, the arm is stopped."""
-    with stop_signals(lambda _number: engine.stop()):
+    """Run to the end; raise the error that ended the run. If the output goes away, the step ends and the arm parks."""
+    with stop_signals(partial(obey, engine)):
         engine.start()
         try:
             # The terminal or pipe may be gone; rich turns a broken pipe into a SystemExit.
             with contextlib.suppress(OSError, SystemExit):
                 _show(engine)
         finally:
-            # Nobody is watching now.
             if not engine.finished:
-                engine.stop()
+                engine.park()
             engine.join()
+
+
+def obey(engine: EngineView, number: int) -> None:
+    """On SIGHUP finish the step, lift and park: nobody is there to lift a brush that was stopped on the paper. On any
+    other signal stop at once, also while the arm is being parked."""
+    (engine.park if number == signal.SIGHUP else engine.stop)()
 
 
 def _show(engine: RunnableEngine) -> None:

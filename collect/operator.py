@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -32,7 +35,7 @@ class Prompt:
     question: str
     choices: tuple[Choice, ...]
     default: str
-    """Key of the answer that moves nothing; an empty line stands for it in the first day."""
+    """Key of the answer that moves nothing: it holds if nobody can answer, and for an empty line in the first day."""
     image: NDArray[np.uint8] | None = field(default=None, compare=False)
     """Gray picture of what the question is about."""
     number: int = 0
@@ -42,7 +45,13 @@ class Prompt:
 class Asker:
     """Passes one question at a time from the engine's event loop to a screen, and the answer back."""
 
-    def __init__(self, *, watched: bool) -> None:
+    def __init__(
+        self, *, watched: bool, waiting: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
+    ) -> None:
+        """`waiting` is entered while a question waits for its answer."""
+        self.attended = watched
+        """Whether the run was begun with somebody who watches; the screen may be gone since."""
+        self._waiting = waiting
         self._watched = watched
         self._lock = threading.Lock()
         self._count = 0
@@ -71,16 +80,24 @@ class Asker:
         """Return the key of the answer. Raises `NeedsOperator` if nobody can answer."""
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[str] = loop.create_future()
-        with self._lock:
-            if not self._watched:
-                raise NeedsOperator(prompt.question)
-            self._count += 1
-            self._open = (replace(prompt, number=self._count), loop, answered)
-        try:
-            return await answered
-        finally:
+        with self._waiting():
             with self._lock:
-                self._open = None
+                if not self._watched:
+                    raise NeedsOperator(prompt.question)
+                self._count += 1
+                self._open = (replace(prompt, number=self._count), loop, answered)
+            try:
+                return await answered
+            finally:
+                with self._lock:
+                    self._open = None
+
+    async def ask_or_default(self, prompt: Prompt) -> str:
+        """Return the key of the answer, or that of the default if nobody can answer."""
+        try:
+            return await self.ask(prompt)
+        except NeedsOperator:
+            return prompt.default
 
     def answer(self, number: int, key: str) -> bool:
         """Answer question `number`; False if it is closed or has no such choice. From any thread."""

@@ -6,6 +6,7 @@ import contextlib
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -13,7 +14,7 @@ from collect.chains.commands import ending
 from collect.engine.dry_run import DryRunEngine
 from collect.engine.engine import Engine
 from collect.engine.live import LiveView
-from collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store, resuming
+from collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store
 from collect.headless import RunnableEngine, run_headless
 from collect.planning.limit_check import check_protocol
 from drivers.clock import HostClock
@@ -52,6 +53,7 @@ def engine_for(
         opening.protocol,
         lambda rig: open_store(opening, resume, rig, clock),
         clock,
+        resumes=resume,
         watched=watched,
         armed=opening.armed,
         live=live,
@@ -71,7 +73,7 @@ def start(
     engine = engine_for(opening, watched=on_screen, **settings)
 
     def again(session_id: str) -> Engine:
-        return engine_for(resuming(opening, session_id), watched=True, **settings)
+        return engine_for(replace(opening, new=False, resume=session_id), watched=True, **settings)
 
     with contextlib.ExitStack() as stack:
         if live is not None:

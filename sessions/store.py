@@ -155,6 +155,10 @@ class SessionStore:
         self.state.sheet += 1
         self._log({"event": "sheet", "sheet": self.state.sheet})
 
+    def ended(self, why: str) -> None:
+        """Journal how a run ended before its time: whoever resumes the session is told so."""
+        self._log({"event": "ended", "why": why})
+
     def verify(self) -> None:
         """Raise `SessionDamaged` naming the first finished step whose file is missing or has changed."""
         try:

@@ -24,7 +24,7 @@ class State(StrEnum):
 
 
 TRANSITIONS: dict[State, frozenset[State]] = {
-    State.IDLE: frozenset({State.RECOVERING, State.STOPPING, State.FAILED}),
+    State.IDLE: frozenset({State.RECOVERING, State.ASKING, State.STOPPING, State.FAILED}),
     State.RECOVERING: frozenset({State.RUNNING, State.PAUSING, State.ASKING, State.STOPPING, State.FAILED}),
     State.RUNNING: frozenset({State.PAUSING, State.RECOVERING, State.ASKING, State.STOPPING, State.DONE, State.FAILED}),
     State.PAUSING: frozenset(

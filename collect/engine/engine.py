@@ -12,20 +12,22 @@ import concurrent.futures
 import contextlib
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 from collect.engine.control import FINAL, RunControl, State
 from collect.engine.live import LiveView, watching
 from collect.engine.perform import Performer
+from collect.engine.policy import resume_question
 from collect.engine.progress import Progress
 from collect.engine.run import Run
 from collect.engine.set_up import board_first, listed
 from collect.engine.snapshot import SetUpStep, Snapshot
 from collect.engine.steps.context import RunContext, uninterrupted
 from collect.engine.telemetry import Telemetry, noting_targets, previewing
-from collect.errors import CollectAborted, ConfigError, Parked, brush_may_be_down, describe, rest_is_unknown
+from collect.errors import NOT_AT_REST, CollectAborted, ConfigError, brush_may_be_down, describe, rest_is_unknown
 from collect.motion.procedures import Procedures
 from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from collect.planning.walk import layout_of, sheet_of, steps_on
@@ -34,6 +36,8 @@ from collect.rig.config import RigConfig
 from collect.rig.devices import Rig, connected
 from drivers.clock import Clock
 from drivers.errors import DeviceError, NotConnected, Stale
+from sessions.errors import SessionError
+from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.store import SessionStore
 
 PARKED_MM = 2.0
@@ -65,23 +69,27 @@ class Engine:
         open_store: OpenStore,
         clock: Clock,
         *,
+        resumes: Path | None = None,
         watched: bool = False,
         armed: bool = False,
         live: LiveView | None = None,
         guided: bool = False,
         preview: bool = False,
     ) -> None:
-        """`watched`: a screen can answer questions. `armed`: the operator allows real hardware to move. `live` was
-        already started. `guided`: a person accepts each set-up step. `preview`: snapshots hold a camera picture."""
+        """`resumes`: folder of the session that `open_store` opens; None for a new one. `watched`: a screen can answer
+        questions. `armed`: the operator allows real hardware to move. `live` was already started. `guided`: a person
+        accepts each set-up step. `preview`: snapshots hold a camera picture."""
         self._rig_config = rig
         self._protocol_config = protocol
         self._open_store = open_store
-        self._progress = Progress(protocol, clock, layout_of(rig, protocol))
+        self._resumes = resumes
+        self._progress = Progress(protocol, clock, layout_of(rig, protocol), resumes)
         self._clock = clock
-        self._asker = Asker(watched=watched)
+        self._asker = Asker(watched=watched, waiting=self._waiting)
         self._armed = armed
         self._live = live
         self._guided = guided
+        self._self_checked = bool(rig.self_check.enabled and protocol.planned())
         self._preview = preview
         self._telemetry = Telemetry()
         self._requests = OperatorRequests()
@@ -89,6 +97,7 @@ class Engine:
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
         self._rig: Rig | None = None
+        self._store: SessionStore | None = None
         self._stop_failure: DeviceError | None = None
         self._rest_unknown = False
         self._thread = threading.Thread(target=self._run_thread, name="engine", daemon=True)
@@ -145,9 +154,9 @@ class Engine:
         return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
 
     def _set_up(self) -> tuple[SetUpStep, ...]:
-        if not self._guided or self._progress.strokes_begun:
+        if not self._guided or self._progress.set_up_over:
             return ()
-        return listed(self._rig_config, self._progress.found, self._progress.set_up)
+        return listed(self._rig_config, self._progress.found, self._progress.set_up, checked=self._self_checked)
 
     def request(self, request: OperatorRequest) -> None:
         """Make or withdraw a request; requests are carried out between steps. From any thread."""
@@ -205,7 +214,7 @@ class Engine:
             await self._task
         except asyncio.CancelledError:
             await self._stopped()
-        except Parked as error:
+        except CollectAborted as error:
             self._end(State.STOPPED, error)
             raise
         except Exception as error:
@@ -216,6 +225,8 @@ class Engine:
             if self._stopper is not None:
                 await self._stopper
             self._control.left()
+            if self._store is not None:
+                self._store.release()
 
     async def _stopped(self) -> None:
         if self._stopper is not None:
@@ -234,8 +245,8 @@ class Engine:
         async with connected(self._rig_config, self._clock, self._progress.log) as rig:
             rig = replace(rig, robot=noting_targets(rig.robot, self._telemetry))
             self._rig = rig
-            await self._arm(rig)
-            store = self._open_store(rig)
+            await self._permitted(rig)
+            store = self._store = self._open_store(rig)
             try:
                 self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
                 if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
@@ -252,24 +263,39 @@ class Engine:
             finally:
                 with contextlib.suppress(DeviceError):
                     self._see_tip(rig)
-                store.release()
         self._control.end(State.DONE)
 
-    async def _arm(self, rig: Rig) -> None:
-        """Ask whether real hardware may move, unless the command line allows it. Nothing has been powered or moved yet.
+    async def _permitted(self, rig: Rig) -> None:
+        """Ask whether a session may be resumed, however it was asked for, and whether real hardware may move, unless
+        the command line allows it. Nothing has been opened, powered or moved yet.
 
         Raises `ConfigError` if nobody can answer, `CollectAborted` if the answer is no.
         """
-        if self._armed or rig.robot_identity.simulated:
-            return
-        robot = rig.config.robot
+        robot, real = rig.config.robot, not rig.robot_identity.simulated
         hardware = f"{rig.robot_identity.model} at {robot.host}:{robot.port} is real hardware"
-        if not self._asker.watched:
+        if self._resumes is not None and self._asker.attended:
+            ended = replay(self._resumes / JOURNAL_NAME).ended
+            prompt = resume_question(self._resumes.name, ended, f"{hardware}. " if real else "")
+        elif self._armed or not real:
+            return
+        elif self._asker.attended:
+            prompt = Prompt(f"{hardware}. May it move?", (ARM, LEAVE), LEAVE.key)
+        else:
             raise ConfigError(
                 "rig.toml", "robot", f"{hardware}: look at the cell, keep a hand at the emergency stop, then add --arm"
             )
-        if await self._asker.ask(Prompt(f"{hardware}. May it move?", (ARM, LEAVE), LEAVE.key)) != ARM.key:
-            raise CollectAborted("not armed; nothing was powered and nothing moved")
+        if await self._asker.ask_or_default(prompt) == prompt.default:
+            raise CollectAborted("it was not confirmed that the arm may move; nothing was powered and nothing moved")
+
+    @contextlib.contextmanager
+    def _waiting(self) -> Generator[None]:
+        """While a question waits, the run is asking."""
+        self._control.move_to(State.ASKING)
+        try:
+            with self._progress.meanwhile("wait for an answer"):
+                yield
+        finally:
+            self._control.go_on()
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
         context = RunContext(
@@ -286,10 +312,16 @@ class Engine:
         steps = steps_on(self._rig_config, self._protocol_config)
         await run.protocol(board_first(steps) if self._guided else steps)
 
-    def _end(self, state: State, error: BaseException) -> None:
-        """End the run with `error`, whose message says so if the brush may be down."""
+    def _end(self, state: State, error: Exception) -> None:
+        """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it
+        for the person who resumes."""
         tip_mm, config = self._telemetry.tip_mm, self._rig_config
+        if self._rest_unknown:
+            error.add_note(NOT_AT_REST)
         if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):
             error.add_note(brush_may_be_down(tip_mm[2] - config.paper.touch_z_mm))
         self._control.end(state)
         self._progress.ended(describe(error))
+        if self._store is not None:
+            with contextlib.suppress(SessionError):
+                self._store.ended(describe(error))

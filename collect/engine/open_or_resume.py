@@ -30,9 +30,9 @@ from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.recording.schemas import Header, Source
 from sessions.store import SessionStore, Snapshots
 
-RIG_EFFECTIVE = "rig.effective.json"
-COMPARED = (RIG_EFFECTIVE, "protocol.effective.json")
-FILES = {"rig.effective.json": "rig.toml", "protocol.effective.json": "protocol.toml"}
+RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
+COMPARED = (RIG_EFFECTIVE, PROTOCOL_EFFECTIVE)
+FILES = {RIG_EFFECTIVE: "rig.toml", PROTOCOL_EFFECTIVE: "protocol.toml"}
 """Name by which the user knows each compared file. Its values are compared, environment and side files included."""
 OPTIONS = {"rig.toml": "--config", "protocol.toml": "--protocol"}
 MOST_SHOWN = 5
@@ -65,6 +65,8 @@ class Opening:
     """The operator has looked at the robot cell: real hardware may move."""
     self_check_left_out: bool = False
     """rig.toml does not say whether there is a self-check: `armed` decides, but an open session keeps its setting."""
+    resume: str | None = None
+    """Id of the session to resume, and no other."""
 
     @classmethod
     def load(
@@ -89,7 +91,7 @@ class Opening:
             # The effective values: a touch height from the environment is part of the record.
             RIG_EFFECTIVE: _effective(rig),
             # Includes the rows of the tables that the protocol names.
-            "protocol.effective.json": protocol.model_dump_json(indent=2) + "\n",
+            PROTOCOL_EFFECTIVE: protocol.model_dump_json(indent=2) + "\n",
         }
         return cls(root, rig_path, protocol_path, rig, protocol, snapshots, new, sheet, armed, left_out)
 
@@ -117,7 +119,11 @@ def find_resumable(opening: Opening) -> Path | None:
     if not opening.root.is_dir():
         return None
     refusals: list[ConfigError] = []
-    for folder in reversed(open_sessions(opening.root)) if not opening.new else ():
+    if opening.resume is not None:
+        folders = [opening.root / opening.resume]
+    else:
+        folders = [] if opening.new else open_sessions(opening.root)
+    for folder in reversed(folders):
         found = differences(folder, {name: opening.as_begun(folder).snapshots[name] for name in COMPARED})
         if not found:
             return folder
@@ -149,19 +155,6 @@ def check_fresh_sheet(root: Path, sheet: int | None) -> None:
         )
     if sheet not in (None, 1):
         raise ConfigError("--sheet", "", f"{sheet}: a new session begins with sheet 1")
-
-
-def resuming(opening: Opening, session_id: str) -> Opening:
-    """Return `opening` if it resumes that open session.
-
-    Raises `ConfigError` if these files begin or resume another session.
-    """
-    opening = replace(opening, new=False)
-    found = find_resumable(opening)
-    if found is None or found.name != session_id:
-        instead = "no open session" if found is None else f"session {found.name}, which is open as well"
-        raise ConfigError(opening.rig_path, "", f"goes on with {instead}, not with {session_id}")
-    return opening
 
 
 def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], texts: dict[str, str]) -> ConfigError:

@@ -7,10 +7,11 @@ import threading
 from collections import Counter, deque
 from collections.abc import Generator
 from dataclasses import replace
+from pathlib import Path
 
 from collect.engine.control import State
 from collect.engine.last_capture import LastCapture
-from collect.engine.snapshot import SET_UP, CellCount, Snapshot
+from collect.engine.snapshot import CellCount, Snapshot, in_set_up
 from collect.engine.tally import Place, Tally
 from collect.operator import Prompt
 from collect.protocols.config import ProtocolConfig
@@ -26,8 +27,10 @@ LOG_LINES = 200
 class Progress:
     """Progress of one run; written by the engine's thread, read from any."""
 
-    def __init__(self, protocol: ProtocolConfig, clock: Clock, layout: Layout | None = None) -> None:
-        """`layout` is that of the sheet; it determines the order of the strokes."""
+    def __init__(
+        self, protocol: ProtocolConfig, clock: Clock, layout: Layout | None = None, resumes: Path | None = None
+    ) -> None:
+        """`layout` is that of the sheet; it determines the order of the strokes. `resumes` is the session's folder."""
         self._clock = clock
         self._lock = threading.Lock()
         self._plan = protocol.planned(layout)
@@ -39,9 +42,9 @@ class Progress:
         self._first_stroke_ns: int | None = None
         self._last_stroke_ns: int | None = None
         self._over_ns: int | None = None
-        self._session_id = ""
+        self._session_id = "" if resumes is None else resumes.name
         self._source = ""
-        self._folder = ""
+        self._folder = "" if resumes is None else str(resumes)
         self._sheet = 0
         self._step = ""
         self._index: int | None = None
@@ -52,9 +55,11 @@ class Progress:
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
         self._last: LastCapture | None = None
         self.found: dict[StepKind, Result] = {}
-        """Results of the set-up steps of this process; the board's may be from an earlier process."""
+        """Results of the set-up steps of this process."""
         self.set_up: StepKind | None = None
         """Set-up step in progress."""
+        self.set_up_over = False
+        """Whether this process has begun a step after the set-up."""
 
     def opened(self, store: SessionStore, sheet: Sheet) -> None:
         """Begin with what a new or resumed session holds. `sheet` is how the paper is divided into cells."""
@@ -67,16 +72,9 @@ class Progress:
             self._tally.opened(store.state, sheet.columns, sheet.rows)
             for line in store.state.segments:
                 self._count(line["kind"], line["result"])
-                if line["kind"] == StepKind.BOARD:
-                    self.found[StepKind.BOARD] = line["result"]
             self._done_at_start = self._tally.done.total()
         verb = f"resumed with {self._done_at_start} strokes" if self._done_at_start else "session"
         self.log(f"{verb}: {store.folder}")
-
-    @property
-    def strokes_begun(self) -> bool:
-        """Whether this process has begun a stroke."""
-        return self._index is not None
 
     def doing(self, what: str) -> None:
         """Say what the run is doing, in words."""
@@ -95,7 +93,8 @@ class Progress:
         """Note that a step begins; `place` is the sheet and cell that it marks."""
         with self._lock:
             self._tally.begun(step, place)
-            if step.kind in SET_UP:
+            self.set_up_over = self.set_up_over or not in_set_up(step)
+            if in_set_up(step):
                 self.set_up = step.kind
             elif step.kind in (StepKind.DIP, StepKind.CAPTURE) or step.kind in MARKING:
                 self._index = step.index
@@ -105,7 +104,7 @@ class Progress:
         with self._lock:
             self._count(step.kind, result)
             self.set_up = None
-            if step.kind in SET_UP:
+            if in_set_up(step):
                 self.found[step.kind] = result
             elif step.kind is StepKind.CAPTURE:
                 self._last_stroke_ns = self._clock.now_ns()
@@ -222,7 +221,7 @@ class Progress:
                 messages=tuple(self._messages),
                 error=self._error,
                 messages_before=self._logged - len(self._messages),
-                sheet=tally.sheet(self._sheet) if self._folder else None,
+                sheet=tally.sheet(self._sheet) if self._source else None,
                 last=self._last,
                 stroke="" if current is None else current.stroke_id,
                 folder=self._folder,
@@ -243,8 +242,8 @@ class Progress:
         return None if stroke is None or stroke.stroke_id in self._tally.over else stroke
 
     def _eta_s(self) -> float | None:
-        done = self._tally.done.total()
-        left, timed = len(self._plan) - done, done - self._done_at_start - 1
+        left = sum(p.stroke_id not in self._tally.over for p in self._plan)
+        timed = self._tally.done.total() - self._done_at_start - 1
         if self._first_stroke_ns is None or self._last_stroke_ns is None or timed < 1:
             return 0.0 if left == 0 else None
         per_stroke_s = (self._last_stroke_ns - self._first_stroke_ns) / 1e9 / timed

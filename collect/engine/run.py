@@ -12,10 +12,10 @@ from collect.engine.perform import Performer
 from collect.engine.policy import GO_ON, STOP, Action, decide, question
 from collect.engine.set_up import again
 from collect.engine.set_up import question as set_up_question
-from collect.engine.snapshot import SET_UP
+from collect.engine.snapshot import in_set_up
 from collect.engine.steps.context import RunContext
 from collect.engine.steps.retake import marked_bad
-from collect.errors import Parked, SheetFull, StepError, arm_at_fault, describe
+from collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
 from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.plan import takes
 from collect.protocols.steps import Protocol, Result, Step, StepKind
@@ -75,24 +75,25 @@ class Run:
     async def _result(self, step: Step) -> Result:
         """Return the result of a step: from the journal if it is done, else by doing it until it succeeds."""
         known = self.context.store.state.done.get(step.key)
-        if known is not None and not step.run_scoped:
+        if known is not None and (not step.run_scoped or step.key in self.context.memory.done):
             return known["result"]
-        failures = 0
+        failures, asked = 0, self.guided and in_set_up(step)
         while True:
             await self._between(step)
             try:
                 result = await self.performer.perform(step)
-                if not self.guided or step.kind not in SET_UP:
-                    return result
-                answer = await self._ask_about(step, result)
+                answer = await self._ask_about(step, result) if asked else GO_ON
                 if answer == GO_ON:
+                    self.context.memory.done.add(step.key)
                     return result
                 self.context.forget_camera()
                 step = again(step, answer)
             except (StepError, DeviceError) as error:
+                if isinstance(error, NeedsOperator) and self.control.park_wanted:
+                    await self._park()  # a question of this step was left open
                 failures += 1
                 action = decide(step, error, failures)
-                if self.guided and step.kind in SET_UP and self.context.asker.watched:
+                if asked and self.context.asker.watched:
                     action = Action.ASK  # the person at the set-up can remove the cause
                 self.context.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
                 if action is Action.ABORT or (action is Action.ASK and not self.context.asker.watched):
@@ -113,13 +114,13 @@ class Run:
         if self.control.park_wanted:
             await self._park()
         await self.control.pause_point()
-        if self.control.park_wanted:
-            await self._park()
         await self._back_in_control()
         if step.kind is StepKind.DIP and self.context.requests.take(OperatorRequest.NEW_SHEET):
             await self._new_sheet()
         if step.kind is StepKind.DIP and self.context.requests.take(OperatorRequest.JOG):
             await self._touch_again(step)
+        if self.control.park_wanted:
+            await self._park()
 
     async def _back_in_control(self) -> None:
         """Retreat along the tool axis if the arm is not where it was left: somebody may have moved it during a pause
@@ -145,7 +146,7 @@ class Run:
         text = f"Put a new sheet in for sheet {sheet + 1}, then go on."
         choices = (Choice(GO_ON, f"sheet {sheet + 2} is in, and blank"), KEEP_SHEET)
         await self._once_arm_is_free(self._recover)
-        if await self._answer(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
+        if await self.context.asker.ask_or_default(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
             self.context.fresh_sheet()
         await self._once_arm_is_free(self._recover)
 
@@ -166,8 +167,7 @@ class Run:
 
     async def _ask_about(self, step: Step, result: Result) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
-        answer = await self._answer(set_up_question(step.kind, result, self.context.rig.config))
-        self.control.go_on()
+        answer = await self.context.asker.ask_or_default(set_up_question(step.kind, result, self.context.rig.config))
         if answer == STOP.key:
             await self._park()
         return answer
@@ -180,7 +180,7 @@ class Run:
                 await self._recover()  # a person is about to reach under the arm
                 in_order = True
         asked = question(error, self.context.store.state.sheet)
-        answer = await self._answer(asked)
+        answer = await self.context.asker.ask_or_default(asked)
         meant = next(choice.label for choice in asked.choices if choice.key == answer)
         self.context.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
@@ -191,11 +191,6 @@ class Run:
         if isinstance(error, SheetFull):
             self.context.fresh_sheet()
         return answer
-
-    async def _answer(self, prompt: Prompt) -> str:
-        self.control.move_to(State.ASKING)
-        self.context.progress.doing("wait for an answer")
-        return await self.context.asker.ask(prompt)
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
         """Lift the brush off the paper after `error`, unless the arm is at fault."""

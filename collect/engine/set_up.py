@@ -29,9 +29,12 @@ def facts_of(kind: StepKind, result: Result, config: RigConfig) -> tuple[Fact, .
             return ()
 
 
-def listed(config: RigConfig, found: dict[StepKind, Result], now: StepKind | None) -> tuple[SetUpStep, ...]:
-    """Every set-up step of this rig, with what was measured so far; `now` is in progress."""
-    kinds = SET_UP if config.self_check.enabled else SET_UP[:-1]
+def listed(
+    config: RigConfig, found: dict[StepKind, Result], now: StepKind | None, *, checked: bool
+) -> tuple[SetUpStep, ...]:
+    """Every set-up step of this run, with what was measured so far; `now` is in progress. `checked`: it has a
+    self-check."""
+    kinds = SET_UP if checked else SET_UP[:-1]
     return tuple(_listed(kind, found.get(kind), config, now is kind) for kind in kinds)
 
 
@@ -53,7 +56,7 @@ def again(step: Step, answer: str) -> Step:
 
 def board_first(protocol: Protocol) -> Protocol:
     """Yield a board step, then the same steps, so that the board is seen before the brush comes down. Both board steps
-    have the same key, so the later one is then already done."""
+    have the same key, so the later one is then done already."""
     yield Step(StepKind.BOARD, 0)
     yield from protocol
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
-from collect.protocols.steps import StepKind
+from collect.protocols.steps import Step, StepKind
 
 if TYPE_CHECKING:
     import numpy as np
@@ -79,6 +79,13 @@ class Picture:
 
 SET_UP = (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK)
 """Steps of the set-up, in their order."""
+
+
+def in_set_up(step: Step) -> bool:
+    """Whether this is a step of the set-up: the board is also looked at between strokes, and the paper found again."""
+    return step.kind in SET_UP and step.index == 0
+
+
 TITLES = {
     StepKind.BOARD: "Camera, board, scale",
     StepKind.ZERO_TOUCH: "Zero touch and plane",

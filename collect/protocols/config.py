@@ -23,6 +23,7 @@ from collect.rig.config_file import read_text, read_toml, refusal
 from sessions.cells import as_text
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
+MAX_EFFECTIVE_BYTES = 64 * 1024 * 1024
 ProtocolConfig = GridConfig | FewStrokesConfig | ListConfig | ReplayConfig | WriteConfig | CalibrationConfig
 TaggedProtocol = Annotated[ProtocolConfig, Field(discriminator="kind")]
 _PROTOCOL: TypeAdapter[ProtocolConfig] = TypeAdapter(TaggedProtocol)
@@ -32,7 +33,12 @@ _KINDS: dict[str, type[ProtocolBase]] = {
 
 
 def load_protocol(path: Path) -> ProtocolConfig:
-    """Read `protocol.toml` with its side files. Raises `ConfigError`."""
+    """Read `protocol.toml` with its side files, or the `.json` that a session keeps. Raises `ConfigError`."""
+    if path.suffix == ".json":
+        try:
+            return _PROTOCOL.validate_json(read_text(path, MAX_EFFECTIVE_BYTES))
+        except ValidationError as error:
+            raise refusal(path, error, TaggedProtocol, tagged=True) from None
     values = read_toml(path, MAX_PROTOCOL_BYTES)
     for name in ("presses", "points", "ignored_columns"):
         if name in values and "file" in values:

@@ -36,8 +36,8 @@ class StepKind(StrEnum):
 
 MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
 """Steps that leave ink on a paper cell of their own."""
-RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH})
-"""Steps that are done again in every process, because their results are lost when it ends."""
+RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH, StepKind.BOARD})
+"""Steps whose first one every process does again: it finds the paper, and sees whether camera or board moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Step:
     @property
     def run_scoped(self) -> bool:
         """Whether every process must do the step again, even if a stored result exists."""
-        return self.kind in RUN_SCOPED
+        return self.kind in RUN_SCOPED and self.index == 0
 
 
 Protocol = Generator[Step, Result, None]

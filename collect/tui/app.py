@@ -14,12 +14,12 @@ from textual import work
 
 from collect.engine.control import FINAL, State
 from collect.engine.snapshot import Snapshot
-from collect.errors import ConfigError
+from collect.errors import NOT_AT_REST, ConfigError
 from collect.headless import REFRESH_S, RunnableEngine
 from collect.operator import OperatorRequest
 from collect.tui.browser import SessionBrowser
 from collect.tui.pictures import Pictures
-from collect.tui.question_screens import AT_WORK, NOT_AT_REST, NOT_PARKED, RESUME, RESUME_UNSEEN, AskScreen, Confirm
+from collect.tui.question_screens import AT_WORK, NOT_PARKED, UNSEEN, AskScreen, Confirm
 from collect.tui.run_app import RunApp
 from collect.tui.run_screen import RunScreen
 from collect.tui.set_up_screen import SetUpScreen
@@ -92,18 +92,13 @@ class OperatorApp(RunApp):
             self._poll()
 
     def action_enter(self) -> None:
-        """Resume the session of a run that ended before its time, asking first; else show the last capture large."""
+        """Resume the session of a run that ended before its time: the engine asks first; else show the last capture."""
         if self._now is None or self.screen is not self._main:
             return
-        if self._can_go_on:
-            question = RESUME_UNSEEN if self._now.rest_unknown else RESUME
-            self.push_screen(Confirm(*question), self._go_on_answered)
+        if self._can_go_on and self._again is not None:
+            self._begin(partial(self._again, Path(self._now.folder).name))
         else:
             self.action_enlarge()
-
-    def _go_on_answered(self, yes: bool | None) -> None:
-        if yes and self._can_go_on and self._now is not None and self._again is not None:
-            self._begin(partial(self._again, Path(self._now.folder).name))
 
     async def action_quit(self) -> None:
         """Leave; ask first if the arm is not parked."""
@@ -115,7 +110,7 @@ class OperatorApp(RunApp):
         elif now.state is State.STOPPING:
             self.notify("The arm is being stopped. Press the red button if it keeps moving.", severity="warning")
         elif now.rest_unknown:
-            self.push_screen(Confirm(*NOT_AT_REST), self._leave_answered)
+            self.push_screen(Confirm(*UNSEEN), self._leave_answered)
         elif now.state not in FINAL:
             self.push_screen(Confirm(*AT_WORK), self._park_answered)
         elif now.parked or now.target_mm is None:
@@ -140,9 +135,7 @@ class OperatorApp(RunApp):
         while len(self.screen_stack) > 2:
             self.pop_screen()
         if self._now is not None and self._now.rest_unknown and isinstance(self.screen, StartScreen):
-            self.screen.show_trouble(
-                "The arm was not seen at rest when the run ended. Use the emergency stop if it moves."
-            )
+            self.screen.show_trouble(NOT_AT_REST)
         self._main = self._now = None
         self._leave_when_over = False
 

@@ -5,6 +5,7 @@ Heavy imports wait until they are needed, so that the screen is up first.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from sessions.show import Details, Summary
 
 RECENT = 50
+CHOSEN_FILES = ".files"
+"""File in the folder of sessions that names the rig and the protocol chosen last."""
+MAX_CHARS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +43,21 @@ class SessionBrowser:
     """Reads sessions and makes engines; connects to devices only in `health`."""
 
     def __init__(self, paths: Paths, engine_for: EngineFor) -> None:
-        self.paths = paths
+        self._kept = paths.root / CHOSEN_FILES
         self._engine_for = engine_for
+        with contextlib.suppress(OSError, ValueError), self._kept.open(encoding="utf-8") as stream:
+            config, protocol = stream.read(MAX_CHARS).splitlines()
+            paths = replace(paths, config=Path(config), protocol=Path(protocol))
+        self.paths = paths
 
     def choose(self, config: str, protocol: str) -> None:
-        """Use another rig and another protocol."""
-        self.paths = replace(self.paths, config=Path(config), protocol=Path(protocol))
+        """Use another rig and another protocol, here and at the next start; an empty name keeps the file as it is."""
+        before, names = self.paths, [config.strip(), protocol.strip()]
+        self.paths = replace(before, config=Path(names[0] or before.config), protocol=Path(names[1] or before.protocol))
+        if self.paths != before:
+            with contextlib.suppress(OSError):  # then the choice holds until the program ends
+                self._kept.parent.mkdir(parents=True, exist_ok=True)
+                self._kept.write_text(f"{self.paths.config}\n{self.paths.protocol}\n", encoding="utf-8")
 
     def recent(self) -> list[Summary]:
         """The newest sessions first; empty if there is no folder yet."""
@@ -83,12 +96,14 @@ class SessionBrowser:
     def engine(self, session_id: str | None, *, preview: bool) -> RunnableEngine:
         """An engine that resumes that open session, with the set-up wizard; with None, one for a new session.
 
-        Connects nothing yet. Raises `ConfigError`, also where these files belong to another open session.
+        A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
-        from collect.engine.open_or_resume import Opening, resuming
+        from collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
 
-        paths, new = self.paths, session_id is None
-        opening = Opening.load(paths.root, paths.config, paths.protocol, new=new, sheet=1 if new else None)
-        if session_id is not None:
-            opening = resuming(opening, session_id)
+        root, config, protocol = self.paths.root, self.paths.config, self.paths.protocol
+        if session_id is None:
+            opening = Opening.load(root, config, protocol, new=True, sheet=1)
+        else:
+            opening = Opening.load(root, config, root / session_id / PROTOCOL_EFFECTIVE)
+            opening = replace(opening, resume=session_id)
         return self._engine_for(opening, watched=True, guided=True, preview=preview)

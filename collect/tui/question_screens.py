@@ -16,6 +16,7 @@ from textual.screen import ModalScreen
 from textual.widgets import Static
 
 from collect.engine.snapshot import EngineView
+from collect.errors import NOT_AT_REST
 from collect.operator import Prompt
 from collect.tui.pictures import Pictures
 from collect.tui.text import plain
@@ -24,7 +25,7 @@ LEAVE_LINE = "q  leave: park the arm, answer nothing"
 STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
 LEAVE_KEYS = "y  leave it as it is      n  stay"
 AT_WORK = (
-    "The arm is at work. Finish this step, park the arm, and leave?",
+    "A run is in progress. Finish its step, park the arm, and leave?",
     "y  park and leave      n  go on      s  stop now",
 )
 NOT_PARKED = (
@@ -32,22 +33,7 @@ NOT_PARKED = (
     "The next run begins by lifting it. Leave it as it is?",
     LEAVE_KEYS,
 )
-NOT_AT_REST = (
-    "The arm was not seen at rest: it may still be moving. Use the emergency stop, the red button. "
-    "Leave this screen anyway?",
-    LEAVE_KEYS,
-)
-RESUME_KEYS = "y  at rest, and the cell is clear: resume      n  back"
-RESUME = (
-    "Resume this session? The arm first lifts the brush slowly and parks; the paper is found again, "
-    "and the plan goes on. No stroke is made twice.",
-    RESUME_KEYS,
-)
-RESUME_UNSEEN = (
-    "The arm was not seen at rest when the run ended. Look at it: resume only if it stands still. "
-    "It then lifts the brush slowly, and parks.",
-    RESUME_KEYS,
-)
+UNSEEN = (f"{NOT_AT_REST} Leave this screen anyway?", LEAVE_KEYS)
 
 
 class AskScreen(ModalScreen[None]):

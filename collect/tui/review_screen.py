@@ -135,7 +135,7 @@ class ReviewScreen(Screen[None]):
         """Show the keys; during a run, show how to stop it, and hide note and finish."""
         at_work = self._at_work()
         self._keys.show(KEYS_AT_WORK if at_work else KEYS)
-        self._stop_note.show(f"The arm is at work. {SOFTWARE_STOP}" if at_work else "")
+        self._stop_note.show(f"A run is in progress. {SOFTWARE_STOP}" if at_work else "")
         self.set_class(at_work, "-at-work")
 
     def action_back(self) -> None:
@@ -162,7 +162,7 @@ class ReviewScreen(Screen[None]):
         if self._capture is None:
             return
         if self._at_work():
-            self.notify("Notes can be written after the run: while the arm is at work, s stops it.", severity="warning")
+            self.notify("Notes can be written after the run: until then, s stops the arm.", severity="warning")
             return
         self._note.value = self._capture.remark.note if self._capture.remark is not None else ""
         self.add_class("-noting")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 from collect.errors import CollectAborted
-from collect.headless import RunnableEngine, stop_signals
+from collect.headless import RunnableEngine, obey, stop_signals
 from collect.tui.app import OperatorApp
 from collect.tui.browser import SessionBrowser
 from collect.tui.pictures import Pictures, Preview
@@ -65,14 +64,11 @@ def _run(app: OperatorApp) -> None:
 
 
 def _signals(app: OperatorApp) -> AbstractContextManager[None]:
-    """On SIGINT and SIGTERM stop the arm; on SIGHUP, a lost terminal, finish the step and park it. Then end the screen.
-
-    With the terminal lost, nobody is there to lift a brush that was stopped on the paper.
-    """
+    """On a signal end the run as without a screen, then the screen."""
 
     def on_signal(number: int) -> None:
         if app.engine is not None:
-            (app.engine.park if number == signal.SIGHUP else app.engine.stop)()
+            obey(app.engine, number)
         app.leave()
 
     return stop_signals(on_signal)

@@ -167,7 +167,7 @@ class StartScreen(Screen[None]):
 
     def action_list(self) -> None:
         """Go back to the list; files that were being typed stay as before."""
-        self._config.value, self._protocol.value = str(self._browser.paths.config), str(self._browser.paths.protocol)
+        self._show_files()
         self._to_list()
 
     def action_files(self) -> None:
@@ -223,6 +223,10 @@ class StartScreen(Screen[None]):
 
     def _choose(self) -> None:
         self._browser.choose(self._config.value, self._protocol.value)
+        self._show_files()
+
+    def _show_files(self) -> None:
+        self._config.value, self._protocol.value = str(self._browser.paths.config), str(self._browser.paths.protocol)
 
     def _show_standing(self, session_id: str) -> None:
         try:

@@ -143,6 +143,7 @@ FIELDS: dict[str, tuple[Checks, Checks]] = {
     ),
     "void": ({"key": _is_text, "attempt": _is_whole}, {"why": _is_text}),
     "sheet": ({"sheet": _is_whole}, {}),
+    "ended": ({"why": _is_text}, {}),
     "closed": ({}, {"sha256": _is_text, "counts": _are_counts}),
     "repaired": ({"file": _is_step_file, "sha256": _is_text, "counts": _are_counts}, {"missing": _are_counts}),
     "held": ({"file": _is_step_file, "by": _is_text}, {}),

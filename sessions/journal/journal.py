@@ -2,7 +2,8 @@
 
 Events: `open` (header, configs), `process` (a process opened the session), `begin` and `done` or `void` for a step
 attempt, `sheet` (a fresh sheet was put in), `torn` (a half-written line was found and set aside), `clock` (the host's
-clock was set back), `closed`. A repair adds `repaired`, `held`, `lost`, `doubt` and `journal`.
+clock was set back), `ended` (how a run ended before its time), `closed`. A repair adds `repaired`, `held`, `lost`,
+`doubt` and `journal`.
 """
 
 from __future__ import annotations
@@ -118,6 +119,8 @@ class Replay:
     sheet: int = 0
     begun: int = 0
     voids: int = 0
+    ended: str = ""
+    """How the last run ended; empty if its process was cut off before it could say so."""
     last_ns: int = 0
     """Time of the latest line, to notice a clock that was set back."""
 
@@ -215,13 +218,15 @@ def fold(state: Replay, line: Line) -> None:
             state.sheet = line["sheet"]
         case "closed":
             state.closed = line
+        case "process" | "ended":
+            state.ended = line.get("why", "")
         case "repaired" | "held" | "lost":
             _repair(state, line)
         case "doubt":
             state.doubtful_sheets.add(line["sheet"])
             state.begun = max(state.begun, _next_serial(line))
         case _:
-            pass  # `process`, `void`, `clock`, `journal` and `torn` are for people who read the journal
+            pass  # `void`, `clock`, `journal` and `torn` are for people who read the journal
     state.last_ns = line.get("t_ns", 0)
 
 

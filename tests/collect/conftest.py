@@ -101,6 +101,7 @@ class Lab:
             opening.protocol,
             lambda r: open_store(opening, resume, r, clock),
             clock,
+            resumes=resume,
             watched=watched,
             armed=armed,
             guided=guided,
@@ -119,9 +120,11 @@ class Lab:
         paths = (self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml")
         return [word for option, path in zip(OPTIONS, paths, strict=True) for word in (option, str(path))]
 
-    def write_protocol(self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0]", repeats: int = 1) -> None:
+    def write_protocol(
+        self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0]", repeats: int = 1, dwell_s: float = 0.0
+    ) -> None:
         """A grid; two strokes unless more are asked for."""
-        text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = 0.0\n'
+        text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = {dwell_s}\n'
         (self.folder / "protocol.toml").write_text(text, encoding="utf-8")
 
 

@@ -11,6 +11,8 @@ import pytest
 from collect.engine.control import State
 from collect.engine.snapshot import Snapshot
 from collect.headless import eta_text
+from drivers.sim.faults.phases import Phase
+from sessions.journal.journal import JOURNAL_NAME, replay
 from sessions.reader import Recording
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
@@ -25,13 +27,13 @@ def wait_for_presses(lab: Lab, count: int) -> None:
 
 def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab) -> None:
     lab.write_protocol("[11.0, 13.0]", "[0.0, 10.0]")
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM):
         first = lab.process()
         wait_for_presses(lab, len(lab.rig.world.presses) + 1)
         first.send_signal(number)
         _, stderr = first.communicate(timeout=PATIENCE_S)
         assert first.returncode == 4, stderr
-        assert stderr.splitlines()[-1] == "brushloop: stopped; the same command resumes from here"
+        assert stderr.splitlines()[-1].startswith("brushloop: stopped; the same command resumes from here")
         assert "Traceback" not in stderr
         still = lab.rig.world.tool()
         time.sleep(0.1)
@@ -45,6 +47,34 @@ def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab) -> None:
         f"next:     brushloop calibrate {folder}",
     ]
     assert len({c.stroke.stroke_id for c in Recording(folder).captures()}) == 4
+
+
+def test_a_run_whose_terminal_is_closed_finishes_its_step_and_parks(lab: Lab) -> None:
+    lab.write_protocol(repeats=10)
+    run = lab.process()
+    wait_for_presses(lab, 1)
+    for _ in range(2):  # a shell whose window is closed may pass the signal on as well
+        run.send_signal(signal.SIGHUP)
+    _, stderr = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 4
+    assert stderr.splitlines()[-1] == "brushloop: parked on request; the same command resumes from here"
+    assert lab.rig.faults.truth.phase() is Phase.PARKED
+    [folder] = lab.sessions.iterdir()
+    assert replay(folder / JOURNAL_NAME).voids == 0
+
+
+def test_a_signal_says_that_the_brush_may_be_down_where_it_may(lab: Lab) -> None:
+    lab.write_protocol("[20.0]", dwell_s=60.0)
+    run = lab.process()
+    deep_mm = lab.rig.config.table.paper_z_mm - 10.0
+    wait_until(lambda: lab.rig.world.tool().z_mm < deep_mm, "the brush in the paper")
+    run.send_signal(signal.SIGHUP)
+    time.sleep(0.1)
+    run.send_signal(signal.SIGTERM)  # does not wait for the end of the press
+    _, stderr = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 4
+    assert "brush may be down" in stderr.splitlines()[-1]
+    assert lab.rig.faults.truth.phase() is not Phase.PARKED
 
 
 def test_a_second_process_is_refused_and_the_first_goes_on(lab: Lab) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 
+import numpy as np
+from numpy.typing import NDArray
+
 from calibrate.board.pix2len import Plane
 from calibrate.board.view import see_board
 from calibrate.errors import CalibrationError
@@ -12,7 +15,7 @@ from collect.engine.last_capture import LastCapture, pictures_of, published_mark
 from collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from collect.engine.steps.retake import decide
 from collect.errors import BadPicture, NeedsOperator, StepError
-from collect.protocols.steps import Result
+from collect.protocols.steps import MARKING, Result, StepKind
 from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
 from collect.quality.verdict import Check, Family, Verdict
 from collect.rig.optics import undistorted
@@ -21,9 +24,13 @@ from drivers.samples import Frame
 from sessions.history import limit_s, unlike, waits_of
 from sessions.recording import schemas
 
+MOVED_MM = 1.0
+"""Distance by which the sheet may seem to have moved in the picture since the first mark of the session."""
+
 
 async def board(context: StepContext) -> Result:
-    """The BOARD step. Raises `StepError` where the board is not seen: nothing that follows could be measured."""
+    """The BOARD step. Raises `StepError` where the board is not seen: nothing that follows could be measured; and
+    `NeedsOperator` where photographs have another size, or the board another place, than before the first mark."""
     image = await photograph(context)
     with context.recorder.sections.timed("see the board"):
         plane, checks = await uninterrupted(_board, context.run, image)
@@ -32,6 +39,8 @@ async def board(context: StepContext) -> Result:
         "corners": plane.corners,
         "mm_per_px": plane.mm_per_px,
         "rms_px": plane.rms_px,
+        "size_px": [image.shape[1], image.shape[0]],
+        "sheet_px": plane.to_image(_sheet_corners_mm(context.run.rig.config.paper.size_mm)).tolist(),
         **_camera_delay(context),
         "checks": [
             {"name": str(c.name), "score": c.score, "threshold": c.threshold, "passed": c.passed} for c in checks
@@ -44,12 +53,47 @@ def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
         plane = see_board(image, run.rig.config.board)
     except CalibrationError as error:
         raise StepError(f"the board is not seen: {error.what}") from None
+    if (before := _before_first_mark(run)) is not None:
+        _check_view(before, image, plane, run.rig.config.paper.size_mm)
     run.memory.image_plane = plane
     limits = run.rig.config.quality
     frame = check_frame(image, plane, limits)
     if limits.enabled and frame.cause is not None:
         raise BadPicture(frame.cause.reason)
     return plane, frame.checks
+
+
+def _before_first_mark(run: RunContext) -> Result | None:
+    """The board as it was last seen before the session's first mark; None as long as there is no mark."""
+    before = None
+    for line in run.store.state.segments:
+        if line["kind"] in MARKING:
+            return before
+        if line["kind"] == StepKind.BOARD:
+            before = line["result"]
+    return None
+
+
+def _check_view(before: Result, image: Gray, plane: Plane, sheet_mm: tuple[float, float]) -> None:
+    """Raise `NeedsOperator` unless frame size and place of the board are those of the session's other strokes."""
+    height_px, width_px = image.shape
+    if (size_px := tuple(before["size_px"])) != (width_px, height_px):
+        raise NeedsOperator(
+            f"the camera gives {width_px} x {height_px} px, and gave {size_px[0]} x {size_px[1]} px when the session "
+            "began: set it back (camera.locked in rig.toml), or start a new session with --new."
+        )
+    seen_mm = plane.to_paper(np.array(before["sheet_px"]))
+    moved_mm = float(np.linalg.norm(seen_mm - _sheet_corners_mm(sheet_mm), axis=1).max())
+    if moved_mm > MOVED_MM:
+        raise NeedsOperator(
+            f"the board is seen {moved_mm:.1f} mm from where it was when the session began, at most {MOVED_MM:g} mm: "
+            "camera or board was moved. Put it back, or start a new session with --new."
+        )
+
+
+def _sheet_corners_mm(size_mm: tuple[float, float]) -> NDArray[np.float64]:
+    """(4, 2) corners of the sheet in the paper frame."""
+    return np.array([[x, y] for x in (0.0, size_mm[0]) for y in (0.0, size_mm[1])])
 
 
 async def look_at_sheet(context: StepContext) -> None:

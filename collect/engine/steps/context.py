@@ -34,6 +34,8 @@ _R = TypeVar("_R")
 class RunMemory:
     """What this process has seen and done on the rig; a new process starts without it."""
 
+    done: set[str] = field(default_factory=set[str])
+    """Keys of the steps that this process has done."""
     left_ink_ns: int | None = None
     """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
     image_plane: Plane | None = None

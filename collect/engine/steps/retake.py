@@ -9,7 +9,6 @@ import numpy as np
 
 from calibrate.stroke.params import Gray
 from collect.engine.steps.context import RunContext, StepContext
-from collect.errors import NeedsOperator
 from collect.operator import Choice, OperatorRequest, Prompt
 from collect.protocols.steps import Result, StepKind
 from collect.quality.verdict import Verdict
@@ -36,7 +35,10 @@ async def decide(context: StepContext, verdict: Verdict | None, image: Gray, cel
 
 
 async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
-    """Retake while takes are left, then let a person decide; if nobody watches, give the stroke up."""
+    """Retake while takes are left, then let a person decide; without a screen, leave the stroke out.
+
+    Raises `NeedsOperator` if the screen went away: the step stays open, and is done and asked about again on resume.
+    """
     run = context.run
     take = int(context.step.params.get("take") or 1)
     if take <= run.rig.config.quality.retakes:
@@ -44,14 +46,11 @@ async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, ce
     stroke_id = str(context.step.params["stroke_id"])
     text = f"{stroke_id}, take {take}: {verdict.reason}"
     prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, cell))
-    if run.asker.watched:
-        await run.procedures.park()  # a person may reach under the arm
-    try:
-        with run.progress.meanwhile("wait for an answer"):
-            answer = await run.asker.ask(prompt)
-    except NeedsOperator:
-        run.progress.log(f"{stroke_id}: given up", warning=True)
+    if not run.asker.attended:
+        run.progress.log(f"{stroke_id}: left out", warning=True)
         return False, False
+    await run.procedures.park()  # a person may reach under the arm
+    answer = await run.asker.ask(prompt)
     return answer == KEEP.key, answer == AGAIN.key
 
 

@@ -1,4 +1,4 @@
-"""The terminal is closed while a run is on, a lost ssh say: the arm stops, the session stays whole, it goes on."""
+"""The terminal is closed while a run is on, a lost ssh say: the arm parks, the session stays whole, it goes on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 
 from sessions.reader import Recording
 from sessions.repair.verify import verify_session
-from tests.collect.durability.conftest import the_session
+from tests.collect.durability.conftest import parked, the_session
 from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def read_until(end: int, condition: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize("option", ["--tui", "--no-tui"])
-def test_a_terminal_that_is_closed_stops_the_arm_and_the_same_command_goes_on(lab: Lab, option: str) -> None:
+def test_a_terminal_that_is_closed_parks_the_arm_and_the_same_command_goes_on(lab: Lab, option: str) -> None:
     with terminal() as (ours, theirs):
         process = in_terminal(lab, theirs, option)
         read_until(ours, lambda: len(lab.rig.world.presses) >= 1)
@@ -80,6 +80,7 @@ def test_a_terminal_that_is_closed_stops_the_arm_and_the_same_command_goes_on(la
     still = lab.rig.world.tool()
     time.sleep(0.1)
     assert lab.rig.world.tool() == still
+    assert parked(lab)
     folder = the_session(lab)
     assert verify_session(folder).sound
 

@@ -10,7 +10,7 @@ import pytest
 
 from collect.engine.control import State
 from collect.engine.steps import capture as capturing
-from collect.errors import CollectAborted, NeedsOperator
+from collect.errors import CollectAborted, NeedsOperator, Parked
 from collect.quality.checks import check_drawing
 from collect.quality.verdict import Verdict
 from drivers.sim.brush.flaws import Flaw
@@ -77,7 +77,25 @@ def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_l
     run(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 0, 1)
+    assert now.eta_s == 0.0, "a stroke that was left out takes no more time"
     assert used(sharp_lab) == 3 + now.voids
+
+
+def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
+    left = sharp_lab.engine(watched=True)
+    left.start()
+    assert until(left, lambda now: now.prompt is not None).state is State.ASKING
+    left.park()  # as `q` does, and a lost connection
+    with pytest.raises(Parked):
+        wait_for_end(left)
+    assert left.snapshot().given_up == 0
+
+    resumed = sharp_lab.engine(watched=True)
+    questions = answered(resumed, "g", over=lambda now: now.state is State.DONE)
+    assert [question.partition(":")[0] for question in questions[1:]] == ["H13-a0-r01, take 3"]
+    assert (resumed.snapshot().strokes_done, resumed.snapshot().given_up) == (1, 0)
+    assert len(sharp_lab.rig.world.presses) == 3
 
 
 def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:

@@ -12,14 +12,17 @@ import pytest
 
 from collect.engine.open_or_resume import Opening, find_resumable, put_in_sheet
 from collect.errors import ConfigError
+from collect.headless import RunnableEngine
 from collect.planning.limit_check import distinct_steps
 from collect.protocols.steps import StepKind
+from collect.tui.browser import Paths, SessionBrowser
 from drivers.clock import HostClock
 from drivers.sim.config import SimConfig
 from drivers.sim.rig_toml import Addresses, rig_toml
 from sessions.difference import Difference
 from sessions.recording.schemas import Header, Source
 from sessions.store import SessionStore
+from tests.collect.tui.fake import FakeEngine, picture
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
 GRID = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
@@ -35,10 +38,10 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def begin(*, armed: bool = False) -> None:
-    header = Header(session_id="grid-01", source=Source.LOOPBACK, software="brushloop 0")
+def begin(session_id: str = "grid-01", *, armed: bool = False) -> None:
+    header = Header(session_id=session_id, source=Source.LOOPBACK, software="brushloop 0")
     snapshots = opening(armed=armed).snapshots
-    SessionStore.create(Path("sessions/grid-01"), header, snapshots, HostClock().now_ns).release()
+    SessionStore.create(Path("sessions") / session_id, header, snapshots, HostClock().now_ns).release()
 
 
 def opening(*, armed: bool = False) -> Opening:
@@ -171,6 +174,23 @@ def test_where_hardware_may_move_the_rig_is_checked_first_unless_it_is_switched_
     assert StepKind.SELF_CHECK in kinds(opening())
     edit("rig.toml", "[motion]", "[self_check]\nenabled = false\n\n[motion]")
     assert StepKind.SELF_CHECK not in kinds(opening(armed=True))
+
+
+def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) -> None:
+    """Another protocol lies in the folder, and a newer session is open."""
+    begin("grid-02")
+    Path("protocol.toml").write_text('kind = "calibration"\n')
+    openings: list[Opening] = []
+
+    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> RunnableEngine:
+        openings.append(opening)
+        return FakeEngine(picture())
+
+    browser = SessionBrowser(Paths(), engine_for)
+    for session_id in ("grid-01", "grid-02"):
+        browser.engine(session_id, preview=False)
+        assert find_resumable(openings[-1]) == Path("sessions") / session_id
+        assert openings[-1].protocol.kind == "grid"
 
 
 @pytest.mark.parametrize("begun_armed", [False, True])

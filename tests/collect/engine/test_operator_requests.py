@@ -13,7 +13,7 @@ from collect.engine.perform import Performer
 from collect.engine.snapshot import Mark
 from collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
 from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from collect.protocols.steps import Result, Step
+from collect.protocols.steps import Result, Step, StepKind
 from drivers.errors import DeviceTimeout
 from sessions.journal.lines import read_lines
 from sessions.reader import Recording
@@ -26,6 +26,7 @@ from tests.waiting import wait_until
 def answer(engine: Engine, words: str, key: str) -> None:
     now = until(engine, lambda n: n.prompt is not None and words in n.prompt.question)
     assert now.prompt is not None
+    assert now.state is State.ASKING
     number = now.prompt.number
     assert engine.answer(number, key)
     wait_until(
@@ -101,7 +102,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     with pytest.raises(Parked):
         wait_for_end(first)
     assert first.snapshot().strokes_done + first.snapshot().given_up < 3
-    again = lab.engine(watched=True)
+    again = lab.engine()
     again.start()
     wait_for_end(again)
     now = again.snapshot()
@@ -122,7 +123,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     first.park()
     with pytest.raises(Parked):
         wait_for_end(first)
-    again = lab.engine(watched=True)
+    again = lab.engine()
     again.start()
     wait_for_end(again)
 
@@ -271,7 +272,7 @@ def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) ->
     now = engine.snapshot()
     assert (now.state, now.voids) == (State.STOPPED, 0)
     assert now.parked
-    again = lab.engine(watched=True)
+    again = lab.engine()
     again.start()
     wait_for_end(again)
     assert again.snapshot().strokes_done == 2
@@ -298,6 +299,33 @@ def test_park_while_a_question_waits_asks_nobody_any_more(lab: Lab) -> None:
         wait_for_end(engine)
     assert engine.snapshot().prompt is None
     assert engine.snapshot().parked
+
+
+def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 15.0]")
+    with (lab.folder / "protocol.toml").open("a") as protocol:
+        protocol.write("board_every = 1\n")
+    engine = lab.engine(watched=True, guided=True)
+    engine.start()
+    answer(engine, "Camera, board, scale", "g")
+    answer(engine, "Zero touch and plane", "g")
+    wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 2
+    assert sum(line["kind"] == "board" for line in lines(lab, "done")) == 2
+
+
+def test_a_guided_calibration_lists_only_what_comes(lab: Lab) -> None:
+    (lab.folder / "protocol.toml").write_text('kind = "calibration"\nboard_views = 2\n')
+    rig = lab.folder / "rig.toml"
+    rig.write_text(rig.read_text() + "\n[self_check]\nenabled = true\n")
+    engine = lab.engine(watched=True, guided=True)
+    engine.start()
+    now = until(engine, lambda now: now.prompt is not None)
+    assert [step.kind for step in now.set_up] == [StepKind.BOARD, StepKind.ZERO_TOUCH]
+    answer(engine, "Camera, board, scale", "g")
+    answer(engine, "Zero touch and plane", "g")
+    wait_for_end(engine)
+    assert engine.snapshot().set_up == ()
 
 
 def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera(lab: Lab) -> None:

@@ -257,6 +257,7 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     assert not isinstance(ended, DeviceError) or ended.device == expected.device
     assert ("may still be moving. Use the emergency stop" in now.error) is expected.alarm, now.error
     assert now.rest_unknown or not expected.alarm
+    assert not now.rest_unknown or "may still be moving" in now.error
     assert not (now.rest_unknown and now.parked)
     if isinstance(ended, RobotNotSafe):
         assert ended.remedy in now.error

@@ -195,9 +195,12 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.on(StartScreen)
         await operator.reads("▶", "open", f"{done} of {STROKES} strokes", "Next")
 
-        # resume: touched again, not looked at or checked again; then to the end
+        # resume: asked first; board seen and paper touched again, not checked again; then to the end
         await operator.press("enter")
         await operator.on(SetUpScreen)
+        await operator.reads("Resume ", "stopped; the same command", "g  resume")
+        await operator.press("g")
+        await operator.accept("Camera, board, scale")
         await operator.accept("Zero touch and plane")
         await operator.in_state(State.DONE)
         await operator.on(EndScreen)

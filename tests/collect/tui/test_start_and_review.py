@@ -28,7 +28,7 @@ from collect.tui.question_screens import Confirm
 from collect.tui.start_screen import StartScreen
 from sessions.remarks import remarks_of
 from sessions.repair.verify import Finding, Verdict
-from tests.collect.tui.fake import FakeEngine, picture
+from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.screen_text import has_picture, shown
 from tests.collect.tui.test_app import look
@@ -127,7 +127,10 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
         assert "stop" in app.engine.calls  # type: ignore[attr-defined]
 
 
-async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
+async def test_other_files_can_be_typed_and_letters_of_stop_keys_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     browser = FakeBrowser()
     app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
@@ -136,6 +139,10 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
         await ready(app, pilot)
         assert str(browser.paths.config) == "s2.toml"
         assert isinstance(app.screen, StartScreen)
+        await pilot.press("e", "ctrl+u", "enter")
+        assert "s2.toml" in await ready(app, pilot), "an emptied field leaves the file as it was"
+    assert str(browser.paths.config) == "s2.toml"
+    assert FakeBrowser().paths == browser.paths, "the next start knows the files"
 
 
 async def test_escape_leaves_the_files_as_they_were() -> None:
@@ -186,17 +193,18 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
         assert isinstance(app.screen, StartScreen)
 
 
-async def test_no_note_is_typed_while_the_arm_is_at_work(tmp_path: Path) -> None:
-    engine = FakeEngine(picture())
+async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> None:
+    engine = FakeEngine(PAUSED)
     app = OperatorApp(engine)
     async with app.run_test(size=(120, 40)) as pilot:
         await look(app, pilot)
         review = a_review(tmp_path, lambda: app.at_work)
         app.push_screen(review)
         text = await ready(app, pilot)
-        for words in ("The arm is at work", "red button", "s STOP"):
+        for words in ("A run is in progress", "red button", "s STOP"):
             assert words in text
         assert "o note" not in text
+        assert "arm is at work" not in text
         await pilot.press("o", "s")
         assert engine.calls == ["stop"]
         assert not review.has_class("-noting")
