@@ -72,6 +72,16 @@ class Drawn:
         return np.array([FLAGGED_WEIGHT if flags else 1.0 for flags in self.flags])
 
     @property
+    def conditions(self) -> NDArray[np.int64]:
+        """(B,) number of each image's condition: its command, or the paths of its figure."""
+        commands = np.zeros((len(self.ink), 0)) if self.commands is None else self.commands
+        keys = [
+            b"".join(values.tobytes() for values in (command, *self.paths[begin:end]))
+            for command, begin, end in zip(commands, self.groups, self.groups[1:], strict=False)
+        ]
+        return np.unique(keys, return_inverse=True)[1]
+
+    @property
     def mm_per_px(self) -> float:
         """The pixel's side."""
         return float(self.x_mm[1] - self.x_mm[0])

@@ -1,7 +1,8 @@
 """What a drag model misses, learned from its training strokes by kernel ridge regression on clipped signed distances.
 
 The probability above which a pixel counts as ink is half of the attainable Dice score, which maximises that score's
-expectation. It is estimated by how well each training stroke is predicted from the others, in closed form for a ridge.
+expectation. It is estimated by how well each training stroke is predicted from those of other commands, in closed form
+for a ridge.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ class Residual:
 def threshold(
     commands: Floats, base_mm: Floats, captured_mm: Floats, stride: int = 2, spread_mm: float = SPREAD_MM
 ) -> float:
-    """The probability above which a pixel is ink: half the mean CSIM of training strokes predicted from the others.
+    """The probability above which a pixel is ink: half the mean CSIM of training strokes, each predicted from the
+    strokes of other commands.
 
     `INK_ABOVE` for fewer than `LEAST` strokes.
     """
@@ -63,7 +65,8 @@ def threshold(
         return INK_ABOVE
     every = (slice(None), slice(None, None, stride), slice(None, None, stride))
     base, captured = _flat(base_mm[every]), _flat(captured_mm[every])
-    corrected = captured - _left_out(_gram(commands, scales_of(commands), RIDGE), captured - base)
+    gram = _gram(commands, scales_of(commands), RIDGE)
+    corrected = captured - _left_out(gram, captured - base, np.unique(commands, axis=0, return_inverse=True)[1])
     found = binary_scores(ink(corrected.astype(np.float64), spread_mm) > INK_ABOVE, captured > 0.0)
     half = 0.5 * float(found[:, 0].mean())
     return min(max(round(half, 3), LEAST_ABOVE), MOST_ABOVE)
@@ -100,10 +103,13 @@ def _gram(commands: Floats, scales: Floats, ridge: float) -> Floats:
     return _kernel(commands, commands, scales) + ridge * np.eye(len(commands))
 
 
-def _left_out(gram: Floats, target: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The error in each row of `target` of a ridge that is fitted to the other rows."""
+def _left_out(gram: Floats, target: NDArray[np.float32], conditions: NDArray[np.int64]) -> NDArray[np.float32]:
+    """The error in each row of `target` of a ridge that is fitted to the rows of other conditions."""
     inverse = np.asarray(np.linalg.solve(gram, np.eye(len(gram))), np.float64)
-    return np.asarray((inverse @ target) / np.diag(inverse)[:, None], np.float32)
+    errors = np.asarray(inverse @ target, np.float32)
+    for rows in (np.flatnonzero(conditions == condition) for condition in np.unique(conditions)):
+        errors[rows] = np.linalg.solve(inverse[np.ix_(rows, rows)], errors[rows])
+    return errors
 
 
 def _solved(gram: Floats, target: NDArray[np.float32]) -> NDArray[np.float32]:

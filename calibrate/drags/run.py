@@ -49,7 +49,7 @@ class FittedDrags:
 
 
 def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
-    """Fit all images, leave out each fifth of them in turn, and make the artefact.
+    """Fit all images, leave out each fifth of their conditions in turn, and make the artefact.
 
     Raises `CalibrationError` for fewer than three images.
     """
@@ -64,7 +64,7 @@ def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
             "ink_above": learned.predictor.above,
             "stamps": stamps_of(learned.stamps),
             "kept": learned.predictor.kept,
-            "held_out": _held_out(drawn, progress) if len(drawn.ink) >= FOLDS else {},
+            "held_out": _held_out(drawn, progress),
         }
     )
     return FittedDrags(learned.fit, artefact)
@@ -176,10 +176,13 @@ def _artefact(drawn: Drawn, fit: DragFit, images: Indices, values: dict[str, Fit
 
 
 def _held_out(drawn: Drawn, progress: Progress) -> dict[str, DragScore]:
-    order = np.random.default_rng(0).permutation(len(drawn.ink))
+    """Scores on conditions that were left out; empty for fewer than `FOLDS` conditions."""
+    conditions = drawn.conditions
+    order = np.random.default_rng(0).permutation(conditions.max() + 1)
     found: dict[str, list[Floats]] = {}
-    for k in counted(range(FOLDS), "fifths left out in turn", FOLDS, progress):
-        left, others = np.sort(order[k::FOLDS]), np.sort(np.setdiff1d(order, order[k::FOLDS]))
+    for k in counted(range(FOLDS if len(order) >= FOLDS else 0), "fifths left out in turn", FOLDS, progress):
+        is_left = np.isin(conditions, order[k::FOLDS])
+        left, others = np.flatnonzero(is_left), np.flatnonzero(~is_left)
         learned, truth = learn(drawn, others), drawn.ink[left] > 0.5
         seen, alone = learned.predictor.ink_both_ways(drawn, left)
         if learned.predictor.kept is not None:

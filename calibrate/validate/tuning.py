@@ -100,15 +100,16 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
 def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Cell] = ()) -> int:
     """Write the file for `brushloop train tune`, without some cells; return the number of presses.
 
-    Raises `CalibrationError` if fewer than two are left.
+    Raises `CalibrationError` if fewer than two conditions are left.
     """
     import torch
 
     from model.train.data import save_captures
 
     chosen = [k for k, cell in enumerate(aligned.cells) if cell not in leave_out]
-    if len(chosen) < 2:
-        raise CalibrationError(str(out), f"{len(chosen)} strokes are left, at least 2 are needed to tune on")
+    conditions = len({tuple(aligned.inputs[k].values()) for k in chosen})
+    if conditions < 2:
+        raise CalibrationError(str(out), f"{conditions} conditions are left, at least 2 are needed to tune on")
     columns = {name: torch.tensor([aligned.inputs[k][name] for k in chosen]) for name in aligned.inputs[0]}
     stack = torch.as_tensor(np.stack([aligned.images[k] for k in chosen]))
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -50,8 +50,8 @@ def tune(
     out: Annotated[Path, typer.Option(help="Folder of this training.")] = Path("generator-tuned"),
     steps: Annotated[int, typer.Option(min=1, help="Number of steps.")] = 300,
     learning_rate: Annotated[float, typer.Option(min=0, max=1, help="Peak learning rate.")] = 3e-4,
-    held_out: Annotated[float, typer.Option(min=0, max=1, help="Share of captures to validate on.")] = 0.2,
-    seed: Annotated[int, typer.Option(min=0, help="Which captures are held out, and the order of the rest.")] = 0,
+    held_out: Annotated[float, typer.Option(min=0, max=1, help="Share of conditions to validate on.")] = 0.2,
+    seed: Annotated[int, typer.Option(min=0, help="Which conditions are held out, and the order of the rest.")] = 0,
     tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
 ) -> Path | None:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""

@@ -89,13 +89,15 @@ def exact_sets(config: TrainConfig) -> tuple[Exact, Exact]:
 
 
 def split(captures: Kept, seed: int, held_out: float) -> tuple[Kept, Kept]:
-    """Captures to learn from and to validate on, at least one of each; raises ValueError for fewer than two."""
-    if len(captures) < 2:
-        raise ValueError("at least two captures are needed: one to learn from, one to validate on")
-    order = torch.randperm(len(captures), generator=_generator(seed, _SPLIT))
-    count = min(max(1, round(held_out * len(captures))), len(captures) - 1)
-    held, kept = order[:count].sort().values, order[count:].sort().values
-    return Kept(*captures.pick(kept)), Kept(*captures.pick(held))
+    """Captures to learn from and to validate on: repeats of one condition, that is of equal inputs, stay together.
+
+    There is at least one condition on each side; `load_captures` refuses captures of a single one.
+    """
+    conditions, condition_of = torch.unique(captures.inputs, dim=0, return_inverse=True)
+    order = torch.randperm(len(conditions), generator=_generator(seed, _SPLIT))
+    count = min(max(1, round(held_out * len(conditions))), len(conditions) - 1)
+    held = torch.isin(condition_of, order[:count])
+    return Kept(*captures.pick(~held)), Kept(*captures.pick(held))
 
 
 def batch_numbers(count: int, batch: int, seed: int, step: int) -> Tensor:
@@ -140,8 +142,8 @@ def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
             path, f"px_mm is {metadata.get('px_mm', 'missing')[:40]}, the generator's {config.target.px_mm}"
         )
     images = tensors.pop("images", None)
-    if images is None or images.ndim != 3 or images.shape[1:] != (size, size) or len(images) < 2:
-        raise TrainError(path, f"images must be (n, {size}, {size}) with n of at least 2")
+    if images is None or images.ndim != 3 or images.shape[1:] != (size, size):
+        raise TrainError(path, f"images must be (n, {size}, {size})")
     if images.dtype == torch.uint8:
         images = images.float() / 255
     if images.dtype != torch.float32 or not ((images >= 0) & (images <= 1)).all():
@@ -157,7 +159,10 @@ def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
         columns.append(value.float())
     for name in sorted(tensors):
         raise TrainError(path, f"{name[:60]!r} is not an input of the generator")
-    return Kept(torch.stack(columns, dim=-1), images), metadata.get("source", "not stated")[:200].replace("\n", " ")
+    inputs = torch.stack(columns, dim=-1)
+    if len(torch.unique(inputs, dim=0)) < 2:
+        raise TrainError(path, "captures of at least two conditions are needed: one to learn from, one to validate on")
+    return Kept(inputs, images), metadata.get("source", "not stated")[:200].replace("\n", " ")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

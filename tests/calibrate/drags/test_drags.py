@@ -3,8 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibrate.drags import run
 from calibrate.drags.captures import Drawn, commanded_path
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
+from calibrate.drags.predict import Learned, learn
 from calibrate.drags.residual import Residual, threshold
 from calibrate.drags.run import different
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
@@ -58,6 +60,34 @@ def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
     captured = base + np.sin(3.0 * commands[:, 0])[:, None, None]
     residual = Residual.fit(commands[::2], base[::2], captured[::2], ridge=0.01)
     assert np.abs(residual.add(commands[1:-1:2], base[1:-1:2]) - captured[1:-1:2]).max() < 0.05
+
+
+def test_the_threshold_is_judged_on_commands_that_were_left_out() -> None:
+    """Strokes of a command are alike, and lie where no other command tells: only repeats predict them."""
+    rng = np.random.default_rng(0)
+    commands = np.repeat(np.column_stack([rng.uniform(0.0, 1.0, (12, 4)), np.zeros(12)]), 6, axis=0)
+    x = np.linspace(-6.0, 6.0, 33)
+    moved = np.repeat(rng.choice([-3.0, 3.0], 12), 6)
+    base = np.broadcast_to(2.0 - np.abs(x), (72, 33, 33)).copy()
+    captured = np.array([np.broadcast_to(2.0 - np.abs(x - by), (33, 33)) for by in moved])
+    assert threshold(commands, base, captured) == threshold(commands[::6], base[::6], captured[::6])
+
+
+def test_repeats_of_a_command_are_left_out_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six commands drawn twice each: no fit sees a command that it is scored on."""
+    session = repeated(6, 2)
+    scored: list[tuple[set[int], set[int]]] = []
+
+    def watched(fitted: Drawn, images: np.ndarray) -> Learned:
+        scored.append((set(images.tolist()), set(range(12)) - set(images.tolist())))
+        return learn(fitted, images)
+
+    monkeypatch.setattr(run, "learn", watched)
+    found = run.fit_drawn(session).artefact.held_out
+    assert {score.images for score in found.values()} == {12}
+    for others, left in scored[1:]:
+        assert left
+        assert not {k // 2 for k in left} & {k // 2 for k in others}
 
 
 def test_of_strokes_that_scatter_less_certain_pixels_count_as_ink() -> None:
@@ -145,22 +175,36 @@ def test_what_does_not_belong_together_is_refused() -> None:
         fit_drags(paths, drawn(replace(TRUTH), paths), X_MM, Y_MM, np.zeros((3, 1)))
 
 
-def test_a_brush_is_adapted_to_strokes_that_differ_most() -> None:
-    commands = np.array([[20.0, 5.0, 2.0, 2.0, 0.0]] * 6 + [[40.0, -5.0, 4.0, 4.0, 0.0], [20.0, -5.0, 4.0, 4.0, 0.0]])
-    session = Drawn(
+def repeated(conditions: int, repeats: int) -> Drawn:
+    """A session in which each command was drawn several times."""
+    length, bend, depth = np.linspace(20.0, 35.0, conditions), np.linspace(-9.0, 9.0, conditions), 5.0
+    commands = np.array([[a, b, depth, depth, 0.0] for a, b in zip(length, bend, strict=True) for _ in range(repeats)])
+    return drawn_session(commands)
+
+
+def drawn_session(commands: np.ndarray, truth: DragModel = TRUTH) -> Drawn:
+    """An imported session of these commands, with the ink that `truth` draws."""
+    paths = [commanded_path(*row[:4]) for row in commands]
+    count = len(commands)
+    return Drawn(
         header=Header(session_id="s", source=Source.IMPORT, software="test", protocol=""),
         recording_sha256="",
         calibration=None,
         x_mm=X_MM,
-        y_mm=Y_MM,
-        paths=[commanded_path(*row[:4]) for row in commands],
-        groups=np.arange(9),
-        ink=np.zeros((8, 2, 2), np.float32),
-        stroke_ids=[str(k) for k in range(8)],
+        y_mm=Y_MM[::-1],
+        paths=paths,
+        groups=np.arange(count + 1),
+        ink=np.array([away(truth, path, X_MM, Y_MM[::-1]) > 0.0 for path in paths], np.float32),
+        stroke_ids=[str(k) for k in range(count)],
         refused=[],
         commands=commands,
-        flags=[()] * 8,
+        flags=[()] * count,
         ends="depth_ends_mm",
     )
+
+
+def test_a_brush_is_adapted_to_strokes_that_differ_most() -> None:
+    commands = np.array([[20.0, 5.0, 2.0, 2.0, 0.0]] * 6 + [[40.0, -5.0, 4.0, 4.0, 0.0], [20.0, -5.0, 4.0, 4.0, 0.0]])
+    session = drawn_session(commands)
     assert sorted(different(session, np.arange(8), 3)) == [0, 6, 7]
     assert different(replace(session, commands=None), np.arange(8), 3).tolist() == [0, 1, 2]

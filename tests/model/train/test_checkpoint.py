@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from model.train import checkpoint
 from model.train.checkpoint import load_checkpoint, load_weights, save_checkpoint, save_generator
 from model.train.config import TrainConfig
-from model.train.data import load_captures, save_captures
+from model.train.data import load_captures, save_captures, split
 from model.train.errors import TrainError
 from model.train.loop import new_state
 
@@ -145,3 +145,24 @@ def test_captures_must_fit_the_generator(tmp_path: Path, tiny: TrainConfig) -> N
         save_captures(path, **fields)
         with pytest.raises(TrainError, match=words):
             load_captures(path, tiny)
+
+
+def test_repeats_of_a_condition_are_held_out_together(tmp_path: Path, tiny: TrainConfig) -> None:
+    depths = torch.arange(11.0, 17.0).repeat_interleave(4)
+    inputs = {"height_mm": depths, "tilt_deg": torch.zeros(24)}
+    path = tmp_path / "captures.safetensors"
+    save_captures(path, inputs, torch.rand(24, 32, 32), 0.8, "centred", "loopback rig")
+    captures, _ = load_captures(path, tiny)
+    for seed in range(5):
+        kept, held = split(captures, seed, 0.3)
+        assert len(held) == 8
+        assert len(kept) == 16
+        assert not set(held.inputs[:, 0].tolist()) & set(kept.inputs[:, 0].tolist())
+
+
+def test_captures_of_one_condition_are_refused(tmp_path: Path, tiny: TrainConfig) -> None:
+    inputs = {"height_mm": torch.full((4,), 13.0), "tilt_deg": torch.zeros(4)}
+    path = tmp_path / "captures.safetensors"
+    save_captures(path, inputs, torch.rand(4, 32, 32), 0.8, "centred", "loopback rig")
+    with pytest.raises(TrainError, match="at least two conditions"):
+        load_captures(path, tiny)
