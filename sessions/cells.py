@@ -1,12 +1,18 @@
-"""Cells of CSV files: text that a spreadsheet would run as a formula is prefixed with an apostrophe."""
+"""Cells of CSV files: text that a spreadsheet would run as a formula is prefixed with an apostrophe.
+
+What a cell says as a number is read by `number`.
+"""
 
 from __future__ import annotations
 
 import csv
+import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 MARK = "'"
+NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 FORMULA_STARTS = frozenset("=+-@\t\r\n＝＋－＠")
 
 
@@ -20,6 +26,17 @@ def as_cell(value: object) -> object:
 def as_text(cell: str) -> str:
     """Undo `as_cell`."""
     return cell[1:] if _marked(cell) else cell
+
+
+def number(text: str) -> float:
+    """The finite number in a cell, an option or an answer: `10`, `-0.5`, `1e3`. Raises ValueError.
+
+    `1_0`, which Python reads as 10, is not one: in a table it is a typing error.
+    """
+    value = float(text) if NUMBER.fullmatch(text) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:80]!r} is not a finite number")
+    return value
 
 
 class CsvWriter:

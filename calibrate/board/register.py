@@ -6,7 +6,6 @@ import csv
 import hashlib
 import io
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from calibrate.board.lens import Floats, rms
 from calibrate.errors import CalibrationError
 from calibrate.files import read_bounded
+from sessions.cells import number
 
 Model = Literal["rigid", "similarity", "affine"]
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")
@@ -225,11 +225,6 @@ def read_points(table: Path) -> Points:
 
 def _number(table: Path, line: int, name: str, text: str | None) -> float:
     try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise CalibrationError(
-            str(table), f"line {line}, column `{name}`: {(text or '')[:80]!r} is not a finite number"
-        )
-    return value
+        return number(text or "")
+    except ValueError as error:
+        raise CalibrationError(str(table), f"line {line}, column `{name}`: {error}") from None

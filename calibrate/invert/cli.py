@@ -22,7 +22,6 @@ def invert(
     height_range: Annotated[tuple[float, float], typer.Option(help="Depths to look for, mm.")] = (2.0, 30.0),
     tilt_range: Annotated[tuple[float, float], typer.Option(help="Tilts to look for, deg; at most 30.")] = (0.0, 30.0),
     anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="Standard deviation of the touch point, mm.")] = 0.1,
-    assume_tilt: Annotated[float, typer.Option(min=0, max=30, help="alpha where there is no anchor, deg.")] = 0.0,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     presses: Annotated[
@@ -48,12 +47,10 @@ def invert(
 
     try:
         within = Range(height_range, tilt_range)
-        if tilt_range[1] > 30 or not tilt_range[0] <= assume_tilt <= tilt_range[1]:
-            raise ValueError(
-                f"tilt_deg = {tilt_range}, assumed {assume_tilt:g}: expected 0 to 30, the assumed one within"
-            )
+        if tilt_range[1] > 30:
+            raise ValueError(f"tilt_deg = {tilt_range}: expected 0 to 30")
     except ValueError as error:
-        raise CalibrationError("--height-range, --tilt-range, --assume-tilt", str(error)) from None
+        raise CalibrationError("--height-range, --tilt-range", str(error)) from None
     fitted, cells = None, frozenset[tuple[float, float]]()
     if fit is not None:
         from calibrate.artefact import load_artefact
@@ -70,7 +67,7 @@ def invert(
         if least >= within.height_mm[1]:
             raise CalibrationError("--height-range", f"ends before the fitted brush marks, at {least:.2f} mm")
         within = Range((least, within.height_mm[1]), within.tilt_deg)
-    settings = Settings(model, fitted, cells, lam, within, anchor_sd, assume_tilt, Field(mm_per_px=mm_per_px))
+    settings = Settings(model, fitted, cells, lam, within, anchor_sd, Field(mm_per_px=mm_per_px))
     with shown() as progress:
         made = invert_recording(session, settings, calibration, presses, progress)
     protocol = write_inversion(made, out, repeats, seed)
@@ -90,9 +87,6 @@ def invert(
         vague = sum(flag in row.flags for row in made.rows)
         if vague:
             say(f"warning: {vague} not informative on {name}: the interval covers most of the commanded range")
-    unknown = sum("alpha_unknown" in row.flags for row in made.rows)
-    if unknown:
-        say(f"warning: {unknown} without a zero-touch anchor: alpha is assumed, because shape does not determine it")
     bound = sum("at_bound" in row.flags for row in made.rows)
     if 2 * bound > len(made.rows):
         say(f"warning: {bound} at a bound: the model does not fit this brush; do not press these again")

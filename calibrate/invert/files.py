@@ -46,9 +46,10 @@ def recovered_csv(made: Inversion) -> str:
     writer.writerow(COLUMNS)
     for row in made.rows:
         asked = ["" if v is None else f"{v:g}" for v in (row.commanded_height_mm, row.commanded_tilt_deg)]
-        tilt_sd = "" if row.tilt_sd_deg is None else f"{row.tilt_sd_deg:.3g}"
-        numbers = [f"{row.height_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.height_sd_mm:.3g}", tilt_sd, f"{row.rms:.4f}"]
-        writer.writerow([row.stroke_id, *numbers, " ".join(row.flags), *asked, str(made.header.source)])
+        numbers = [f"{row.height_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.height_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
+        writer.writerow(
+            [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, str(made.header.source)]
+        )
     return out.getvalue()
 
 

@@ -15,17 +15,15 @@ from typing import TypeVar
 import numpy as np
 
 from calibrate.calibration import Calibration
-from calibrate.compare.field import Field, Image, covered, crop
+from calibrate.compare.field import Field, Image, covered
 from calibrate.compare.images import brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
 from calibrate.invert.model_error import NORMAL_95, Cell, model_sd
 from calibrate.session import calibration_of
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import rescale
+from calibrate.stroke.params import PX_PER_MM
 from model.brush import DomainError
 from model.inversion.noise import Noise
-from model.inversion.press import Flag, Inverter, Known, Range, Recovered
+from model.inversion.press import Flag, Inverter, Range
 from model.protocol import Basis, StrokeModel
 from model.strokes import UnknownModelError, stroke_model
 from sessions.errors import SessionDamaged
@@ -59,20 +57,18 @@ class Settings:
     within: Range = field(default_factory=Range)
     anchor_sigma_mm: float = 0.1
     """Standard deviation of the zero-touch point; 0 if it is known exactly."""
-    assumed_tilt_deg: float = 0.0
-    """alpha to assume for captures that have neither an anchor nor a commanded tilt."""
     view: Field = field(default_factory=Field)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One recovered stroke. `tilt_sd_deg` is None where alpha was assumed, not recovered."""
+    """One recovered stroke."""
 
     stroke_id: str
     height_mm: float
     tilt_deg: float
     height_sd_mm: float
-    tilt_sd_deg: float | None
+    tilt_sd_deg: float
     rms: float
     flags: tuple[str, ...]
     commanded_height_mm: float | None
@@ -94,11 +90,11 @@ class Inversion:
 
 @dataclass(frozen=True, slots=True)
 class AlignedStroke:
-    """A stroke on its field: coverage, and the anchor in mm from the left and top edge if it is known."""
+    """A stroke on its field: coverage, and the anchor in mm from the left and top edge."""
 
     stroke: Stroke
     image: Image
-    place_mm: tuple[float, float] | None
+    place_mm: tuple[float, float]
 
 
 def invert_recording(
@@ -121,24 +117,21 @@ def invert_recording(
         raise CalibrationError(str(recording.path), "holds drags: only presses are inverted")
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     made = Inversion(recording.header, recording.path, digest, settings, [], [])
-    anchored, loose = _inverters(recording.header, settings)
-    waiting: dict[bool, list[AlignedStroke]] = {True: [], False: []}
+    inverter = _inverter(recording.header, settings)
+    waiting: list[AlignedStroke] = []
     chosen = {stroke.stroke_id for stroke in spread(strokes, presses)}
     for capture in counted(recording.captures(), "presses recovered", len(strokes), progress):
         if capture.stroke.stroke_id not in chosen:
             continue
         try:
-            aligned = align(capture, calibration, settings.view)
+            waiting.append(align(capture, calibration, settings.view))
         except (CaptureRefused, SessionDamaged) as error:
             made.refused.append((capture.stroke.stroke_id, error.what))
             continue
-        known = aligned.place_mm is not None
-        waiting[known].append(aligned)
-        if len(waiting[known]) == BATCH:
-            _invert(made, anchored if known else loose, waiting[known])
-            waiting[known] = []
-    for known, rest in waiting.items():
-        _invert(made, anchored if known else loose, rest)
+        if len(waiting) == BATCH:
+            _invert(made, inverter, waiting)
+            waiting = []
+    _invert(made, inverter, waiting)
     order = {stroke.stroke_id: number for number, stroke in enumerate(strokes)}
     made.rows.sort(key=lambda row: order[row.stroke_id])
     made.rows[:] = with_model_error(made.rows, settings.fitted_cells)
@@ -155,7 +148,7 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list
     deep = np.array([nan if (h := row.commanded_height_mm) is None else row.height_mm - h for row in rows])
     tilted = np.array([nan if (a := row.commanded_tilt_deg) is None else row.tilt_deg - a for row in rows])
     height_sd = np.array([row.height_sd_mm for row in rows])
-    tilt_sd = np.array([nan if row.tilt_sd_deg is None else row.tilt_sd_deg for row in rows])
+    tilt_sd = np.array([row.tilt_sd_deg for row in rows])
     known = [
         cell for cell, one, other in zip(cells, deep, tilted, strict=True) if np.isfinite(one) and np.isfinite(other)
     ]
@@ -168,16 +161,16 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list
     out: list[Row] = []
     for k, row in enumerate(rows):
         flags = set(row.flags)
-        if np.isnan(more_mm[k]) or (row.tilt_sd_deg is not None and np.isnan(more_deg[k])):
+        if np.isnan(more_mm[k]) or np.isnan(more_deg[k]):
             flags.add(NO_MODEL_ERROR)
         else:
-            wider = None if row.tilt_sd_deg is None else float(np.hypot(row.tilt_sd_deg, more_deg[k]))
+            wider = float(np.hypot(row.tilt_sd_deg, more_deg[k]))
             row = replace(row, height_sd_mm=float(np.hypot(row.height_sd_mm, more_mm[k])), tilt_sd_deg=wider)
         for name, (value, sd, among) in {
             "H": (row.height_mm, row.height_sd_mm, [cell[0] for cell in known]),
             "alpha": (row.tilt_deg, row.tilt_sd_deg, [cell[1] for cell in known]),
         }.items():
-            if sd is not None and covers_most(value, sd, among):
+            if covers_most(value, sd, among):
                 flags.add(NOT_INFORMATIVE[name])
         out.append(replace(row, flags=tuple(sorted(flags))))
     return out
@@ -199,40 +192,21 @@ def spread(strokes: Sequence[_T], most: int | None) -> Sequence[_T]:
 
 def align(capture: Capture, calibration: Calibration | None, view: Field) -> AlignedStroke:
     """Place a capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
-    stroke = capture.stroke
-    if stroke.px_per_mm is None or stroke.anchor_px is not None:
-        prepared = prepare_press(capture, calibration, view)
-    else:  # an import without an anchor
-        whole = prepare(
-            rescale(capture.image(), stroke.px_per_mm, capture.where), None, capture.where, Params.of(calibration)
-        )
-        prepared = crop(whole, view.corner_around_px(whole.mask), view)
+    stroke, prepared = capture.stroke, prepare_press(capture, calibration, view)
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph, cell or field")
-    anchor = prepared.anchor_px
-    place_mm = None if anchor is None else (anchor[0] / PX_PER_MM, anchor[1] / PX_PER_MM)
-    return AlignedStroke(stroke, covered(prepared), place_mm)
+    assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
+    x_px, y_px = prepared.anchor_px
+    return AlignedStroke(stroke, covered(prepared), (x_px / PX_PER_MM, y_px / PX_PER_MM))
 
 
 def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> None:
-    """Invert a batch, all with or all without an anchor, and file each stroke as recovered or refused."""
+    """Invert a batch, and file each stroke as recovered or refused."""
     if not batch:
         return
     images = np.stack([aligned.image for aligned in batch])
-    if inverter.known is Known.ANCHOR:
-        heading = np.array([aligned.stroke.heading_deg for aligned in batch])
-        found = inverter(images, np.array([aligned.place_mm for aligned in batch]), heading)
-        _file(made, batch, found)
-        return
-    for aligned in batch:
-        # Without an anchor alpha keeps the assumed value, so the commanded tilt is preferred.
-        tilt = aligned.stroke.tilt_deg
-        low, high = made.settings.within.tilt_deg
-        assumed = made.settings.assumed_tilt_deg if tilt is None else min(max(tilt, low), high)
-        _file(made, [aligned], inverter.assuming(assumed)(aligned.image[None]))
-
-
-def _file(made: Inversion, batch: list[AlignedStroke], found: Recovered) -> None:
+    heading = np.array([aligned.stroke.heading_deg for aligned in batch])
+    found = inverter(images, np.array([aligned.place_mm for aligned in batch]), heading)
     for k, aligned in enumerate(batch):
         stroke, flags = aligned.stroke, found.flags[k]
         ident = stroke.stroke_id
@@ -242,11 +216,10 @@ def _file(made: Inversion, batch: list[AlignedStroke], found: Recovered) -> None
         if problem := _unnameable(ident, {row.stroke_id for row in made.rows}):
             made.refused.append((ident, problem))
             continue
-        tilt_sd = float(found.sigma[k, 1]) if "tilt_deg" in found.fitted else None
         made.rows.append(
             Row(
-                ident, float(found.values[k, 0]), float(found.values[k, 1]), float(found.sigma[k, 0]), tilt_sd,
-                float(found.rms[k]), tuple(sorted(flags)), stroke.height_mm, stroke.tilt_deg,
+                ident, float(found.values[k, 0]), float(found.values[k, 1]), float(found.sigma[k, 0]),
+                float(found.sigma[k, 1]), float(found.rms[k]), tuple(sorted(flags)), stroke.height_mm, stroke.tilt_deg,
             )
         )  # fmt: skip
 
@@ -260,18 +233,16 @@ def _unnameable(ident: str, taken: set[str]) -> str:
     return "its name cannot stand in a protocol" if ident[0] in ".-~" else ""
 
 
-def _inverters(header: Header, settings: Settings) -> tuple[Inverter, Inverter]:
-    """Make the inverters for captures with and without a known anchor."""
+def _inverter(header: Header, settings: Settings) -> Inverter:
     brush = brush_of(header)
     basis = Basis(brush) if settings.lam is None else Basis(brush, settings.lam)
     options = {"within": settings.within, "noise": Noise.BLOCKS, "px_mm": settings.view.mm_per_px}
-    known = options | {"anchor_sigma_mm": settings.anchor_sigma_mm}
-    loose = options | {"known": Known.NOTHING, "tilt_deg": settings.within.tilt_deg[0]}
+    options |= {"anchor_sigma_mm": settings.anchor_sigma_mm}
     try:
         if settings.fitted is None and settings.model == "ccd-bsm":
-            return Inverter.of_brush(basis, **known), Inverter.of_brush(basis, **loose)
+            return Inverter.of_brush(basis, **options)
         model = settings.fitted or stroke_model(settings.model, brush, basis.lam)
-        return Inverter.of_model(model, **known), Inverter.of_model(model, **loose)
+        return Inverter.of_model(model, **options)
     except UnknownModelError as error:
         raise CalibrationError("--model", str(error)) from None
     except DomainError as error:
@@ -285,7 +256,7 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, flo
     """
     pairs = {
         "H": [(r.height_mm, r.height_sd_mm, r.commanded_height_mm) for r in rows],
-        "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows if r.tilt_sd_deg is not None],
+        "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows],
     }
     for name, found in pairs.items():
         known = [(value - asked, sd) for value, sd, asked in found if asked is not None]

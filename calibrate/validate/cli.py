@@ -136,11 +136,12 @@ def captures(
     from calibrate.files import check_target
     from calibrate.validate.sources import open_session
     from calibrate.validate.tuning import align_captures, write_captures
+    from sessions.cells import number
 
     cells: list[tuple[float, float]] = []
     for text in leave_out or ():
         try:
-            height, tilt = (float(part) for part in text.split("/"))
+            height, tilt = (number(part) for part in text.split("/"))
         except ValueError:
             raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
         cells.append((height, tilt))

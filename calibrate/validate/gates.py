@@ -11,6 +11,7 @@ from typing import ClassVar
 from calibrate.compare.field import Alignment, Tone
 from calibrate.errors import CalibrationError
 from calibrate.validate.report.data import Report
+from sessions.cells import number
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     ">=": operator.ge,
@@ -66,7 +67,7 @@ def parse_gate(text: str) -> Gate:
     if found["statistic"] not in STATISTICS:
         raise _bad(text, f"{found['statistic']!r} is not one of {', '.join(STATISTICS)}")
     try:
-        limit = float(found["limit"])
+        limit = number(found["limit"])
     except ValueError:
         raise _bad(text, f"{found['limit']!r} is not a number") from None
     if not 0.0 <= limit <= 1.0:

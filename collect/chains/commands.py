@@ -12,6 +12,7 @@ from calibrate.artefact import artefacts
 from collect.errors import ConfigError
 from collect.headless import stop_signals
 from collect.protocols.config import load_protocol
+from collect.rig.config import load_rig
 from sessions.errors import SessionError
 from sessions.reader import Recording
 
@@ -54,13 +55,20 @@ def run_command(say: Say, *arguments: str | Path, accepts: tuple[int, ...] = (0,
     return code
 
 
-def finished_session(root: Path, protocol: Path) -> Path | None:
-    """The newest finished session of exactly this protocol under `root`. Raises `ConfigError` for a bad protocol."""
-    wanted = load_protocol(protocol).model_dump_json()
+def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
+    """The newest finished session under `root` of exactly this protocol with the brush, ink and paper of `config`.
+
+    Raises `ConfigError` for a bad file.
+    """
+    if not root.is_dir():
+        return None
+    rig, wanted = load_rig(config), load_protocol(protocol).model_dump_json()
+    material = (rig.brush.name, rig.ink.name, rig.paper.name)
     found: list[Path] = []
-    for folder in root.iterdir() if root.is_dir() else ():
+    for folder in root.iterdir():
         try:
-            if folder.is_dir() and Recording(folder).header.protocol == wanted:
+            header = Recording(folder).header
+            if header.protocol == wanted and (header.brush, header.ink, header.paper) == material:
                 found.append(folder)
         except SessionError:
             continue  # open, damaged, or no session
@@ -68,15 +76,15 @@ def finished_session(root: Path, protocol: Path) -> Path | None:
 
 
 def collected_session(say: Say, config: Path, protocol: Path, root: Path, options: Sequence[str | Path]) -> Path:
-    """The finished and calibrated session of this protocol under `root`; collected and calibrated if missing.
+    """The finished and calibrated session of these files under `root`; collected and calibrated if missing.
 
     Raises `ConfigError`, `CommandFailed`.
     """
-    session = finished_session(root, protocol)
+    session = finished_session(root, config, protocol)
     if session is None:
         files = ("--config", config, "--protocol", protocol, "--out", root)
         run_command(say, "collect", *files, *options, accepts=(0, GIVEN_UP))
-        session = finished_session(root, protocol)
+        session = finished_session(root, config, protocol)
     if session is None:
         raise ConfigError(root, "", f"holds no finished session of {protocol}, although collection ended")
     if not artefacts(session):

@@ -133,7 +133,7 @@ class Demo:
             self._protocol.write_text(protocol, encoding="utf-8")
 
     def _collect(self) -> None:
-        session = finished_session(self._sessions, self._protocol)
+        session = finished_session(self._sessions, self._rig.config, self._protocol)
         if session is not None and not _report(session).is_file():
             say(f"continuing with {session}: its collection is finished")
             self._session = session
@@ -147,7 +147,7 @@ class Demo:
         sheet = ("--sheet", "1") if earlier else ()
         files = ("--config", self._rig.config, "--protocol", self._protocol, "--out", self._sessions)
         self._collect_code = run_command(say, "collect", *files, "--no-tui", *sheet, accepts=(0, GIVEN_UP))
-        self._session = finished_session(self._sessions, self._protocol)
+        self._session = finished_session(self._sessions, self._rig.config, self._protocol)
 
     def _fit(self) -> None:
         session = self._finished()
@@ -194,7 +194,7 @@ class Demo:
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""
-        if protocol.exists() and finished_session(self._sessions, protocol) is not None:
+        if protocol.exists() and finished_session(self._sessions, self._rig.config, protocol) is not None:
             return
         self._rig.ready()
         if not open_sessions(self._sessions):

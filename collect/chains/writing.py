@@ -121,7 +121,7 @@ class Writing:
     def _written(self, protocol: Path) -> Path:
         """The finished and calibrated session of a plan."""
         request, options = self._request, list(self._request.collect_options)
-        if self._sheet is not None and finished_session(request.sessions, protocol) is None:
+        if self._sheet is not None and finished_session(request.sessions, request.config, protocol) is None:
             options += ["--sheet", str(self._sheet)]
             self._sheet = None  # used up: the next session asks again
         return collected_session(self._say, request.config, protocol, request.sessions, options)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -20,7 +21,7 @@ from collect.protocols.calibration import CalibrationConfig
 from collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
 from collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
 from collect.rig.config_file import read_text, read_toml, refusal
-from sessions.cells import as_text
+from sessions.cells import as_text, number
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
 MAX_EFFECTIVE_BYTES = 64 * 1024 * 1024
@@ -173,9 +174,18 @@ def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others
     return columns
 
 
+def _value(row: type[BaseModel], column: str, cell: str) -> str | float:
+    if not allowed(row, column):
+        return cell
+    try:
+        return number(cell)
+    except ValueError:
+        return math.nan  # outside any range
+
+
 def _checked(path: Path, line: int, row: type[_R], values: dict[str, str]) -> _R:
     try:
-        return row.model_validate(values)
+        return row.model_validate({column: _value(row, column, cell) for column, cell in values.items()})
     except ValidationError as error:
         first = error.errors()[0]
         column = str(first["loc"][0])

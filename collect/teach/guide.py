@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from collect.operator import Choice
+from sessions.cells import number
 
 Picture = NDArray[np.uint8]
 """(h, w) gray or (h, w, 3) BGR."""
@@ -107,7 +108,7 @@ class JogStep:
 def number_in(line: str, unit: str, low: float, high: float) -> float:
     """The number that a person typed, with a point or a comma. Raises ValueError, worded for that person."""
     try:
-        value = float(line.replace(",", "."))
+        value = number(line.replace(",", "."))
     except ValueError:
         raise ValueError(f"{line!r} is not a number") from None
     if not low <= value <= high:

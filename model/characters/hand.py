@@ -81,7 +81,7 @@ def _point(values: list[Any], where: str, cell: Cell) -> tuple[float, float, flo
     for name, value in zip(COLUMNS, values, strict=True):
         low, high = (0.0, MAX_WIDTH_MM) if name == "width_mm" else (0.0, cell.side_mm)
         try:
-            number = math.nan if isinstance(value, bool) else float(value)
+            number = math.nan if isinstance(value, bool) or "_" in str(value) else float(value)
         except (TypeError, ValueError, OverflowError):
             number = math.nan
         if not low <= number <= high:

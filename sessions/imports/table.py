@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sessions.cells import as_text
+from sessions.cells import as_text, number
 from sessions.disk import read_bounded
 from sessions.errors import InputError
 from sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
@@ -121,7 +121,7 @@ def _columns(
         raise InputError(table, f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
     if "px_per_mm" not in names and "px_per_mm_x" not in names and px_per_mm is None:
         raise InputError(table, "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm")
-    required = [(name, "presses need it") for name in ("height_mm", "tilt_deg") if kind == "press"]
+    required = [(name, "presses need it") for name in ("height_mm", "tilt_deg", "start_x_px") if kind == "press"]
     for first, second in PAIRS:
         required += [(b, f"`{a}` needs it") for a, b in ((first, second), (second, first)) if a in names]
     for name, why in required:
@@ -156,7 +156,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
 
     def value(name: str, factor: float = 1.0) -> float:
         try:
-            parsed = float(fields[name]) * factor
+            parsed = number(fields[name]) * factor
         except ValueError:
             parsed = math.nan
         if not math.isfinite(parsed):

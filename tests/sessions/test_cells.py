@@ -5,7 +5,7 @@ import io
 
 import pytest
 
-from sessions.cells import CsvWriter, as_cell, as_text
+from sessions.cells import CsvWriter, as_cell, as_text, number
 from sessions.export.export import export
 from sessions.imports.photographs import ImportOptions
 from sessions.reader import Recording
@@ -39,3 +39,14 @@ def test_names_go_out_and_in_again_by_our_own_importer(make, tmp_path, photos, r
         cells = [row["stroke_id"] for row in csv.DictReader(file)]
     assert cells == ["'=1+1", "'@home", "'-2-3", "-5", "''=x", "a"]
     assert [as_text(cell) for cell in cells] == names
+
+
+@pytest.mark.parametrize(("text", "value"), [("10", 10.0), (" -.5 ", -0.5), ("+1.e3", 1000.0), ("2.5E-1", 0.25)])
+def test_a_number_is_read_as_it_is_written(text: str, value: float) -> None:
+    assert number(text) == value
+
+
+@pytest.mark.parametrize("text", ["1_0", "1e1_0", "nan", "-inf", "1e999", "", "0x10", "1,5", "1 0", "１０"])
+def test_what_nobody_writes_as_a_number_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a finite number"):
+        number(text)

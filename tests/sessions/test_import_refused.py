@@ -16,9 +16,10 @@ from sessions.imports.photographs import ImportOptions, import_photographs
 from sessions.reader import Recording
 from sessions.recording import messages
 
+START = {"start_x_px": "1", "start_y_px": "1"}
 ROWS = [
-    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},
-    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"},
+    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"} | START,
+    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"} | START,
 ]
 
 
@@ -26,64 +27,95 @@ def lines(*rows):
     return "\n".join(rows) + "\n"
 
 
+def presses(head, *rows):
+    """A table whose lines say where the presses began."""
+    return lines(f"{head},start_x_px,start_y_px", *(row and f"{row},1,1" for row in rows))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "table.csv: column `file` is missing; found: none"),
         (lines("name,px_per_mm", "a.png,1"), "column `file` is missing; found: name, px_per_mm"),
-        (lines("file,px_per_mm,height_mm,tilt_deg"), "has no rows"),
+        (presses("file,px_per_mm,height_mm,tilt_deg"), "has no rows"),
         (
             lines("file,height_mm,tilt_deg", "a.png,1,1"),
             "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing",
         ),
-        (lines("file,px_per_mm_x,height_mm,tilt_deg", "a.png,1,1,1"), "column `px_per_mm_y` is missing"),
+        (presses("file,px_per_mm_x,height_mm,tilt_deg", "a.png,1,1,1"), "column `px_per_mm_y` is missing"),
         (lines("file,px_per_mm,tilt_deg", "a.png,1,1"), "column `height_mm` is missing; presses need it"),
         (lines("file,px_per_mm,height_mm", "a.png,1,1"), "column `tilt_deg` is missing; presses need it"),
+        (
+            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1"),
+            "table.csv: column `start_x_px` is missing; presses",
+        ),
         (lines("file,px_per_mm,height_mm,tilt_deg,start_x_px", "a.png,1,1,1,1"), "column `start_y_px` is missing"),
         (
-            lines("file,px_per_mm,height_mm,tilt_deg,l_furlong", "a.png,1,1,1,1"),
+            lines("file,px_per_mm,height_mm,tilt_deg,start_x_px,start_y_px", "a.png,1,1_0,1,1,1"),
+            "line 2, column `height_mm`: '1_0' is not a finite",
+        ),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg,l_furlong", "a.png,1,1,1,1"),
             "must end in one of: mm, cm, m, in, deg",
         ),
-        (lines("file,px_per_mm,height_mm,tilt_deg,l_mm,l_cm", "a.png,1,1,1,1,1"), "column `l_mm` occurs twice"),
-        (lines("file,px_per_mm,height_mm,tilt_deg,file", "a.png,1,1,1,b.png"), "column `file` occurs twice"),
-        (lines("file,px_per_mm,height_mm,tilt_deg,", "a.png,1,1,1,"), "column `` has no known unit"),
+        (presses("file,px_per_mm,height_mm,tilt_deg,l_mm,l_cm", "a.png,1,1,1,1,1"), "column `l_mm` occurs twice"),
+        (presses("file,px_per_mm,height_mm,tilt_deg,file", "a.png,1,1,1,b.png"), "column `file` occurs twice"),
+        (presses("file,px_per_mm,height_mm,tilt_deg,", "a.png,1,1,1,"), "column `` has no known unit"),
         (lines('"fi\nle",px_per_mm', "a.png,1"), "line 1 holds control characters"),
         (
-            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,deep,1"),
+            presses("file,px_per_mm,height_mm,tilt_deg", "a.png,1,deep,1"),
             "line 2, column `height_mm`: 'deep' is not a fin",
         ),
         (
-            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,nan"),
+            presses("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,nan"),
             "line 2, column `tilt_deg`: 'nan' is not a finite",
         ),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,inf,1,1"), "line 2, column `px_per_mm`: 'inf' is not a fin"),
-        (lines("file,px_per_mm,height_mm,tilt_deg,l_m", "a.png,1,1,1,1e308"), "column `l_m`: '1e308' is not a finite"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,0,1,1"), "line 2: px_per_mm = (0.0, 0.0), allowed: 0.01 to"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1"), "line 2 has 3 fields, expected 4"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1,1"), "line 2 has 5 fields, expected 4"),
         (
-            lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1", "", "./a.png,1,1,1"),
+            presses("file,px_per_mm,height_mm,tilt_deg", "a.png,inf,1,1"),
+            "line 2, column `px_per_mm`: 'inf' is not a fin",
+        ),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg,l_m", "a.png,1,1,1,1e308"),
+            "column `l_m`: '1e308' is not a finite",
+        ),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg", "a.png,0,1,1"),
+            "line 2: px_per_mm = (0.0, 0.0), allowed: 0.01 to",
+        ),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1"), "line 2 has 5 fields, expected 6"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1,1"), "line 2 has 7 fields, expected 6"),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1", "", "./a.png,1,1,1"),
             "line 4: stroke a appears twice",
         ),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "c.png,1,1,1"), "line 2: file 'c.png' is not in photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", ",1,1,1"), "line 2: file '' is not in photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", ".,1,1,1"), "line 2: file '.' is not in photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "../x.png,1,1,1"), "line 2: file '../x.png' lies outside photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "/x.png,1,1,1"), "line 2: file '/x.png' lies outside photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "link.png,1,1,1"), "line 2: file 'link.png' lies outside photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "loop.png,1,1,1"), "line 2: file 'loop.png' lies outside photos/"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "x" * 5000 + ",1,1,1"), "line 2: file 'xxx"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", '"a\n.png",1,1,1'), "column `file`: 'a\\n.png' holds control"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "a\0.png,1,1,1"), "line 2, column `file`: 'a\\x00.png' holds"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1\u2028,1"), "line 2 has 5 fields"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", '"a.png"x,1,1,1'), "line 2: ',' expected after '\"'"),
-        (lines("file,px_per_mm,height_mm,tilt_deg", '"' + "a" * 200_000), "line 2: "),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "c.png,1,1,1"), "line 2: file 'c.png' is not in photos/"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", ",1,1,1"), "line 2: file '' is not in photos/"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", ".,1,1,1"), "line 2: file '.' is not in photos/"),
         (
-            lines("file,px_per_mm,height_mm,tilt_deg", "text.png,1,1,1"),
+            presses("file,px_per_mm,height_mm,tilt_deg", "../x.png,1,1,1"),
+            "line 2: file '../x.png' lies outside photos/",
+        ),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "/x.png,1,1,1"), "line 2: file '/x.png' lies outside photos/"),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg", "link.png,1,1,1"),
+            "line 2: file 'link.png' lies outside photos/",
+        ),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg", "loop.png,1,1,1"),
+            "line 2: file 'loop.png' lies outside photos/",
+        ),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "x" * 5000 + ",1,1,1"), "line 2: file 'xxx"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", '"a\n.png",1,1,1'), "column `file`: 'a\\n.png' holds control"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "a\0.png,1,1,1"), "line 2, column `file`: 'a\\x00.png' holds"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", "a.png,1,1,1\u2028,1"), "line 2 has 7 fields"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", '"a.png"x,1,1,1'), "line 2: ',' expected after '\"'"),
+        (presses("file,px_per_mm,height_mm,tilt_deg", '"' + "a" * 200_000), "line 2: "),
+        (
+            presses("file,px_per_mm,height_mm,tilt_deg", "text.png,1,1,1"),
             "photos/text.png: is not a complete PNG or JPEG image",
         ),
         (
-            lines("file,px_per_mm,height_mm,tilt_deg", "cut.png,1,1,1"),
+            presses("file,px_per_mm,height_mm,tilt_deg", "cut.png,1,1,1"),
             "photos/cut.png: is not a complete PNG or JPEG image",
         ),
     ],

@@ -15,9 +15,10 @@ from sessions.reader import Recording
 from sessions.recording.schemas import Source
 from tests.command import brushloop
 
+START = {"start_x_px": "1", "start_y_px": "1"}
 ROWS = [
-    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"},
-    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"},
+    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"} | START,
+    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"} | START,
 ]
 
 

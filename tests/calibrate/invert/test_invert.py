@@ -38,13 +38,13 @@ def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 
-def session(folder: Path, *, anchored: bool = True, kind: str = "press") -> Path:
+def session(folder: Path, *, kind: str = "press") -> Path:
     photos = folder / "photos"
     photos.mkdir()
-    rows = ["file,height_mm,tilt_deg,px_per_mm" + (",start_x_px,start_y_px" if anchored else "")]
+    rows = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(PRESSES):
         cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt))
-        rows.append(f"p{k}.png,{height},{tilt},{PX}" + (f",{START[0] * PX},{START[1] * PX}" if anchored else ""))
+        rows.append(f"p{k}.png,{height},{tilt},{PX},{START[0] * PX},{START[1] * PX}")
     (photos / "strokes.csv").write_text("\n".join(rows) + "\n")
     out = folder / "sessions" / "shots"
     import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind=kind), "test", lambda: 1)
@@ -76,17 +76,6 @@ def test_some_presses_are_chosen_evenly_and_the_others_left_alone(tmp_path: Path
     assert [row.stroke_id for row in made.rows] == ["p0", "p1"]
     assert made.refused == []
     assert [list(spread([*range(9)], most)) for most in (3, 9, 20, None)] == [[0, 3, 6], *[[*range(9)]] * 3]
-
-
-def test_without_an_anchor_alpha_is_what_was_commanded_and_flagged(tmp_path: Path) -> None:
-    made = invert_recording(session(tmp_path, anchored=False), Settings(), None)
-    assert made.refused == []
-    for row, (height, tilt) in zip(made.rows, PRESSES, strict=True):
-        assert "alpha_unknown" in row.flags
-        assert row.tilt_sd_deg is None
-        assert row.tilt_deg == tilt
-        assert row.height_mm == pytest.approx(height, abs=0.1)
-    assert load_protocol(write_inversion(made, tmp_path / "recovered.csv")).kind == "replay"
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

@@ -17,8 +17,13 @@ from collect.chains.loop import LoopRequest
 from collect.chains.writing import WritingRequest
 from collect.errors import ConfigError
 from collect.protocols.config import load_protocol
+from collect.rig.config import load_rig
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
 from sessions.store import SessionStore
 from tests.sessions.conftest import Make
+
+RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
 
 
 class Chain:
@@ -33,8 +38,12 @@ class Chain:
         self.ran.append(name)
         if name == "collect":
             sessions, protocol = Path(arguments[5]), Path(arguments[3])
+            rig = load_rig(Path(arguments[1]))
             header = Make.header.model_copy(
                 update={
+                    "brush": rig.brush.name,
+                    "ink": rig.ink.name,
+                    "paper": rig.paper.name,
                     "session_id": f"grid-{1 + len(list(sessions.glob('*')))}",
                     "protocol": load_protocol(protocol).model_dump_json(),
                 }
@@ -67,6 +76,7 @@ class FakeRig:
 
     def __init__(self, chain: Chain, folder: Path) -> None:
         self.config = folder / "rig.toml"
+        self.config.write_text(RIG)
         self.start = lambda: chain.rig("rig starts")
         self.ready = lambda: chain.rig("rig")
         self.fresh_sheet = lambda _say: chain.rig("fresh sheet")

@@ -12,10 +12,16 @@ from pathlib import Path
 import pytest
 
 from collect.chains import commands
-from collect.chains.commands import CommandFailed, run_command
+from collect.chains.commands import CommandFailed, finished_session, run_command
 from collect.chains.loop import SETTINGS as FILE
 from collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
 from collect.errors import ConfigError
+from collect.protocols.config import load_protocol
+from collect.rig.config import load_rig
+from drivers.sim.config import SimConfig
+from drivers.sim.rig_toml import Addresses, rig_toml
+from sessions.store import SessionStore
+from tests.sessions.conftest import Make
 
 SETTINGS = Settings(
     original="grid-01",
@@ -46,13 +52,36 @@ def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -
     path = tmp_path / "recovered.csv"
     path.write_text("stroke_id,flags\na,\nb,at_bound\nc,\nd,at_bound\n")
     check_recovered(path)
-    path.write_text("stroke_id,flags\na,\nb,at_bound\nc,alpha_unknown at_bound\n")
+    path.write_text("stroke_id,flags\na,\nb,at_bound\nc,upright at_bound\n")
     with pytest.raises(ConfigError, match="2 of 3 presses were recovered at a bound") as caught:
         check_recovered(path)
     assert caught.value.exit_code == 2
     path.write_bytes(b"stroke_id,flags\n\xff,\n")
     with pytest.raises(ConfigError, match=r"recovered\.csv: is not UTF-8 at byte 16"):
         check_recovered(path)
+
+
+def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path: Path) -> None:
+    """The same protocol was pressed with two inks: each rig.toml finds its own session, and a third ink finds none."""
+    protocol = tmp_path / "protocol.toml"
+    protocol.write_text('kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n')
+    rigs = {ink: tmp_path / f"{ink}.toml" for ink in ("sumi", "walnut", "red")}
+    text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+    for ink, path in rigs.items():
+        path.write_text(text.replace("simulated ink", ink), encoding="utf-8")
+    root = tmp_path / "sessions"
+    for number, ink in enumerate(("sumi", "walnut"), 1):
+        rig = load_rig(rigs[ink])
+        known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
+        asked = {"session_id": f"grid-{number}", "protocol": load_protocol(protocol).model_dump_json()}
+        header = Make.header.model_copy(update=known | asked)
+        store = SessionStore.create(root / header.session_id, header, Make.snapshots, Make().clock())
+        Make().collect(store)
+        store.close()
+        store.release()
+    assert finished_session(root, rigs["sumi"], protocol) == root / "grid-1"
+    assert finished_session(root, rigs["walnut"], protocol) == root / "grid-2"
+    assert finished_session(root, rigs["red"], protocol) is None
 
 
 def test_a_command_that_fails_ends_the_chain_with_its_exit_code(

@@ -40,6 +40,8 @@ def test_the_examples_are_valid(path: Path) -> None:
     ("protocol", "csv", "message"),
     [
         (LIST, "height_mm\n11\nx\n", r"p.csv: line 3: height_mm: .*, more than 0 and at most 100 \(given: 'x'\)$"),
+        (LIST, "height_mm\n1_1\n", r"p.csv: line 2: height_mm: .*, more than 0 and at most 100 \(given: '1_1'\)$"),
+        (LIST, "height_mm,dwell_s\n11,1_0\n", r"p.csv: line 2: dwell_s: must be a number.* \(given: '1_0'\)$"),
         (LIST, "height_mm,tilt_deg\n11,31\n", r"p.csv: line 2: tilt_deg: must be a number, at least 0 and at most 30"),
         (LIST, "height_mm\nnan\n", r"line 2: height_mm: must be a number"),
         (LIST, "height_mm\ninf\n", r"line 2: height_mm: must be a number"),

@@ -144,6 +144,7 @@ def test_a_hand_gives_ways_and_widths() -> None:
         ("x_mm,y_mm,width_mm\n1,2\n", "line 2: 2 cells under 3 columns"),
         ("x_mm,y_mm,width_mm\n1,900,3\n", "line 2: y_mm: must be a number, 0 to 70"),
         ("x_mm,y_mm,width_mm\n1,nan,3\n", "line 2: y_mm: must be a number"),
+        ("x_mm,y_mm,width_mm\n1,1_0,3\n", "line 2: y_mm: must be a number"),
         ("x_mm,y_mm,width_mm\n", "holds no stroke"),
         ("x_mm,y_mm,width_mm\n1,1,3\n2,1,3\n", "stroke 1: is 1 mm long"),
         ('x_mm,y_mm,width_mm\n"1,1,3\n', "is not CSV"),
