@@ -36,6 +36,8 @@ BLANK = "check that the sheet is blank"
 BEFORE, SETTLING, REST = "from a move to its motion", "from steady to the move's end", "the rest"
 PARTS = ("motion", ENCODE, JUDGE, BLANK, FILES, FRAME, INK, STEADY, BEFORE, SETTLING)
 """The first that covers an instant has it."""
+LEAST_MS = 1.0
+"""A part that takes less is no figure: the spans are noted to about a millisecond."""
 Span = tuple[float, float]
 """Begin and end in seconds on the monotonic clock."""
 Spans = dict[str, list[Span]]
@@ -77,7 +79,7 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
     end_s = max(end for _, end in spans["capture"])
     took = share_out(spans, begin_s, end_s)
     motion_s = took.pop("motion") / strokes
-    took[REST] -= DWELL_S * strokes
+    took[REST] = max(took[REST] - DWELL_S * strokes, 0.0)  # some of the dwell lies within other parts
     [(merge_begin_s, merge_end_s)] = spans["merge"]
     took[MERGE] = merge_end_s - merge_begin_s
     once_s = took.pop(BLANK)
@@ -94,11 +96,14 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
         results.append(result(name, percent, "% of motion", f"the goal ({GOAL_PERCENT:g} %)", GOAL_PERCENT / percent))
     for name, seconds in sorted(took.items(), key=lambda item: -item[1]):
         each_ms = 1e3 * seconds / strokes
+        if each_ms < LEAST_MS:
+            continue
         unit = "ms a stroke, waited" if name in WAITS else "ms a stroke"
         if name in watch.cpu_s:
             unit = f"ms a stroke ({1e3 * watch.cpu_s[name] / strokes:.0f} ms of CPU)"
-        results.append(result(name, each_ms, unit, "the motion", 1e3 * motion_s / max(each_ms, 1e-3)))
-    results.append(result(BLANK, 1e3 * once_s, "ms a sheet", "the motion of one stroke", motion_s / max(once_s, 1e-6)))
+        results.append(result(name, each_ms, unit, "the motion", 1e3 * motion_s / each_ms))
+    if 1e3 * once_s >= LEAST_MS:
+        results.append(result(BLANK, 1e3 * once_s, "ms a sheet", "the motion of one stroke", motion_s / once_s))
     return results
 
 

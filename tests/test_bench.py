@@ -1,5 +1,6 @@
 """The benchmarks run, report the agreed fields, and refuse unknown names."""
 
+import datetime as dt
 import json
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import cv2
 import pytest
 
 import bench.__main__
-from bench import footprints, growth, paper_brush, raster, rpc, table, whole
+from bench import footprints, growth, overhead, raster, rpc, table, whole
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.peak import Used, measure
 from bench.processes import started
@@ -60,6 +61,8 @@ def test_the_table_keeps_rows_that_were_not_measured_and_names_missed_goals(tmp_
     table.renew([replace(fast, ratio=12.0)], path)
     rows = [line for line in path.read_text().splitlines() if line.startswith("| `")]
     assert [table.name_of(line) for line in rows] == ["raster-press", "startup"]
+    assert "**Goals that are missed:** `raster-press`." in path.read_text()
+    assert all(line.endswith(f"| {dt.date.today()} |") for line in rows)
     assert "| `raster-press` | 500,000 images/s | 12.00 | 41.00, 39.50 | cv2 | 40, **missed** | 60 | 0 |" in rows[0]
     assert "| 0.90 |  | import typer |  | 10 | 3 | Python" in rows[1]
 
@@ -210,8 +213,12 @@ def test_unknown_name_is_one_line_and_exit_code_2() -> None:
     assert done.stderr == f"unknown bench 'rasta'; known: {', '.join(bench.__main__.benches())}\n"
 
 
-def test_no_outline_has_both_the_paper_s_csim_and_its_ssim_with_the_circle() -> None:
-    bound = paper_brush.circle_bound(seed=1)
-    assert 50.0 < bound.value < 55.0
-    assert bound.ratio == pytest.approx(bound.value / 60.23)
-    assert paper_brush.CHECKED not in paper_brush.SEARCHED
+def test_a_part_that_took_no_time_is_not_published_as_a_negative_one() -> None:
+    """The dwell of a press lies within the wait for a steady arm: nothing is left of the rest to take it from."""
+    spans = {"dip": [(0.0, 1.0)], "capture": [(9.0, 10.0)], "motion": [(0.0, 9.0)], "merge": [(10.0, 10.5)]}
+    watch = overhead.Watch()
+    watch.spans.update(spans | {"encode the still": [(9.0, 10.0)]})
+    found = {one.name: one for one in overhead._results(watch, 1, 0)}
+    assert "overhead: the rest" not in found
+    assert all(one.value >= 0.0 and one.ratio < 1e5 for one in found.values())
+    assert found["overhead: software"].value == pytest.approx(100.0 * 1.5 / 9.0)

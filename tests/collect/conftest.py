@@ -68,7 +68,7 @@ def serving(config: SimConfig) -> Iterator[LoopbackRig]:
     finally:
         loop.call_soon_threadsafe(over.set)
         thread.join(timeout=PATIENCE_S)
-        assert not thread.is_alive(), "waited 30 s for the loopback rig to end"
+        assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the loopback rig to end"
 
 
 @dataclass

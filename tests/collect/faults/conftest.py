@@ -110,4 +110,4 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     yield Stage(rig, loop, gears, tmp_path)
     loop.call_soon_threadsafe(over.set)
     thread.join(timeout=PATIENCE_S)
-    assert not thread.is_alive(), "waited 30 s for the loopback rig to end"
+    assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the loopback rig to end"

@@ -147,7 +147,7 @@ def in_lab(seed: int, trap: Trap | None = None, **options: Any) -> Iterator[InLa
     finally:
         loop.call_soon_threadsafe(over.set)
         thread.join(timeout=PATIENCE_S)
-        assert not thread.is_alive(), "waited 30 s for the lab to end"
+        assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the lab to end"
 
 
 async def first_day(person: InLab, rig_path: Path, *, armed: bool = True) -> Path | None:
