@@ -20,7 +20,9 @@ from bench.realink_network import train_and_predict
 from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.captures import Drawn
-from calibrate.drags.predict import learn
+from calibrate.drags.predict import BETWEEN_SESSIONS, Predictor, learn
+from calibrate.drags.predicted import correction_helps
+from calibrate.drags.residual import captured_distance, clipped
 from calibrate.drags.run import adapt, different
 
 SESSION_SPLITS = 5
@@ -69,19 +71,31 @@ def _compare(
         truth = target.ink[test] > 0.5
         within = learn(target, np.sort(order[-STROKES:])).predictor
         across = learn(source, other)
-        known = across.predictor
+        known = replace(across.predictor, share=BETWEEN_SESSIONS)
         seen = {
             "within": within.ink(target, test),
             "circles": across.stamps.ink(target, test),
             "network": _network(strokes[source_name], other, strokes[target_name], test, seed + k, network_steps),
         }
         seen["zero-shot"], seen["lag, zero-shot"] = known.ink_both_ways(target, test)
+        seen["whole correction, zero-shot"] = across.predictor.ink(target, test)
         for count in ADAPTED:
-            fit = adapt(target, different(target, left, count), known)
-            seen[f"adapted to {count}"] = replace(known, model=fit.model).ink(target, test)
+            images = different(target, left, count)
+            adapted = replace(known, model=adapt(target, images, known).model)
+            helps = correction_helps(*adapted.ink_both_ways(target, images), target.ink[images] > 0.5)
+            seen[f"adapted to {count}"] = adapted.ink_both_ways(target, test)[0 if helps else 1]
+        found.setdefault("slope of what the lag misses", []).append(_slope(across.predictor, target, test))
         for name, ink in seen.items():
             found.setdefault(name, []).append(binary_scores(ink, truth).mean(axis=0))
     return {name: np.array(each) for name, each in found.items()}
+
+
+def _slope(known: Predictor, target: Drawn, images: NDArray[np.int64]) -> Floats:
+    """What the lag misses in a session, regressed through zero on the correction of the other one; given twice."""
+    correction, base = known.correction(target, images), clipped(known.distance(target, images))
+    assert correction is not None, "imported strokes have commands, so they have a correction"
+    missed = clipped(captured_distance(target.ink[images] > 0.5, target.mm_per_px)) - base
+    return np.full(2, float((missed * correction).sum() / (correction**2).sum()))
 
 
 def _network(

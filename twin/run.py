@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
@@ -83,16 +84,25 @@ class TwinStopped(Exception):
 def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
     """Processes that draw presses, one for each core; they end with this one, even if it is killed.
 
-    Raises `TwinStopped` if one of them ends before the block does, as when the system runs out of memory.
+    Raises `TwinStopped` on SIGTERM, once what is being drawn is drawn, and if one of them ends before the block does,
+    as when the system runs out of memory.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of matrix products would compete with the processes
     count = min(os.cpu_count() or 1, most)
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
-        try:
-            yield pool
-        except BrokenExecutor:
-            raise TwinStopped("a process that drew presses was ended (memory?): the same command continues") from None
+
+    def terminated(_number: int, _frame: object) -> None:
+        raise TwinStopped("SIGTERM: the same command continues")
+
+    before = signal.signal(signal.SIGTERM, terminated)  # a process that just ends leaks the pool's semaphores
+    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent)
+    try:
+        yield pool
+    except BrokenExecutor:
+        raise TwinStopped("a process that drew presses was ended (memory?): the same command continues") from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+        signal.signal(signal.SIGTERM, before)
 
 
 def _end_with_parent() -> None:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+BETWEEN_SESSIONS = 0.66
+"""Share of a correction that is used in another session than the one it was learned in: the slope, through zero, of
+what the lag misses there on the correction. It is .75 and .57 for two sessions of one brush (`bench realink`)."""
 FIT_MM = 0.8
 """Scale of the images that the parameters are fitted to: finer ones do not change the fit."""
 STAMP_SPREAD_MM = 1.5
@@ -39,6 +42,8 @@ class Predictor:
     kept: Kept | None = None
     learned: tuple[Residual, DragModel] | None = None
     """The ridges over `kept`, and the model that they correct."""
+    share: float = 1.0
+    """Share of the correction that is used: 1 in the session that it was learned in, `BETWEEN_SESSIONS` in others."""
 
     def ink(self, drawn: Drawn, images: Indices) -> NDArray[np.bool_]:
         """The ink that these images should show, (n, len(y_mm), len(x_mm))."""
@@ -64,7 +69,7 @@ class Predictor:
         residual, model = self.learned
         base = self.kept.base(model, chosen(drawn, images)[0])
         change = residual.add(drawn.commands[images], base) - clipped(base)
-        return self.kept.placed(change, drawn.x_mm, drawn.y_mm)
+        return self.share * self.kept.placed(change, drawn.x_mm, drawn.y_mm)
 
     def is_ink(self, away_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Whether a pixel at this signed distance counts as ink."""
@@ -96,8 +101,8 @@ def learn(drawn: Drawn, images: Indices) -> Learned:
     return Learned(fit, Predictor(fit.model, fit.spread_mm, above, kept, learned), _stamps(drawn, images, stamps))
 
 
-def predictors(artefact: DragArtefact, where: str) -> tuple[Predictor, Predictor | None]:
-    """The predictor of an artefact, and that of its circle stamps if it has any.
+def predictors(artefact: DragArtefact, where: str, recording_sha256: str) -> tuple[Predictor, Predictor | None]:
+    """The predictor of an artefact for a recording, and that of its circle stamps if it has any.
 
     Raises `CalibrationError` for ink that cannot be read.
     """
@@ -105,7 +110,9 @@ def predictors(artefact: DragArtefact, where: str) -> tuple[Predictor, Predictor
         learned = artefact.kept.residual() if artefact.kept is not None else None
     except (ValueError, np.linalg.LinAlgError) as error:
         raise CalibrationError(where, f"kept: {error}") from None
-    ours = Predictor(artefact.model(), artefact.spread_mm, artefact.ink_above, artefact.kept, learned)
+    own = not artefact.prior and artefact.recording_sha256 == recording_sha256
+    share = 1.0 if own else BETWEEN_SESSIONS
+    ours = Predictor(artefact.model(), artefact.spread_mm, artefact.ink_above, artefact.kept, learned, share)
     stamps = artefact.stamps
     if stamps is None:
         return ours, None

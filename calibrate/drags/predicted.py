@@ -46,6 +46,8 @@ class Predictions:
     drawn: Drawn
     seen: NDArray[np.bool_]
     """(n, rows, columns) predicted ink."""
+    corrected: bool = True
+    """Whether the correction was used, as the strokes of the session that were seen decide."""
 
     @property
     def scored(self) -> tuple[PredictedStroke, ...]:
@@ -112,17 +114,20 @@ def predict_session(
 ) -> Predictions:
     """Predict every usable stroke of a session. Raises `CalibrationError` for a file that is no fit of drags."""
     artefact = load_artefact(fit, DragArtefact)
-    ours, stamps = predictors(artefact, str(fit))
     drawn = read_drags(session, artefact.mm_per_px, calibration, progress)
+    ours, stamps = predictors(artefact, str(fit), drawn.recording_sha256)
     truth = drawn.ink > 0.5
-    seen, alone = _in_pieces(drawn, ours)
+    known = set(artefact.fitted_strokes) if artefact.recording_sha256 == drawn.recording_sha256 else set[str]()
+    corrected, alone = _in_pieces(drawn, ours)
+    fitted = np.array([name in known for name in drawn.stroke_ids])
+    helps = not artefact.prior or correction_helps(corrected[fitted], alone[fitted], truth[fitted])
+    seen = corrected if helps else alone
     rows = {OURS: binary_scores(seen, truth)}
     if ours.kept is not None and drawn.commands is not None:
         rows[LAG] = binary_scores(alone, truth)
     if stamps is not None:
         rows[STAMPS] = binary_scores(_in_pieces(drawn, stamps)[0], truth)
     ceiling = _ceiling(drawn, truth)
-    known = set(artefact.fitted_strokes) if artefact.recording_sha256 == drawn.recording_sha256 else set[str]()
     strokes = [
         PredictedStroke(
             name,
@@ -133,7 +138,15 @@ def predict_session(
         )
         for k, name in enumerate(drawn.stroke_ids)
     ]
-    return Predictions(artefact, tuple(strokes), drawn, seen)
+    return Predictions(artefact, tuple(strokes), drawn, seen, helps)
+
+
+def correction_helps(corrected: NDArray[np.bool_], alone: NDArray[np.bool_], truth: NDArray[np.bool_]) -> bool:
+    """Whether the strokes that were seen are predicted better with the correction; as usual if none was seen."""
+    if not len(truth):
+        return True
+    with_it, without = (float(binary_scores(ink, truth)[:, 0].mean()) for ink in (corrected, alone))
+    return with_it > without
 
 
 def _in_pieces(drawn: Drawn, predictor: Predictor) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -102,6 +102,8 @@ def prediction_sentences(predictions: Predictions) -> Iterator[str]:
         f"{len(predictions.scored)} strokes ({header.source}) predicted by the fit {fit.digest} of {origin}{adapted}; "
         f"ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm per pixel, no shift."
     )
+    if not predictions.corrected:
+        yield "The correction of the other session is left out: seen strokes are predicted better without it."
     if predictions.in_sample:
         yield "In sample: the fit was fitted to every one of these strokes."
     elif len(predictions.scored) < len(predictions.strokes):

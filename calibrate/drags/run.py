@@ -80,7 +80,7 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
     if abs(drawn.mm_per_px - prior.mm_per_px) > 1e-6:
         raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drawn.mm_per_px:g}")
     images = np.sort(different(drawn, np.arange(len(drawn.ink)), strokes))
-    ours, stamps = predictors(prior, where)
+    ours, stamps = predictors(prior, where, drawn.recording_sha256)
     fit = adapt(drawn, images, ours)
     moved = None if stamps is None else stamps_of(replace(stamps, model=adapt(drawn, images, stamps).model))
     values = {name: value for name, value in _values(fit).items() if name in fit.free}

@@ -227,7 +227,8 @@ def test_where_steps_and_merged_file_are_damaged_the_better_one_is_taken(make, s
 
 def test_an_import_keeps_every_stroke_whose_photograph_is_whole(make, photos, out, run, repair, monkeypatch):
     monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
-    rows = [{"file": f"{n}.png", "px_per_mm": "10", "height_mm": "13", "tilt_deg": "5"} for n in range(5)]
+    asked = {"px_per_mm": "10", "height_mm": "13", "tilt_deg": "5", "start_x_px": "1", "start_y_px": "1"}
+    rows = [{"file": f"{n}.png"} | asked for n in range(5)]
     make.photographs(photos, *rows)
     final = run()
     cut(final, 0.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from model.brush import DomainError
 ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 MAX_POINTS = 200
+LABEL_CHARS = 120
+"""As many fit on a line over two plots; a label that names a simulated brush is longer."""
 MAX_SAMPLES, MAX_CELLS = 15, 5
 GRAY_MM, MM_BINARY = KEYS.index((Alignment.MM, Tone.GRAY)), KEYS.index((Alignment.MM, Tone.BINARY))
 MAX_CURVE_BYTES = 64 * 1024 * 1024
@@ -54,9 +57,10 @@ def distributions(outcome: Outcome, report: Report) -> str:
             axis.plot(stat.avg, place, "|", ms=15, mew=2.5, color=ORANGE)
         axis.set_yticks(range(len(names)), [labels[name] for name in reversed(names)])
         axis.set_xlabel("CSIM, %")
-        axis.set_title(f"{alignment}, binary ({report.label})", fontsize=10)
+        axis.set_title(f"{alignment}, binary", fontsize=10)
         axis.grid(axis="x", alpha=0.3)
     axes[1].set_yticklabels([])
+    figure.suptitle(textwrap.fill(report.label, LABEL_CHARS), fontsize=10)
     return plot_uri(figure)
 
 
@@ -74,7 +78,7 @@ def by_strokes(report: Report) -> str:
     axis.minorticks_off()
     axis.set_xlabel("presses that were fitted")
     axis.set_ylabel("CSIM on all others, %")
-    axis.set_title(f"mm, binary ({report.label})", fontsize=10)
+    axis.set_title(f"mm, binary\n{textwrap.fill(report.label, LABEL_CHARS // 2)}", fontsize=10)
     axis.grid(alpha=0.3)
     axis.legend()
     return plot_uri(figure)

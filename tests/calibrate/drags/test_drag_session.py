@@ -144,7 +144,7 @@ def test_hostile_ink_in_an_artefact_is_refused(fitted: tuple[Path, str]) -> None
     for ink in ("not base64!", fit.kept.ink[:40], ""):
         bad = fit.model_copy(update={"kept": fit.kept.model_copy(update={"ink": ink})})
         with pytest.raises(CalibrationError, match="kept: ink"):
-            predictors(bad, "fit.json")
+            predictors(bad, "fit.json", fit.recording_sha256)
 
 
 def test_equal_inputs_give_an_equal_file_and_an_edited_one_is_refused(

@@ -1,12 +1,14 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibrate.drags import run
+from calibrate.artefact import put_to_use
+from calibrate.drags import predicted, run
 from calibrate.drags.captures import Drawn, commanded_path
 from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
-from calibrate.drags.predict import Learned, learn
+from calibrate.drags.predict import BETWEEN_SESSIONS, Learned, learn, predictors
 from calibrate.drags.residual import Residual, threshold
 from calibrate.drags.run import different
 from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
@@ -173,6 +175,40 @@ def test_what_does_not_belong_together_is_refused() -> None:
         fit_drags(paths, np.zeros((3, len(Y_MM), len(X_MM))), X_MM, Y_MM)
     with pytest.raises(ValueError, match="not alike"):
         fit_drags(paths, drawn(replace(TRUTH), paths), X_MM, Y_MM, np.zeros((3, 1)))
+
+
+def test_a_correction_is_used_in_part_in_another_session() -> None:
+    """Half of the strokes lie aside, which the correction learns."""
+    session = repeated(6, 1)
+    session.ink[3:] = np.roll(session.ink[3:], 2, axis=1)
+    fitted = run.fit_drawn(session).artefact
+    images = np.arange(6)
+    own, _ = predictors(fitted, "fit.json", fitted.recording_sha256)
+    other, _ = predictors(fitted, "fit.json", "the digest of another recording")
+    learned, used = own.correction(session, images), other.correction(session, images)
+    assert learned is not None
+    assert used is not None
+    assert np.abs(learned).max() > 0.2
+    np.testing.assert_allclose(used, BETWEEN_SESSIONS * learned)
+
+
+def test_a_correction_that_made_the_strokes_seen_worse_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One session teaches that strokes lie apart as they bend; the next one does not have that, another one does."""
+    taught, plain = repeated(8, 1), repeated(8, 1)
+    taught.ink[:4], taught.ink[4:] = np.roll(taught.ink[:4], 3, axis=1), np.roll(taught.ink[4:], -3, axis=1)
+    prior = run.fit_drawn(replace(taught, recording_sha256="taught")).artefact
+    for shown, helps in ((plain, False), (taught, True)):
+        session = replace(shown, recording_sha256="another")
+        adapted = run.refit_drawn(session, prior, "fit.json", 4).artefact
+        path = put_to_use(adapted, tmp_path, run.FOLDER)
+        monkeypatch.setattr(predicted, "read_drags", lambda *_, session=session: session)
+        found = predicted.predict_session(tmp_path, path)
+        assert found.corrected is helps
+        means = found.means()
+        if not helps:
+            assert means[predicted.OURS] == means[predicted.LAG]
 
 
 def repeated(conditions: int, repeats: int) -> Drawn:
