@@ -26,6 +26,7 @@ from drivers.errors import (
     LimitExceeded,
     MotionRefused,
     NotConnected,
+    NotPowered,
     PathDisturbed,
     RobotNotSafe,
     SettingsChanged,
@@ -149,7 +150,7 @@ def rest_is_unknown(error: BaseException | None) -> bool:
         return error.moving
     if isinstance(error, PathDisturbed):
         return hasattr(error, "__notes__")  # the stop failed, or the lift after it
-    known = RobotNotSafe | LimitExceeded | MotionRefused | NotConnected | SettingsChanged
+    known = RobotNotSafe | NotPowered | LimitExceeded | MotionRefused | NotConnected | SettingsChanged
     return isinstance(error, DeviceError) and error.device == "robot" and not isinstance(error, known)
 
 

@@ -14,6 +14,7 @@ DeviceError
       +-- MotionRefused     the controller did not accept the command
       +-- MotionFailed      accepted, but the arm did not arrive
       +-- RobotNotSafe      protective, safeguard or emergency stop, violation or fault
+      +-- NotPowered        somebody has switched the arm off
       +-- ArmMoved          another client or a person has moved the arm, or is moving it
       +-- PathDisturbed     another client interfered with lines that were being carried out
       +-- SettingsChanged   the tool offset, or another setting that a press depends on, has changed
@@ -126,6 +127,20 @@ class RobotNotSafe(MotionError):
     def __init__(self, device: str, op: str, mode: str, condition: str, remedy: str) -> None:
         self.mode = mode
         super().__init__(device, op, f"safety mode is {mode}", condition=condition, remedy=remedy)
+
+
+class NotPowered(MotionError):
+    """Nobody can move the arm in this robot mode; `mode` is the controller's name for it."""
+
+    def __init__(self, device: str, op: str, mode: str) -> None:
+        self.mode = mode
+        super().__init__(
+            device,
+            op,
+            f"robot mode is {mode}, not Running: the arm was switched off",
+            condition="Nothing was sent to it.",
+            remedy="Find out who switched it off, and why. Enabling the arm again powers it and releases its brakes.",
+        )
 
 
 class ArmMoved(MotionError):

@@ -57,7 +57,7 @@ class Robot(Protocol):
         ...
 
     async def confirm(self) -> None:
-        """Raise `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
+        """Raise `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
         ...
 
     async def take_up(self) -> Pose:

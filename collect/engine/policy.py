@@ -12,6 +12,7 @@ from drivers.errors import (
     DeviceError,
     DeviceTimeout,
     MotionError,
+    NotPowered,
     PathDisturbed,
     RobotNotSafe,
     SettingsChanged,
@@ -44,8 +45,8 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
         # Only a person can change paper or ink, mend a sensor, release the arm, or see what lies under the brush.
         case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe() | Stuck():
             return Action.ASK
-        # Another client controlled the arm.
-        case _, ArmMoved() | SettingsChanged() | PathDisturbed():
+        # Somebody else had the arm.
+        case _, ArmMoved() | SettingsChanged() | NotPowered() | PathDisturbed():
             return Action.ASK
         case StepKind.ZERO_TOUCH, JogGivenUp():
             return Action.ASK
@@ -96,6 +97,8 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
         case JogGivenUp(height=height):
             text += f". {height[0].upper()}{height[1:]} can be kept: H is then counted from there."
             return Prompt(text, (Choice(KEEP, "keep that height, go on"), Choice("a", "jog again"), STOP), STOP.key)
+        case NotPowered():
+            go_on = "nothing is in the way of the arm: power it, lift it and go on"
         case MotionError():
             go_on = "the arm is released and nothing is in its way: lift it and go on"
         case _:

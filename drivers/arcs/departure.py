@@ -9,10 +9,11 @@ import asyncio
 import itertools
 from collections.abc import Sequence
 
+from drivers.arcs.codes import RobotMode
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.settings import Settings, read_back, require_same
-from drivers.errors import ArmMoved, NotConnected
+from drivers.errors import ArmMoved, NotConnected, NotPowered
 from drivers.geometry import distance
 from drivers.limits import Limits
 from drivers.samples import Pose
@@ -42,7 +43,7 @@ class Departure:
     async def take_up(self) -> Pose:
         """Accept the place where the arm rests as the start of the next line.
 
-        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`.
+        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`, `NotPowered`.
         """
         await self._require_rest("take up")
         await self._require_settings("take up")
@@ -50,7 +51,7 @@ class Departure:
         return self.left
 
     async def confirm(self) -> None:
-        """Check that all is as it was left. Raises `RobotNotSafe`, `SettingsChanged`, then `ArmMoved`."""
+        """Check that all is as it was left. Raises `RobotNotSafe`, `NotPowered`, `SettingsChanged`, then `ArmMoved`."""
         await self._require_settings("confirm")
         await self._require_rest("confirm")
         self._require_place("confirm", await self._controller.pose())
@@ -75,6 +76,8 @@ class Departure:
         self._require_enabled(op)
         found = await read_back(self._controller)
         await self._controller.require_safe(op)
+        if (mode := await self._controller.mode()) != RobotMode.RUNNING:
+            raise NotPowered(DEVICE, op, mode)
         require_same(op, self._settings, found)
 
     async def _require_rest(self, op: str) -> None:

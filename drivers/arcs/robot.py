@@ -244,7 +244,7 @@ class AuboArcs:
         return await self._motion.pose()
 
     async def confirm(self) -> None:
-        """Raise `RobotNotSafe`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
+        """Raise `RobotNotSafe`, `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left."""
         await self._departure.confirm()
 
     async def take_up(self) -> Pose:

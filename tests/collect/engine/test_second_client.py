@@ -12,7 +12,7 @@ from collect.engine.control import State
 from drivers.arcs.controller import Controller
 from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.waiting import Tolerance, until_settled
-from drivers.errors import MotionFailed, PathDisturbed, SettingsChanged
+from drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from drivers.geometry import brush_pose, from_wire, lean, to_wire
 from sessions.journal.lines import read_lines
 from tests.collect.until import until, wait_for_end
@@ -139,6 +139,31 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
+
+
+def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_again(lab: Lab) -> None:
+    engine = lab.engine(watched=True)
+    start_and_pause(engine)
+    second_client(lab, RobotManage_poweroff={})
+    sent = lines_sent(lab)
+    engine.resume()
+    prompt = until(engine, lambda now: now.prompt is not None).prompt
+    assert prompt is not None
+    assert "robot mode is Power" in prompt.question
+    assert not sent
+    engine.answer(prompt.number, "g")
+    wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 2
+
+
+def test_where_nobody_watches_an_arm_that_was_switched_off_ends_the_run_with_the_reason(lab: Lab) -> None:
+    engine = lab.engine()
+    start_and_pause(engine)
+    second_client(lab, RobotManage_poweroff={})
+    engine.resume()
+    with pytest.raises(NotPowered, match="robot mode is Power"):
+        wait_for_end(engine)
+    assert not engine.snapshot().rest_unknown
 
 
 def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:

@@ -12,7 +12,7 @@ from drivers.arcs.robot import AuboArcs
 from drivers.arcs.rpc import RpcConnection
 from drivers.arcs.settings import TOOL_OFFSET, require_same
 from drivers.arcs.waiting import Tolerance, until_settled
-from drivers.errors import ArmMoved, LimitExceeded, RobotNotSafe, SettingsChanged
+from drivers.errors import ArmMoved, LimitExceeded, NotPowered, RobotNotSafe, SettingsChanged
 from drivers.geometry import brush_pose, distance
 from drivers.samples import Pose
 from drivers.sim.arcs.server import ArcsServer
@@ -111,6 +111,18 @@ async def test_a_safety_stop_is_reported_before_what_it_changes(arm: AuboArcs, o
     cabinet.cabinet.safety_stop()
     with pytest.raises(RobotNotSafe):
         await arm.move(LOW, **QUICK)
+
+
+async def test_an_arm_without_power_is_not_as_it_was_left_and_enabling_it_powers_it_again(
+    arm: AuboArcs, other: Controller
+):
+    await arm.move(ABOVE, **QUICK)
+    await other.ask("RobotManage.poweroff")
+    for refused in (arm.confirm(), arm.take_up(), arm.move(LOW, **QUICK)):
+        with pytest.raises(NotPowered):
+            await refused
+    await arm.enable()
+    await arm.move(LOW, **QUICK)
 
 
 @pytest.mark.parametrize("code", [0, 13])
