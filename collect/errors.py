@@ -8,6 +8,7 @@ StepError              a step failed in a defined way; says what state it leaves
  +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
  +-- NeedsOperator     a person must act first
  |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
+ |    +-- PosesLate    the controller's poses come too late
  +-- JogGivenUp        the operator did not find the paper by jog: its known height stays
  +-- SheetFull         no free cell is left on the sheet
 CannotTeach            what was taught on the first day contradicts itself or cannot be used
@@ -90,6 +91,18 @@ class NeedsOperator(StepError):
 
 class CameraLate(NeedsOperator):
     """Photographs may be older than they seem. Leaves the arm parked; nothing was pressed meanwhile."""
+
+
+class PosesLate(NeedsOperator):
+    """The recorded path of the brush would lag behind force and camera. Leaves the step void, and the brush lifted."""
+
+    def __init__(self, lag_ms: float, limit_ms: float) -> None:
+        self.lag_ms = lag_ms
+        self.limit_ms = limit_ms
+        super().__init__(
+            f"poses of the arm arrive {lag_ms:.0f} ms late; robot.max_pose_lag_ms = {limit_ms:g}. If only pushed poses "
+            "are late, leave robot.rtde_port out of rig.toml: they are then asked for. If not, look at the network."
+        )
 
 
 class JogGivenUp(StepError):

@@ -130,15 +130,14 @@ class RobotNotSafe(MotionError):
 
 
 class NotPowered(MotionError):
-    """Nobody can move the arm in this robot mode; `mode` is the controller's name for it."""
+    """The arm has no power, or its brakes are on, although it was enabled."""
 
-    def __init__(self, device: str, op: str, mode: str) -> None:
-        self.mode = mode
+    def __init__(self, device: str, op: str) -> None:
         super().__init__(
             device,
             op,
-            f"robot mode is {mode}, not Running: the arm was switched off",
-            condition="Nothing was sent to it.",
+            "robot mode is not Running: the arm was switched off",
+            condition="It has not moved.",
             remedy="Find out who switched it off, and why. Enabling the arm again powers it and releases its brakes.",
         )
 

@@ -56,6 +56,10 @@ class Robot(Protocol):
         """Ask the controller for the pose."""
         ...
 
+    def pose_lag_ms(self) -> float | None:
+        """How late poses arrived during the last motions, measured against `where`; None if that is not known."""
+        ...
+
     async def confirm(self) -> None:
         """Raise `NotPowered`, `SettingsChanged` or `ArmMoved` if the arm is not as it was left; sets nothing."""
         ...

@@ -12,7 +12,7 @@ from collect.engine.recorder import Recorder
 from collect.engine.steps import capture, dip, press, retake, touch
 from collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from collect.engine.telemetry import Telemetry
-from collect.errors import describe
+from collect.errors import PosesLate, describe
 from collect.operator import OperatorRequest
 from collect.protocols.steps import MARKING, Result, Step, StepKind
 from collect.touch.selfcheck import partners
@@ -20,7 +20,7 @@ from drivers.errors import ArmMoved
 from sessions.recording.schemas import StepEvent
 
 HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
-"""Steps that count only if the tool is still the one that was set; otherwise their heights are wrong."""
+"""Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""
 
 
 class Performer:
@@ -78,10 +78,13 @@ class Performer:
                 if step.kind in HEIGHTS:
                     with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
                         await rig.robot.confirm()
+                lag_ms = rig.robot.pose_lag_ms()
+                if step.kind in HEIGHTS and lag_ms is not None and lag_ms > rig.config.robot.max_pose_lag_ms:
+                    raise PosesLate(lag_ms, rig.config.robot.max_pose_lag_ms)
             finally:
                 guard.deafen()
                 rig.robot.listen(None)
-            recorder.cadence()
+            recorder.cadence(lag_ms)
             recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
             run.memory.left_ink_ns = None

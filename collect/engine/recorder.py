@@ -111,12 +111,12 @@ class Recorder:
         """Record the checks of the stroke on still `number`."""
         self._now(Topic.QUALITY, quality, number)
 
-    def cadence(self) -> None:
-        """Record how steadily samples came and which sections were slow; call it once, at the end of the step."""
+    def cadence(self, lag_ms: float | None) -> None:
+        """Record how steadily samples came, how late poses, and which sections were slow; call it once, at the end of
+        the step."""
         now_ns = self._clock.now_ns()
         slow = self.sections.report()
-        for arrivals in (self._poses, self._forces):
-            report = None if arrivals is None else arrivals.report(slow if arrivals is self._poses else ())
+        for report in (self._poses.report(slow, lag_ms), self._forces.report() if self._forces is not None else None):
             if report is not None:
                 self._put(Topic.CADENCE, now_ns, now_ns, 0, report)
 
@@ -176,8 +176,8 @@ class Arrivals:
             self._missed += max(0, round(gap_ns * self._expected_hz / 1e9) - 1)
         self._last_ns = host_ns
 
-    def report(self, slow: tuple[SlowSection, ...] = ()) -> Cadence | None:
-        """The counts, to be recorded with `slow`; None if no sample came."""
+    def report(self, slow: tuple[SlowSection, ...] = (), lag_ms: float | None = None) -> Cadence | None:
+        """The counts, to be recorded with `slow` and `lag_ms`; None if no sample came."""
         if not self._received:
             return None
         return Cadence(
@@ -186,6 +186,7 @@ class Arrivals:
             received=self._received,
             missed=self._missed,
             longest_gap_ms=self._longest_ns / 1e6 if self._received > 1 else None,
+            lag_ms=lag_ms,
             slow_sections=slow,
         )
 

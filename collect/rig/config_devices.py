@@ -38,6 +38,9 @@ class LimitsConfig(Config):
         return self
 
 
+POSE_LAG_MS = 100.0
+
+
 class RobotConfig(Config):
     """The arm."""
 
@@ -53,6 +56,9 @@ class RobotConfig(Config):
     """`sof` as in the maker's client, `bare` as in the maker's documentation."""
     rtde_port: int | None = Field(None, ge=1, le=65535)
     """Port that pushes poses (30010); if left out, poses are polled."""
+    max_pose_lag_ms: Annotated[float, Field(ge=60.0, le=5000.0, exclude_if=lambda ms: ms == POSE_LAG_MS)] = POSE_LAG_MS
+    """Presses and touches during which poses arrive later than this are void: at 20 mm/s the recorded tip is 2 mm away
+    from where force and camera saw it after 100 ms. Below 60 ms a busy computer's own lag would count."""
     watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
     """Dead-man switch on the controller: after this long without a sign of life it makes a protective stop, which only
     a person can release and which leaves the brush where it is. If left out, it is not armed, and a press lifts by

@@ -96,8 +96,6 @@ def refusal(code: int) -> tuple[str, str]:
     """(name, remedy) of a move command's return code."""
     known = {member.value: member.name for member in ReturnCode}
     name = known.get(abs(code), "UNKNOWN")
-    if code == -1:
-        return "robot mode is not Running", "Power the arm on and start it up."
     remedies = {
         ReturnCode.BAD_STATE: "Bring the safety mode to Normal on the pendant.",
         ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",

@@ -21,9 +21,12 @@ from drivers.arcs.codes import (
 )
 from drivers.arcs.framing import numbers
 from drivers.arcs.rpc import DEVICE, RpcConnection
-from drivers.errors import DeviceError, MotionRefused, ProtocolViolation, RobotNotSafe
+from drivers.errors import DeviceError, MotionRefused, NotPowered, ProtocolViolation, RobotNotSafe
 from drivers.geometry import from_wire, to_wire
 from drivers.samples import Pose
+
+NOT_RUNNING = -1
+"""Return code of a motion in any robot mode but Running."""
 
 Triple = tuple[float, float, float]
 
@@ -44,6 +47,8 @@ class Controller:
         self.connection = connection
         self.robot = ""
         self.on_notice: Callable[[str], None] | None = None
+        self.on_pose: Callable[[Pose, float], None] | None = None
+        """Gets each pose that was asked for, and how long the answer took, in s."""
         self._reduced = False
 
     async def ask(self, method: str, **params: object) -> Any:
@@ -64,7 +69,12 @@ class Controller:
 
     async def pose(self) -> Pose:
         """Where the tip is. Raises `ProtocolViolation`."""
-        return from_wire(six("getTcpPose", await self.ask("RobotState.getTcpPose")))
+        loop = asyncio.get_running_loop()
+        asked_s = loop.time()
+        pose = from_wire(six("getTcpPose", await self.ask("RobotState.getTcpPose")))
+        if self.on_pose is not None:
+            self.on_pose(pose, loop.time() - asked_s)
+        return pose
 
     async def joint_positions(self) -> list[float]:
         """Six joints in rad. Raises `ProtocolViolation`."""
@@ -178,9 +188,11 @@ def six(op: str, answer: object) -> list[float]:
 
 
 def accepted(op: str, code: object) -> None:
-    """Raise `MotionRefused` for a return code that is neither success nor `already there`."""
+    """Raise `MotionRefused` or `NotPowered` for a return code that is neither success nor `already there`."""
     if not isinstance(code, int):
         raise ProtocolViolation(DEVICE, op, f"expected a return code, got {code!r}")
+    if code == NOT_RUNNING:
+        raise NotPowered(DEVICE, op)
     if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
         name, remedy = refusal(code)
         error = QueueFull if code == ReturnCode.QUEUE_FULL else MotionRefused

@@ -43,7 +43,8 @@ class Departure:
     async def take_up(self) -> Pose:
         """Accept the place where the arm rests as the start of the next line.
 
-        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`, `NotPowered`.
+        Raises `ArmMoved` while it moves, `SettingsChanged` if a pose would refer to another tool, `RobotNotSafe`,
+        `NotPowered`.
         """
         await self._require_rest("take up")
         await self._require_settings("take up")
@@ -76,8 +77,8 @@ class Departure:
         self._require_enabled(op)
         found = await read_back(self._controller)
         await self._controller.require_safe(op)
-        if (mode := await self._controller.mode()) != RobotMode.RUNNING:
-            raise NotPowered(DEVICE, op, mode)
+        if await self._controller.mode() != RobotMode.RUNNING:
+            raise NotPowered(DEVICE, op)
         require_same(op, self._settings, found)
 
     async def _require_rest(self, op: str) -> None:

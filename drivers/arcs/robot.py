@@ -59,6 +59,7 @@ class AuboArcs:
         self._departure = Departure(self._motion)
         self._tolerance = Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg)
         self._motion.on_notice = on_notice
+        self._motion.on_pose = self._telemetry.lag.asked
 
     async def connect(self) -> Identity:
         """Connect and identify; telemetry runs from here on. Raises `WrongGeneration` for AUBOPE cabinets.
@@ -254,6 +255,10 @@ class AuboArcs:
     def latest(self) -> PoseSample:
         """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
         return self._telemetry.latest()
+
+    def pose_lag_ms(self) -> float | None:
+        """How late poses arrived during the last motions, measured against `where`; None if that is not known."""
+        return self._telemetry.lag.lag_ms()
 
     def listen(self, on_sample: Callable[[PoseSample], None] | None) -> None:
         """Hand every telemetry sample to `on_sample` in the event loop."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator
 
 from drivers.arcs.controller import Controller
 from drivers.arcs.framing import numbers
+from drivers.arcs.lag import LagMeter
 from drivers.arcs.rpc import DEVICE
 from drivers.arcs.rtde import RtdeStream
 from drivers.arcs.settings import ArcsOptions
@@ -36,6 +37,7 @@ class Telemetry:
         self._task: asyncio.Task[None] | None = None
         self._stream: RtdeStream | None = None
         self._seen: list[Pose] | None = None
+        self.lag = LagMeter(clock)
         self.listener: Callable[[PoseSample], None] | None = None
 
     @property
@@ -147,6 +149,7 @@ class Telemetry:
     def _take(self, pose: Pose, joints_rad: tuple[float, ...] | None = None) -> None:
         seq = self._latest.stamp.seq + 1 if self._latest else 0
         self._latest = PoseSample(Stamp(self._clock.now_ns(), None, seq), pose, joints_rad)
+        self.lag.arrived(self._latest)
         if self._seen is not None:
             self._seen.append(pose)
         if self.listener is not None:

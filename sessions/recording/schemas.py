@@ -169,6 +169,8 @@ class Cadence(Event):
     """Intervals of 1 / `expected_hz` without a message."""
     longest_gap_ms: float | None = Field(default=None, ge=0.0)
     """None for fewer than two messages."""
+    lag_ms: float | None = Field(default=None, ge=0.0)
+    """How late poses arrived while the arm moved; None for other topics, and where it is not known."""
     slow_sections: tuple[SlowSection, ...] = ()
 
 

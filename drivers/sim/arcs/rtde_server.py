@@ -115,8 +115,15 @@ class RtdeServer(LoopbackServer):
                 writer.write(encode_short(MALFORMED))
             case "drop":
                 writer.close()
-            case _:
-                writer.write(encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments]))
+            case kind:
+                sample = encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments])
+                late_s = fault.late_s if fault is not None and kind == "late" else 0.0
+                asyncio.get_running_loop().call_later(late_s, self._send, writer, sample)
+
+    @staticmethod
+    def _send(writer: asyncio.StreamWriter, sample: bytes) -> None:
+        if not writer.is_closing():
+            writer.write(sample)
 
 
 def topic_of(payload: bytes) -> Topic:

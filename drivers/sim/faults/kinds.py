@@ -83,7 +83,7 @@ STOPS = frozenset({"protective-stop", "emergency-stop", "safeguard-stop"})
 
 KINDS: dict[Device, frozenset[str]] = {
     Device.ROBOT: LOST | REPLIES | STOPS,
-    Device.TELEMETRY: frozenset({"mute", "malformed", "drop"}),
+    Device.TELEMETRY: frozenset({"mute", "late", "malformed", "drop"}),
     Device.CAMERA: frozenset({"stale", "black", "frozen", "torn", "drop"}),
     Device.INK: frozenset(kind.value for kind in InkFault),
     Device.FORCE: frozenset(kind.value for kind in ForceFault),
@@ -115,7 +115,7 @@ class Fault(BaseModel):
     for_s: Annotated[float, Field(gt=0.0, le=86_400.0)] | None = None
     """Duration in real seconds from its beginning; the timeouts of drivers are in real time too."""
     late_s: Annotated[float, Field(ge=0.001, le=60.0)] = 0.3
-    """How late a `late` reply of the robot comes, in real seconds."""
+    """How late a `late` reply or push of the robot comes, in real seconds."""
 
     @model_validator(mode="after")
     def _coherent(self) -> Fault:
@@ -130,8 +130,8 @@ class Fault(BaseModel):
             raise ValueError(f"{self.kind} happens once and lasts until a person ends it: no count, no for_s")
         if self.by_itself and self.nth != 1:
             raise ValueError(f"nth = {self.nth} counts nothing here: {self.kind} of {self.device} waits for no request")
-        if "late_s" in self.model_fields_set and (self.device, self.kind) != (Device.ROBOT, "late"):
-            raise ValueError("late_s goes with device = 'robot', kind = 'late' only")
+        if "late_s" in self.model_fields_set and (self.kind != "late" or self.device is Device.INK):
+            raise ValueError("late_s goes with kind = 'late' of robot and telemetry only")
         return self
 
     @property

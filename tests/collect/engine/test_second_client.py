@@ -149,7 +149,7 @@ def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_agai
     engine.resume()
     prompt = until(engine, lambda now: now.prompt is not None).prompt
     assert prompt is not None
-    assert "robot mode is Power" in prompt.question
+    assert "robot mode is not Running" in prompt.question
     assert not sent
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
@@ -161,7 +161,7 @@ def test_where_nobody_watches_an_arm_that_was_switched_off_ends_the_run_with_the
     start_and_pause(engine)
     second_client(lab, RobotManage_poweroff={})
     engine.resume()
-    with pytest.raises(NotPowered, match="robot mode is Power"):
+    with pytest.raises(NotPowered, match="robot mode is not Running"):
         wait_for_end(engine)
     assert not engine.snapshot().rest_unknown
 

@@ -18,6 +18,7 @@ from drivers.errors import (
     MotionFailed,
     MotionRefused,
     NotConnected,
+    NotPowered,
     RobotNotSafe,
     RpcError,
     Stale,
@@ -62,11 +63,12 @@ async def test_an_arm_that_was_not_enabled_is_not_moved(sleeping_arm: AuboArcs, 
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
 
-async def test_an_arm_whose_power_went_refuses_to_move(arm: AuboArcs, cabinet: ArcsServer):
+@pytest.mark.parametrize("up_mm", [-20.0, 20.0])
+async def test_an_arm_whose_power_went_refuses_to_move(arm: AuboArcs, cabinet: ArcsServer, up_mm: float):
     cabinet.cabinet.power_off()
-    with pytest.raises(MotionRefused, match="Power the arm on") as caught:
-        await arm.move(NEAR, **QUICK)
-    assert caught.value.code == -1
+    here = await arm.where()
+    with pytest.raises(NotPowered):
+        await arm.move(dataclasses.replace(here, z_mm=here.z_mm + up_mm), **QUICK)
 
 
 async def test_enabling_runs_the_arm_and_sets_the_tool_but_moves_nothing(sleeping_arm: AuboArcs, cabinet: ArcsServer):

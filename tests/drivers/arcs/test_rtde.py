@@ -23,9 +23,10 @@ from drivers.clock import HostClock
 from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from drivers.geometry import brush_pose, distance
 from drivers.limits import Limits
-from drivers.samples import PoseSample
+from drivers.samples import PoseSample, QueuedLine
 from drivers.sim.arcs.rtde_server import RtdeServer
 from drivers.sim.arcs.server import ArcsServer
+from drivers.sim.faults.kinds import ALWAYS, Device, Fault
 from drivers.sim.rig import HOST
 from drivers.sim.server import LoopbackServer
 from tests.drivers.muting import mute
@@ -247,6 +248,22 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
     await arm.close()
     await asyncio.sleep(0.02)
     assert rtde.clients == 0
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.8])
+async def test_the_lag_of_pushed_poses_is_measured_while_the_arm_moves(
+    rtde: RtdeServer, make_arm: MakeArm, late_s: float
+):
+    arm = make_arm(rtde.port)
+    await arm.connect()
+    await arm.enable()
+    assert arm.pose_lag_ms() is None
+    if late_s:
+        rtde.faults.hang(Fault(device=Device.TELEMETRY, kind="late", late_s=late_s, count=ALWAYS))
+        await asyncio.sleep(late_s)
+    down, up = (QueuedLine(brush_pose(250.0, -230.0, z_mm), 4.0) for z_mm in (220.0, 259.0))
+    await arm.sequence([down, up], acc_mm_s2=800.0)
+    assert arm.pose_lag_ms() == pytest.approx(1e3 * late_s, abs=60.0)
 
 
 async def test_a_closed_port_is_reported_and_poses_are_polled(

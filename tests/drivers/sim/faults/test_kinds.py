@@ -34,7 +34,7 @@ def test_a_fault_has_what_its_request_says() -> None:
         ({"kind": "protective-stop", "count": 2}, "happens once"),
         ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),
         ({"device": "ink", "kind": "mute", "nth": 2}, "counts nothing here"),
-        ({"late_s": 1.0}, "late_s goes with device = 'robot', kind = 'late' only"),
+        ({"late_s": 1.0}, "late_s goes with kind = 'late' of robot and telemetry only"),
         ({"a\nb\x1b[31m": 1}, "Extra inputs are not permitted"),
     ],
 )
