@@ -69,4 +69,4 @@ class LagMeter:
         misfit_mm = np.where(enough, (off_mm * known).sum(axis=1) / known.sum(axis=1).clip(1), math.inf)
         best = int(np.argmin(misfit_mm))
         extent_mm = np.linalg.norm(asked_mm - asked_mm.mean(axis=0), axis=1).mean()
-        return max(0.0, 1e3 * float(lags_s[best])) if misfit_mm[best] <= MISFIT_SHARE * extent_mm else None
+        return max(0.0, round(1e3 * float(lags_s[best]), 1)) if misfit_mm[best] <= MISFIT_SHARE * extent_mm else None
