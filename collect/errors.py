@@ -21,6 +21,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
+from drivers.busy import too_busy
 from drivers.errors import (
     ArmMoved,
     DeviceError,
@@ -91,6 +92,9 @@ class NeedsOperator(StepError):
 
 class CameraLate(NeedsOperator):
     """Photographs may be older than they seem. Leaves the arm parked; nothing was pressed meanwhile."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(f"{too_busy()} {text}".strip())
 
 
 class PosesLate(NeedsOperator):

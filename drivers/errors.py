@@ -24,6 +24,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from drivers.busy import too_busy
+
 
 class DeviceError(Exception):
     """A device failed: `condition` is the physical state it leaves, `remedy` what the operator must do."""
@@ -48,7 +50,10 @@ class ConnectionLost(DeviceError, ConnectionError):
 
 
 class DeviceTimeout(DeviceError, TimeoutError):
-    """The device did not answer in time."""
+    """The device did not answer in time. The message says if this computer is too busy."""
+
+    def __init__(self, device: str, op: str, what: str, *, condition: str = "", remedy: str = "") -> None:
+        super().__init__(device, op, what, condition=condition, remedy=f"{too_busy()} {remedy}".strip())
 
 
 class Stale(DeviceTimeout):

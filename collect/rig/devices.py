@@ -12,6 +12,7 @@ from collect.errors import ConfigError
 from collect.rig.config import RigConfig
 from collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
 from drivers.arcs.robot import ArcsOptions, AuboArcs
+from drivers.busy import noting_lateness
 from drivers.camera import CameraOptions, Locked, OpenCvCamera
 from drivers.clock import Clock
 from drivers.exclusive import Claimed, claimed
@@ -150,6 +151,7 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     """
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config.robot.host, config.robot.port))
+        await stack.enter_async_context(noting_lateness())
         camera = make_camera(config, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()

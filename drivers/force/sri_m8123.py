@@ -12,6 +12,7 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivers.busy import too_busy
 from drivers.clock import Clock
 from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
 from drivers.force.rounds import BITRATE, RoundAssembler, Wrench
@@ -185,7 +186,7 @@ class SriM8123:
         if self._stream is None:
             raise NotConnected(DEVICE, op, "not connected")
         if (loss := self._stream.loss) is not None:
-            raise ConnectionLost(DEVICE, op, loss.what, remedy=loss.remedy)
+            raise ConnectionLost(DEVICE, op, loss.what, remedy=f"{too_busy()} {loss.remedy}".strip())
         return self._stream
 
     def _sample(self, stamp: Stamp, wrench: Wrench) -> ForceSample:
