@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 POSE_HZ = 100.0
 """Rate at which the driver asks the arm for its pose."""
+CLOCK_STEP_NS = 1_000_000_000
+"""A sample that seems to have taken longer to arrive shows that the device's clock was set or began again."""
 SLOW_MS = 250.0
 """Sections that take longer are recorded, because an operator has to wait for them."""
 
@@ -62,6 +64,8 @@ class Recorder:
         self._poses = Arrivals(Topic.TCP, POSE_HZ)
         self._forces = None if force_hz is None else Arrivals(Topic.WRENCH, force_hz)
         self._listeners: list[Callable[[PoseSample], None]] = []
+        self._offset_ns: int | None = None
+        """Of the host's clock from the force sensor's."""
         self.sections = Sections()
 
     @contextlib.contextmanager
@@ -146,7 +150,16 @@ class Recorder:
     def _sample(self, topic: Topic, stamp: Stamp, message: Event | Message) -> None:
         # A failed disk must not end the telemetry that calls this; the step's next event raises the error.
         with contextlib.suppress(SessionError):
-            self._put(topic, stamp.host_ns, stamp.device_ns or stamp.host_ns, stamp.seq, message)
+            self._put(topic, stamp.host_ns, self._taken_ns(stamp), stamp.seq, message)
+
+    def _taken_ns(self, stamp: Stamp) -> int:
+        """When the device took a sample, by the host's clock, whose offset the quickest sample so far gives."""
+        if stamp.device_ns is None:
+            return stamp.host_ns
+        offset_ns = stamp.host_ns - stamp.device_ns
+        if self._offset_ns is None or not 0 <= offset_ns - self._offset_ns < CLOCK_STEP_NS:
+            self._offset_ns = offset_ns
+        return stamp.device_ns + self._offset_ns
 
     def _put(self, topic: Topic, log_ns: int, publish_ns: int, sequence: int, message: Event | Message) -> None:
         outgoing = Outgoing(topic, log_ns, publish_ns, sequence, message)
