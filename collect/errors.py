@@ -21,7 +21,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from drivers.busy import too_busy
 from drivers.errors import (
     ArmMoved,
     DeviceError,
@@ -32,6 +31,7 @@ from drivers.errors import (
     PathDisturbed,
     RobotNotSafe,
     SettingsChanged,
+    too_busy,
 )
 
 NOT_AT_REST = "The arm was not seen at rest: it may still be moving. If it moves, press the red button."

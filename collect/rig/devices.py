@@ -12,9 +12,9 @@ from collect.errors import ConfigError
 from collect.rig.config import RigConfig
 from collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
 from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.busy import noting_lateness
 from drivers.camera import CameraOptions, Locked, OpenCvCamera
 from drivers.clock import Clock
+from drivers.errors import noting_lateness
 from drivers.exclusive import Claimed, claimed
 from drivers.force.sri_m8123 import SriM8123, SriOptions
 from drivers.ink.pump import ModbusPump, PumpOptions

@@ -12,9 +12,17 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.busy import too_busy
 from drivers.clock import Clock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
+from drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    LimitExceeded,
+    NotConnected,
+    Stale,
+    Stuck,
+    too_busy,
+)
 from drivers.force.rounds import BITRATE, RoundAssembler, Wrench
 from drivers.force.stream import BusSettings, ForceHealth, RoundStream
 from drivers.samples import ForceSample, Identity, Stamp

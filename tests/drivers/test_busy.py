@@ -9,8 +9,7 @@ import time
 import pytest
 
 from collect.errors import CameraLate, describe
-from drivers.busy import noting_lateness, too_busy
-from drivers.errors import DeviceTimeout, Stale
+from drivers.errors import DeviceTimeout, Stale, noting_lateness, too_busy
 
 LATE = [
     lambda: CameraLate("the camera's delay is not steady: use a cable instead of Wi-Fi."),
