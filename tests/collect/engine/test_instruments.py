@@ -10,9 +10,10 @@ from mcap.reader import make_reader
 
 from collect.engine.control import State
 from collect.errors import ForceTooHigh, NeedsOperator, PosesLate
+from drivers.arcs.robot import AuboArcs
 from drivers.errors import ConnectionLost, Stuck
 from drivers.ink.port import InkRefused
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from drivers.sim.faults.kinds import Device, Fault
 from sessions.journal.journal import replay
 from sessions.recording.schemas import Topic
 from tests.collect.until import until, wait_for_end
@@ -175,11 +176,11 @@ def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypa
     assert not [press for press in lab.rig.world.presses if press.depth_mm > 1.0]
 
 
-def test_poses_that_come_late_end_the_run_before_a_press_counts(slow_lab: Lab) -> None:
-    slow_lab.rig.faults.hang(Fault(device=Device.TELEMETRY, kind="late", late_s=0.4, count=ALWAYS))
+def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(AuboArcs, "pose_lag_ms", lambda _: 412.0)
     with pytest.raises(PosesLate, match="max_pose_lag_ms = 100") as caught:
-        run(slow_lab.engine())
-    assert caught.value.lag_ms == pytest.approx(400.0, abs=60.0)
-    state = replay(only_session(slow_lab) / "journal.jsonl")
+        run(lab.engine())
+    assert caught.value.lag_ms == 412.0
+    state = replay(only_session(lab) / "journal.jsonl")
     assert state.voids == 1
     assert not [line for line in state.done.values() if line["kind"] == "press"]
