@@ -22,6 +22,7 @@ def benches() -> dict[str, Bench]:
     return {
         "analysis": _late("analysis"),
         "brushfit": _late("brushfit"),
+        "ceiling": _late("ceiling"),
         "characters": _late("characters"),
         "curves": _late("curves"),
         "drawing": _late("generator", "run_drawing"),

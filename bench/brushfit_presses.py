@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError
+from calibrate.compare.ceiling import ceiling_values, pair_means
 from calibrate.compare.field import Field
+from calibrate.compare.similarity import binary_scores
 from calibrate.fit.captures import Grid, Pressed, read_presses
 from drivers.sim.brush.brush import Brush, BrushSpec
 from drivers.sim.brush.paper import Footprint
@@ -55,24 +58,35 @@ class BrushPresses:
         return self.strokes([(c, r) for c in range(len(CELLS)) for r in range(self.ink.shape[1])])
 
     def gap(self, cells: Sequence[int], predict: Callable[[float, float], NDArray[np.floating]]) -> float:
-        """CSIM points by which predictions of these cells fall short of the ceiling: the majority of the other presses
-        of the same cell. A negative gap is a prediction better than that."""
-        repeats = self.ink.shape[1]
-        short: list[float] = []
+        """CSIM points by which predictions of these cells fall short of the ceiling. A negative gap is a prediction
+        that does better."""
+        top, scored = self.ceiling(cells), list[float]()
         for c in cells:
-            seen = predict(*CELLS[c]) > 0.5
+            truth, seen = self.ink[c] > 0.5, predict(*CELLS[c]) > 0.5
+            scored += binary_scores(np.broadcast_to(seen, truth.shape), truth)[:, 0].tolist()
+        return top - 100.0 * float(np.mean(scored))
+
+    def ceiling(self, cells: Sequence[int]) -> float:
+        """CSIM of a perfect model in these cells, percent."""
+        values: list[float] = []
+        for c in cells:
             truth = self.ink[c] > 0.5
-            votes = truth.sum(axis=0)
-            for one in truth:
-                short.append(_csim(2 * (votes - one) > repeats - 1, one) - _csim(seen, one))
-        return 100.0 * float(np.mean(short))
+            pairs = pair_means(len(truth), partial(_pairs, truth))[:, 0]
+            values += ceiling_values(100.0 * pairs, np.zeros(len(truth), np.int64)).tolist()
+        return float(np.mean(values))
 
 
-def simulated(spec: BrushSpec, name: str, repeats: int = REPEATS) -> BrushPresses:
+def _pairs(presses: NDArray[np.bool_], one: int, others: list[int]) -> NDArray[np.float64]:
+    return binary_scores(presses[others], np.broadcast_to(presses[one], (len(others), *presses.shape[1:])))
+
+
+def simulated(
+    spec: BrushSpec, name: str, repeats: int = REPEATS, cells: Sequence[tuple[float, float]] = CELLS
+) -> BrushPresses:
     """Presses of a brush of the loopback rig."""
     brush = Brush(spec)
-    ink = np.empty((len(CELLS), repeats, SIZE_PX, SIZE_PX), np.float32)
-    for c, (height, tilt) in enumerate(CELLS):
+    ink = np.empty((len(cells), repeats, SIZE_PX, SIZE_PX), np.float32)
+    for c, (height, tilt) in enumerate(cells):
         for r in range(repeats):
             ink[c, r] = _on_field(brush.press(height, tilt, ink_load=1.0, press_seed=1000 * c + r))
     return BrushPresses(name, spec.radius_mm, spec.length_mm, grid(), ink[:, :, ROWS])
@@ -107,8 +121,3 @@ def _on_field(mark: Footprint) -> Images:
     top, left = max(0, row), max(0, column)
     field[top : top + ink.shape[0], left : left + ink.shape[1]] = ink
     return np.asarray(cv2.resize(field, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _csim(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    norm = np.sqrt(float(np.count_nonzero(a)) * float(np.count_nonzero(b)))
-    return float(np.count_nonzero(a & b)) / norm if norm > 0.0 else 0.0

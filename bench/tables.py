@@ -15,10 +15,10 @@ from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.press_sessions import CELLS, Presses, session
 from bench.processes import brushloop
+from calibrate.compare.ceiling import CEILING
 from calibrate.compare.field import Alignment, Tone
 from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
 from calibrate.validate.report.data import Report, load_report
-from calibrate.validate.run import CEILING
 
 REPEATS, TRAIN_STEPS, TUNE_STEPS = 3, 3000, 300
 PUBLISHED = ("ccd-bsm", "bezier", "ellipse", "line", "circle")
@@ -30,7 +30,7 @@ ORDER_POINTS = 0.1
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """CSIM of the first `n` frozen brushes (default all five), binary, in both alignments.
 
-    value = points below the ceiling (another press of the same cell); ratio = the refitted Bezier's gap over ours.
+    value = points below the ceiling (`calibrate.compare.ceiling`); ratio = the refitted Bezier's gap over ours.
     """
     brushes = FROZEN[: len(FROZEN) if n is None else n]
     if not brushes:

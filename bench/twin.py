@@ -12,7 +12,8 @@ from collections.abc import Iterator, Sequence
 from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, simulated
 from bench.harness import BenchError, Result
-from calibrate.fit.heldout import BEZIER, CEILING
+from calibrate.compare.ceiling import CEILING
+from calibrate.fit.heldout import BEZIER
 from sessions.progress import shown
 from twin.run import fit_twin, workers
 from twin.score import TWIN

@@ -31,6 +31,7 @@ ACCURACY = {
     "structure": 120,
     "paper-brush": 120,
     "characters": 130,
+    "ceiling": 120,
     "inversion": 300,
     "curves": 300,
     "loop": 600,

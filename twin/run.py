@@ -14,11 +14,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from calibrate.compare.ceiling import CEILING
 from calibrate.fit.captures import Grid, Pressed
 from calibrate.fit.heldout import (
     BEZIER,
-    CEILING,
-    FEWEST_REPEATS,
     HeldOut,
     Images,
     Scores,
@@ -34,7 +33,7 @@ from twin.drawing import Cell
 from twin.quality import sound_head
 from twin.score import TWIN, parts_of, predicted
 from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, of_parts, search, start
-from twin.spread import Repeats, Spread, fit_spread
+from twin.spread import FEWEST_REPEATS, Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
 MOST_SD = 0.7

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from calibrate.compare.similarity import csim
 from calibrate.fit.captures import Grid
-from calibrate.fit.heldout import FEWEST_REPEATS
 from drivers.sim.brush.spec import BrushSpec
 from twin.constants import SPREAD, Offset, Vector, with_values
 from twin.drawing import Cell, Images, draw
 from twin.shape import Map, derivatives
 
+FEWEST_REPEATS = 3
+"""Captures of a cell from which their spread is told."""
 REPEATS = 6
 """Simulated presses of a cell."""
 FIRST_SEED = 500

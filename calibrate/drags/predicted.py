@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.artefact import load_artefact
+from calibrate.compare.ceiling import CEILING, ceiling_values, pair_means
 from calibrate.compare.similarity import binary_scores
 from calibrate.drags.artefact import DragArtefact
 from calibrate.drags.captures import Drawn, read_drags
@@ -20,7 +21,7 @@ from calibrate.drags.predict import Predictor, predictors
 from sessions.progress import Progress, unseen
 
 Floats = NDArray[np.float64]
-OURS, LAG, STAMPS, CEILING = "predicted", "bristle lag alone", "circle stamps", "other strokes of the same command"
+OURS, LAG, STAMPS = "predicted", "bristle lag alone", "circle stamps"
 PIECE = 32
 """Images predicted at a time, so that memory stays bounded."""
 
@@ -156,16 +157,18 @@ def _in_pieces(drawn: Drawn, predictor: Predictor) -> tuple[NDArray[np.bool_], N
 
 
 def _ceiling(drawn: Drawn, truth: NDArray[np.bool_]) -> dict[int, tuple[float, float]]:
-    """CSIM and IoU of each stroke that was repeated, predicted by the majority of the others of its command."""
+    """`ceiling_values` of CSIM and IoU, from 0 to 1, of each stroke whose command was repeated."""
     if drawn.commands is None:
         return {}
-    alike: dict[tuple[float, ...], list[int]] = {}
-    for k, command in enumerate(drawn.commands.tolist()):
-        alike.setdefault(tuple(command), []).append(k)
-    found: dict[int, tuple[float, float]] = {}
-    for group in alike.values():
-        for k in group if len(group) > 1 else ():
-            others = truth[[j for j in group if j != k]].mean(axis=0) >= 0.5
-            [(csim, iou)] = binary_scores(others[None], truth[k : k + 1]).tolist()
-            found[k] = (csim, iou)
-    return found
+    _, command = np.unique(drawn.commands, axis=0, return_inverse=True)
+    command = command.reshape(-1)
+    pairs = np.full((len(truth), 2), np.nan)
+    for number in range(int(command.max()) + 1):
+        at = np.flatnonzero(command == number)
+        pairs[at] = _pairs(truth[at])
+    found = 0.01 * np.apply_along_axis(ceiling_values, 0, 100.0 * pairs, command)
+    return {k: (csim, iou) for k, (csim, iou) in enumerate(found.tolist()) if np.isfinite(csim)}
+
+
+def _pairs(alike: NDArray[np.bool_]) -> Floats:
+    return pair_means(len(alike), lambda k, others: binary_scores(alike[others], alike[[k] * len(others)]))

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from rich.table import Column, Table
 
+from calibrate.compare.ceiling import CEILING
 from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
-from calibrate.drags.predicted import CEILING, OURS, Predictions
+from calibrate.drags.predicted import OURS, Predictions
 from calibrate.report import (
     BLUE,
     ORANGE,
@@ -110,7 +111,7 @@ def prediction_sentences(predictions: Predictions) -> Iterator[str]:
         fitted = len(predictions.strokes) - len(predictions.scored)
         yield f"The means leave out {fitted} strokes that the fit was fitted to."
     if CEILING not in predictions.means():
-        yield "No command was repeated, so the ceiling (one stroke predicting another of its command) is not known."
+        yield "No command was repeated, so the ceiling (the score of a perfect model) is not known."
     if predictions.drawn.commands is not None:
         yield ends_sentence(predictions.drawn.ends)
 

@@ -105,14 +105,14 @@ def read_presses(
         raise CalibrationError(str(recording.path), "holds no press that can be used for a fit")
     brush = brush_of(recording.header)
     radius, length = float(brush.radius_mm), float(brush.length_mm)
-    grid, rows = grid_of(view), inked_rows([one.ink for one in pressed], view)
+    grid, rows = grid_of(view), inked_rows([one.ink for one in pressed], view.mm_per_px)
     grid = Grid(grid.x_mm, grid.y_mm[rows])
     pressed = [Pressed(one.height_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
     return Captures(recording.header, digest, calibration, radius, length, rows, grid, pressed, names, refused)
 
 
-def inked_rows(images: Sequence[NDArray[np.floating]], view: Field) -> slice:
-    """Rows of the field that the ink of any of these (128, 128) images reaches, and 2 mm more."""
+def inked_rows(images: Sequence[NDArray[np.floating]], px_mm: float) -> slice:
+    """Rows that the ink of any of these (rows, columns) images reaches, and 2 mm more."""
     inked = np.flatnonzero(np.any([image.any(axis=1) for image in images], axis=0))
-    margin = round(MARGIN_MM / view.mm_per_px)
-    return slice(max(0, int(inked[0]) - margin), min(SIZE_PX, int(inked[-1]) + 1 + margin))
+    margin = round(MARGIN_MM / px_mm)
+    return slice(max(0, int(inked[0]) - margin), min(len(images[0]), int(inked[-1]) + 1 + margin))

@@ -3,38 +3,49 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.images import draw_loop
-from calibrate.compare.similarity import csim, ssim
-from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
-from calibrate.fit.fit import Fit, refit
+from calibrate.compare.ceiling import CEILING, Average, average, ceiling_values, pair_means
+from calibrate.compare.field import SIZE_PX
+from calibrate.compare.images import draw_loop, to_pixels
+from calibrate.fit.captures import SPREAD_MM, Grid, Pressed, inked_rows
+from calibrate.fit.fit import refit
+from calibrate.fit.prior import learned
+from model.brush import DomainError
 from model.fitted import FittedPress
 from model.loops import BEZIER_PIECES, Loop, bezier_side, closed
 from model.plane import Plane, fit_plane
 from sessions.progress import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
-FEWEST_REPEATS = 3
-"""Strokes of a cell from which one is compared with the others."""
 Cell = tuple[float, float]
-CEILING, FITTED, BEZIER, UNCALIBRATED = "same-cell template", "fitted", "refitted Bezier", "uncalibrated"
+FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
 Predict = Callable[[float, float], Images]
+Outline = Callable[[float, float], Loop]
+MAX_FOLDS = 15
+"""Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
+PER_CELL = 3
+"""Presses of each other cell that a fit uses; more did not change it."""
+MAX_STROKES = 60
+One = TypeVar("One")
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Scores of one model on held-out strokes, binary images, percent."""
+    """Scores of one model on held-out strokes, binary images, percent; of the ceiling, its estimate."""
 
     model: str
     csim: float
     ssim: float
     n: int
+    below: Average | None = None
+    """Points of CSIM below the ceiling; None for the ceiling itself, and where no cell was pressed twice."""
 
 
 def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
@@ -50,51 +61,91 @@ def predictor(press: FittedPress, grid: Grid) -> Predict:
     return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
 
 
-def leave_cell_out(fit: Fit, strokes: Sequence[Pressed], grid: Grid, progress: Progress = unseen) -> list[HeldOut]:
-    """Score each cell as predicted by fits to all other cells. Raises ValueError with fewer than two cells.
+def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
+    """Groups of cells that are left out together; none if there is only one cell."""
+    ordered = sorted(set(cells))
+    count = min(len(ordered), most)
+    return [ordered[k::count] for k in range(count)] if len(ordered) > 1 else []
 
-    Models without enough data are left out: a template needs three strokes of a cell, a regressed Bezier two depths
-    and two tilts among the others.
+
+def without(cells: Mapping[Cell, Sequence[One]], fold: Sequence[Cell]) -> list[One]:
+    """The strokes of all other cells that a fit uses."""
+    others = [one for cell, group in cells.items() if cell not in fold for one in group[:PER_CELL]]
+    return others[:: max(1, -(-len(others) // MAX_STROKES))]
+
+
+def fit_held_out(strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> FittedPress:
+    """Fit these strokes, cut to the inked rows, from the prior: it knows no other stroke of their session."""
+    rows = inked_rows([one.ink for one in strokes], grid.px_mm)
+    cut = [replace(one, ink=one.ink[rows]) for one in strokes]
+    start = FittedPress(radius_mm, length_mm, learned().values)
+    return refit(start, cut, Grid(grid.x_mm, grid.y_mm[rows]))
+
+
+def leave_cell_out(
+    strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, progress: Progress = unseen
+) -> list[HeldOut]:
+    """Score each cell as predicted by fits to other cells; empty for a single cell.
+
+    `brushloop validate` uses the same fits. Models without enough data are left out: the ceiling needs two strokes of
+    a cell, a regressed Bezier two depths and two tilts among the others.
     """
     cells = by_cell(strokes)
-    if len(cells) < 2:
-        raise ValueError("leaving a cell out needs at least two cells")
-    published = FittedPress(fit.press.radius_mm, fit.press.length_mm)
-    scores = Scores()
-    for cell, held in counted(cells.items(), "cells left out in turn", len(cells), progress):
-        others = [stroke for key, group in cells.items() if key != cell for stroke in group]
-        images = {
-            FITTED: predictor(refit(fit.press, others, grid), grid)(*cell),
-            UNCALIBRATED: image_of(published.outline(*cell), grid),
-        }
+    published = FittedPress(radius_mm, length_mm)
+    scores, left = Scores(), folds(list(cells))
+    for fold in counted(left, "cells left out in turn", len(left), progress):
+        # In 256 levels, as validation stores them: the numbers of both are equal.
+        others = [replace(one, ink=to_pixels(np.asarray(one.ink, np.float32)) / 255.0) for one in without(cells, fold)]
+        press = fit_held_out(others, grid, radius_mm, length_mm)
+        models: dict[str, Outline] = {FITTED: press.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-            images[BEZIER] = image_of(refit_bezier(others, grid).outline(*cell), grid)
-        scores.add(held, images)
+            models[BEZIER] = refit_bezier(others, grid).outline
+        for cell in fold:
+            scores.add(cells[cell], dict(_images(models, cell, grid)))
     return scores.rows((CEILING, FITTED, BEZIER, UNCALIBRATED))
 
 
+def _images(
+    models: Mapping[str, Callable[[float, float], Loop]], cell: Cell, grid: Grid
+) -> Iterator[tuple[str, Images]]:
+    for name, outline in models.items():
+        with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
+            yield name, image_of(outline(*cell), grid)
+
+
 class Scores:
-    """Collects scores of held-out strokes by model, and of the template of their own cell."""
+    """Collects scores of held-out strokes by model, and of the pairs of strokes in their cell."""
 
     def __init__(self) -> None:
-        self._found: dict[str, list[tuple[float, float]]] = {}
+        self._found: dict[str, list[NDArray[np.float64]]] = {}
+        self._cells: list[int] = []
 
     def add(self, held: Sequence[Pressed], images: Mapping[str, Images]) -> None:
-        """Score the strokes of one cell by what each model predicts there, and by the others of the cell."""
-        for k, stroke in enumerate(held):
-            for name, image in images.items():
-                self._found.setdefault(name, []).append(_score(image, stroke.ink))
-            if len(held) >= FEWEST_REPEATS:
-                template = np.mean([other.ink > 0.5 for m, other in enumerate(held) if m != k], axis=0)
-                self._found.setdefault(CEILING, []).append(_score(template, stroke.ink))
+        """Score the strokes of one cell by what each model predicts there, and in pairs."""
+        inks = [_levels(stroke.ink) for stroke in held]
+        nothing = np.full((len(inks), 2), np.nan)
+        before = sum(map(len, self._found.get(CEILING, [])))
+        pairs = pair_means(len(inks), lambda k, others: _scores(inks[k], [inks[j] for j in others]))
+        for name in {*self._found, *images} - {CEILING}:
+            found = nothing
+            if name in images:
+                found = np.concatenate([_scores(ink, [_levels(images[name])]) for ink in inks])
+            self._found.setdefault(name, [np.full((before, 2), np.nan)]).append(found)
+        self._found.setdefault(CEILING, []).append(pairs)
+        self._cells += [1 + max(self._cells, default=-1)] * len(inks)
 
     def rows(self, order: Sequence[str]) -> list[HeldOut]:
         """Means in percent in this order; a model without a score is left out."""
-        rows: list[HeldOut] = []
+        cells, rows = np.array(self._cells), list[HeldOut]()
+        values = {name: 100.0 * np.concatenate(found) for name, found in self._found.items()}
+        if CEILING in values:
+            values[CEILING] = np.stack([ceiling_values(pairs, cells) for pairs in values[CEILING].T], axis=1)
         for name in order:
-            if name in self._found:
-                mean = 100.0 * np.mean(self._found[name], axis=0)
-                rows.append(HeldOut(name, float(mean[0]), float(mean[1]), len(self._found[name])))
+            known = np.isfinite(values[name][:, 0]) if name in values else np.zeros(0, np.bool_)
+            if known.any():
+                below = average(values[CEILING][:, 0] - values[name][:, 0], cells) if name != CEILING else None
+                csim, ssim = values[name][known].mean(axis=0).tolist()
+                rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
         return rows
 
 
@@ -138,8 +189,16 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
     return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
 
 
-def _score(predicted: Images, ink: Images) -> tuple[float, float]:
-    seen, truth = (np.asarray(image > 0.5, np.float32) for image in (predicted, ink))
-    if not seen.any() or not truth.any():
-        return 0.0, 0.0
-    return csim(seen, truth), ssim(seen, truth)
+def _levels(image: Images) -> NDArray[np.uint8]:
+    """Ink or paper as 255 or 0, with blank rows up to the height of the field, which SSIM is averaged over."""
+    blank = max(0, SIZE_PX - len(image))
+    return np.pad(np.where(image > 0.5, 255, 0).astype(np.uint8), ((blank // 2, blank - blank // 2), (0, 0)))
+
+
+def _scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+    """(n, 2) CSIM and SSIM; NaN where an image is blank."""
+    from calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
+
+    out = np.empty((len(predicted), 2))
+    compare(captured, np.stack(predicted), 0, out)
+    return out

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
 from calibrate.compare.similarity import csim
 from calibrate.files import write_whole
 from calibrate.fit.captures import Captures, Floats, Grid, Pressed
-from calibrate.fit.heldout import CEILING, FITTED, UNCALIBRATED, Cell, by_cell, predictor
+from calibrate.fit.heldout import FITTED, UNCALIBRATED, Cell, by_cell, predictor
 from calibrate.fit.run import Fitted
 from calibrate.report import (
     BLUE,
@@ -34,8 +35,6 @@ MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
 LITTLE = 0.1
 """Share of a parameter's variance below which the strokes say next to nothing about it."""
-NEAR_CEILING = 1.5
-"""Distance from the ceiling that counts as near, in points of CSIM."""
 COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Of Okabe and Ito, one for each tilt in turn."""
 
@@ -175,7 +174,7 @@ def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
     if FITTED not in scores:
         yield "Only one combination was pressed, so how well it predicts others is not known."
         return
-    ceiling = f"; another press of the same combination reaches {scores[CEILING]:.1f} %" if CEILING in scores else ""
+    ceiling = f"; a perfect model would reach {scores[CEILING]:.1f} %" if CEILING in scores else ""
     yield (
         f"On combinations that were left out of the fit it predicts the ink with a CSIM of {scores[FITTED]:.1f} %, "
         f"the model as published with {scores[UNCALIBRATED]:.1f} %{ceiling}."
@@ -183,17 +182,15 @@ def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
 
 
 def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
-    scores = {row.model: row.csim for row in fitted.held_out}
-    if not scores:
+    below = {row.model: row.below for row in fitted.held_out}
+    if not below:
         yield Point(False, "One combination of H and α does not show how the mark changes with depth or tilt.")
-    elif CEILING in scores:
-        off = scores[CEILING] - scores[FITTED]
-        words = f"Held out, the fit is {off:.1f} points of CSIM below the ceiling"
-        yield Point(off <= NEAR_CEILING, f"{words}; {NEAR_CEILING:g} or less is near.")
+    elif (off := below.get(FITTED)) is not None:
+        span = "" if off.interval is None else f" (95 % {off.interval[0]:.1f} to {off.interval[1]:.1f})"
+        words = f"Held out, the fit is {off.mean:.1f} points of CSIM{span} below the ceiling"
+        yield Point(is_near(off.mean, off.interval), f"{words}; {NEAR_POINTS:g} or less is near.")
     else:
-        yield Point(
-            None, "No combination was pressed three times, so the repeatability of the brush is not known here."
-        )
+        yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
     if captures.refused:
         yield Point(False, f"{len(captures.refused)} presses could not be used; each is named below.")
     else:

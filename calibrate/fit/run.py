@@ -48,7 +48,7 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
     """Fit, leave each cell out in turn, and make the artefact."""
     grid, strokes = captures.grid, captures.strokes
     fit = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm, progress=progress)
-    held_out = leave_cell_out(fit, strokes, grid, progress) if len(by_cell(strokes)) > 1 else []
+    held_out = leave_cell_out(strokes, grid, captures.radius_mm, captures.length_mm, progress)
     parameters: dict[str, FittedValue] = {}
     for name, value, error in zip(NAMES, fit.press.values.tolist(), fit.errors.tolist(), strict=True):
         bounds = PARAMETERS[NAMES.index(name)]

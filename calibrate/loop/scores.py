@@ -83,7 +83,7 @@ class Verdict:
     difference: float
     low: float | None
     high: float | None
-    """95 % interval, by bootstrap over the commanded cells; None with fewer than three."""
+    """95 % interval over the commanded cells; None with fewer than three."""
     n: int
     holds: bool
     """Whether the difference is at least minus `GOAL_POINTS`."""
@@ -239,10 +239,9 @@ def _verdict(scores: Sequence[PairScore], key: Key, measure: str) -> Verdict | N
     if not both:
         return None
     cell_of = {s.again: s.cell for s in scores}
-    cells: dict[tuple[float, float], list[float]] = {}
-    for name in both:
-        cells.setdefault(cell_of[name], []).append(again[name] - another[name])
-    difference = float(np.mean([value for cell in cells.values() for value in cell]))
-    low, high = interval_over_groups(list(cells.values())) or (None, None)
+    cells = sorted({cell_of[name] for name in both})
+    differences = np.array([again[name] - another[name] for name in both])
+    difference = float(differences.mean())
+    low, high = interval_over_groups(differences, np.array([cells.index(cell_of[n]) for n in both])) or (None, None)
     ours, theirs = (float(np.mean([values[name] for name in both])) for values in (again, another))
     return Verdict(*key, measure, ours, theirs, difference, low, high, len(both), difference >= -GOAL_POINTS)

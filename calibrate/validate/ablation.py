@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -11,14 +10,12 @@ import numpy as np
 
 from calibrate.compare.field import KEYS, Alignment, Tone
 from calibrate.compare.images import brush_of, loop_pixels, pack
-from calibrate.fit.fit import fit_presses
-from calibrate.validate.heldout import RefitJob, bezier_body, bezier_pixels, cropped, fitted_press, press_body
+from calibrate.validate.heldout import RefitJob, bezier_pixels, fitted_press, refit_job
 from calibrate.validate.jobs import ABSENT, ScoreJob, score_job
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.report.data import Step
 from calibrate.validate.rows import CHUNK
 from calibrate.validate.run import Outcome
-from calibrate.validate.store import VERSION
 from sessions.progress import Progress
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
@@ -45,11 +42,10 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
     for trial in _trials(outcome):
         brush = brush_of(outcome.sessions[trial.session].header)
         strokes = tuple((*outcome.rows.cell(k), outcome.rows.pixels(k)) for k in trial.chosen)
-        job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), None, outcome.options.view)
-        key = hashlib.sha256(f"fit {VERSION} {job.key}".encode()).hexdigest()
-        jobs[f"{key}:{len(jobs)}"] = (trial, job)
+        job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), outcome.options.view)
+        jobs[f"{job.key}:{len(jobs)}"] = (trial, job)
     waiting = ((name, job) for name, (_, job) in jobs.items() if name.partition(":")[0] not in outcome.store)
-    for done, (name, found) in enumerate(scheduler.run(fit_job, waiting), 1):
+    for done, (name, found) in enumerate(scheduler.run(refit_job, waiting), 1):
         outcome.store.put(name.partition(":")[0], found)
         progress("fits from few strokes", done, len(jobs))
     sums: dict[tuple[int, int, str], list[np.ndarray]] = {}
@@ -65,13 +61,6 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
         csim, ssim = (round(float(value), 6) for value in mean)
         steps.append(Step(session_id=ident, strokes=count, model=model, csim=csim, ssim=ssim, n=len(scores)))
     return tuple(steps)
-
-
-def fit_job(job: RefitJob) -> dict[str, Any]:
-    """Fit as `refit_job` does, but from the prior instead of from a fit to the whole session."""
-    strokes, grid = cropped(job)
-    press = fit_presses(strokes, grid, job.radius_mm, job.length_mm).press
-    return {"fitted": press_body(press), "bezier": bezier_body(strokes, grid)}
 
 
 def _trials(outcome: Outcome) -> Iterator[Trial]:

@@ -84,7 +84,10 @@ def check_gates(report: Report, gates: list[Gate]) -> None:
         if stat is None:
             known = ", ".join(dict.fromkeys(one.model for one in report.stats))
             raise _bad(gate.text, f"{model!r} has no score; scored: {known}")
-        value = 0.01 * float(getattr(stat, gate.statistic))
+        found: float | None = getattr(stat, gate.statistic)
+        if found is None:
+            raise _bad(gate.text, f"the {model} is an average and has no {gate.statistic}")
+        value = 0.01 * found
         if not OPERATORS[gate.op](value, gate.limit):
             which = f"{model}, {gate.alignment}, {gate.tone}"
             missed.append(f"{gate.text}: {gate.measure}_{gate.statistic} of {which} is {value:.4f} ({report.label})")

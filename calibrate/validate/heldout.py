@@ -14,23 +14,24 @@ import numpy as np
 
 from calibrate.compare.field import Field
 from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
-from calibrate.fit.artefact import BrushFit
-from calibrate.fit.captures import Grid, Pressed, grid_of, inked_rows
-from calibrate.fit.fit import refit
-from calibrate.fit.heldout import BEZIER_SIZES, RefittedBezier, refit_bezier
+from calibrate.fit.captures import Grid, Pressed, grid_of
+from calibrate.fit.heldout import (
+    BEZIER_SIZES,
+    MAX_FOLDS,
+    PER_CELL,
+    RefittedBezier,
+    fit_held_out,
+    folds,
+    refit_bezier,
+    without,
+)
 from calibrate.validate.pool import Scheduler
 from calibrate.validate.rows import Cell, Numbers, Rows
 from calibrate.validate.sources import LoadedSession
 from calibrate.validate.store import VERSION, Store
-from model.fitted import MODES, NAMES, TERMS, FittedPress
+from model.fitted import MODES, TERMS, FittedPress
 from model.plane import Plane
 from sessions.progress import Progress
-
-MAX_FOLDS = 15
-"""Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
-PER_CELL = 3
-"""Presses of each other cell that a fit uses; more did not change it."""
-MAX_STROKES = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,46 +42,30 @@ class RefitJob:
     """H, alpha and `Press.pixels`, whose last image is the coverage."""
     radius_mm: float
     length_mm: float
-    start: tuple[float, ...] | None
-    """Parameters of the session's fit; None fits no CCD-BSM."""
     view: Field
+    fitted: bool = True
+    """Whether to fit CCD-BSM; a Bezier always is."""
 
     @property
     def key(self) -> str:
         """Hash of everything that determines the result."""
         digest = hashlib.sha256(
-            f"refit {VERSION} {self.radius_mm} {self.length_mm} {self.start} {self.view} {len(self.strokes)}".encode()
+            f"refit {VERSION} {self.radius_mm} {self.length_mm} {self.fitted} {self.view} {len(self.strokes)}".encode()
         )
         for height, tilt, pixels in self.strokes:
             digest.update(f"{height} {tilt} ".encode() + hashlib.sha256(pixels).digest())
         return digest.hexdigest()
 
 
-def start_of(fit: BrushFit) -> tuple[float, ...]:
-    """Initial values of a refit: those of the whole session."""
-    return tuple(fit.parameters[name].value for name in NAMES)
-
-
-def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
-    """Groups of cells that are left out together; none if there is only one cell."""
-    ordered = sorted(set(cells))
-    count = min(len(ordered), most)
-    return [ordered[k::count] for k in range(count)] if len(ordered) > 1 else []
-
-
 def refit_job(job: RefitJob) -> dict[str, Any]:
     """Fit `fitted` (values, edges) and `bezier` (coefficients), each None if there are too few strokes for it."""
-    strokes, grid = cropped(job)
-    out: dict[str, Any] = {"fitted": None}
-    if job.start is not None:
-        whole = FittedPress(job.radius_mm, job.length_mm, np.array(job.start))
-        out["fitted"] = press_body(refit(whole, strokes, grid))
-    return out | {"bezier": bezier_body(strokes, grid)}
-
-
-def press_body(press: FittedPress) -> dict[str, Any]:
-    """A fitted brush as plain data."""
-    return {"values": press.values.tolist(), "edges": press.edges.ravel().tolist(), "ends": press.ends.ravel().tolist()}
+    grid = grid_of(job.view)
+    strokes = [Pressed(h, a, unpack(pixels)[-1].astype(np.float64) / 255.0) for h, a, pixels in job.strokes]
+    fitted = None
+    if job.fitted:
+        press = fit_held_out(strokes, grid, job.radius_mm, job.length_mm)
+        fitted = {name: getattr(press, name).ravel().tolist() for name in ("values", "edges", "ends")}
+    return {"fitted": fitted, "bezier": bezier_body(strokes, grid)}
 
 
 def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
@@ -90,14 +75,6 @@ def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
     except ValueError:
         return None
     return [float(value) for value in coefficients.ravel()]
-
-
-def cropped(job: RefitJob) -> tuple[list[Pressed], Grid]:
-    """Crop the strokes and their grid to the inked rows and 2 mm more, as `brushloop fit` does."""
-    inks = [unpack(pixels)[-1].astype(np.float64) / 255.0 for _, _, pixels in job.strokes]
-    rows, grid = inked_rows(inks, job.view), grid_of(job.view)
-    pressed = [Pressed(h, a, ink[rows]) for (h, a, _), ink in zip(job.strokes, inks, strict=True)]
-    return pressed, Grid(grid.x_mm, grid.y_mm[rows])
 
 
 def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
@@ -124,20 +101,16 @@ def refits_by_cell(
 ) -> dict[Cell, dict[str, Any]]:
     """Refit for each cell of session `number` to uncut presses of its other cells; return the results by cell."""
     cells = {cell: _first_uncut(rows, group) for session_of, cell, group in rows.groups() if session_of == number}
-    brush = brush_of(session.header)
-    start = start_of(session.fit) if session.fit is not None else None
+    brush, fitted = brush_of(session.header), session.fit is not None
     fits: dict[Cell, dict[str, Any]] = {}
-    left = folds(list(cells), most_folds)
     jobs: list[tuple[str, RefitJob]] = []
     of_key: dict[str, list[Cell]] = {}
-    for fold in left:
-        alone = set(fold)
-        others = [row for cell, group in cells.items() if cell not in alone for row in group]
-        others = others[:: max(1, -(-len(others) // MAX_STROKES))]
+    for fold in folds(list(cells), most_folds):
+        others = without(cells, fold)
         if not others:
             continue
         strokes = tuple((*rows.cell(row), rows.pixels(row)) for row in others)
-        job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), start, view)
+        job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), view, fitted)
         of_key[job.key] = fold
         if job.key not in store:
             jobs.append((job.key, job))

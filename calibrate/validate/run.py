@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from calibrate.compare.ceiling import others_of
 from calibrate.compare.field import Field
 from calibrate.compare.images import brush_of, pack
 from calibrate.compare.paper import ROBOT_WRITING
@@ -26,12 +27,10 @@ from calibrate.validate.tuning import FOLDS, tuned_by_cell
 from model.brush import DomainError
 from sessions.progress import Progress
 
-CEILING = "another press"
+ANOTHER = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
 REPEATED = ROBOT_WRITING
 """A press compared with the stroke of another session that it repeats: the third row of the paper's Table 1."""
-MAX_OTHERS = 9
-"""Most presses that predict one: all others of a cell of ten, as in the paper, or the next nine of a larger one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +111,7 @@ def _validate(
             raise CalibrationError(
                 "--model", f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
             )
-    names = [*_ordered_names(candidates), CEILING, REPEATED]
+    names = [*_ordered_names(candidates), ANOTHER, REPEATED]
     columns = [[*(names.index(one.name) for one in group), len(names) - 2, len(names) - 1] for group in candidates]
     scores = Scores(store, rows, names, columns)
     done = 0
@@ -195,10 +194,7 @@ def _score_jobs(
                 refused.extend((sessions[session].header.session_id, rows[int(k)].press.stroke_id, why) for k in group)
         for start in range(0, len(group), CHUNK):
             chunk = group[start : start + CHUNK]
-            reach = min(MAX_OTHERS, len(group) - 1)
-            theirs = [
-                [int(group[(start + n + step) % len(group)]) for step in range(1, reach + 1)] for n in range(len(chunk))
-            ]
+            theirs = [[int(group[k]) for k in others_of(start + n, len(group))] for n in range(len(chunk))]
             others = sorted({k for mine in theirs for k in mine})
             job = ScoreJob(
                 tuple(rows.pixels(k) for k in map(int, chunk)),

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from calibrate.compare.field import FINE, Field, Image
 from calibrate.compare.images import axis_mm, brush_of, prepare_press
 from calibrate.errors import CalibrationError, CaptureRefused
+from calibrate.fit.heldout import folds
 from calibrate.report import source_label
 from calibrate.stroke.params import PX_PER_MM
 from calibrate.stroke.preprocess import Prepared
 from calibrate.validate.candidates import Generator
-from calibrate.validate.heldout import fitted_press, folds
+from calibrate.validate.heldout import fitted_press
 from calibrate.validate.rows import Cell
 from calibrate.validate.sources import LoadedSession, one_source
 from calibrate.validate.store import VERSION

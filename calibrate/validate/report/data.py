@@ -36,12 +36,17 @@ class Stat(Frozen):
     """`csim` or `ssim`."""
     cell: tuple[float, float] | None
     n: int
-    max: float
-    min: float
+    max: float | None
+    min: float | None
     avg: float
     avg_interval: Interval | None
-    median: float
+    median: float | None
+    """None for the ceiling, as are the extremes: it is an average of its own, not of scores."""
     median_interval: Interval | None
+    below: float | None = None
+    """Points below the ceiling over all cells together; None where no cell was pressed twice."""
+    below_interval: Interval | None = None
+    """95 % interval of that difference, which resamples whole cells."""
 
 
 class CandidateInfo(Frozen):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
+from calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import ORDER
 from calibrate.compare.similarity import Polarity
@@ -12,14 +13,12 @@ from calibrate.loop.scores import AGAIN, ANOTHER, LoopRecord
 from calibrate.report import Point, source_point
 from calibrate.validate import candidates as who
 from calibrate.validate.report.data import Report, Session, Stat
-from calibrate.validate.run import CEILING
+from calibrate.validate.run import ANOTHER as ANOTHER_PRESS
 from calibrate.writing.scores import REFERENCE
 from sessions.recording.schemas import Source
 
 CLOSE = 0.5
 """Points below which two models count as equal."""
-NEAR_CEILING = 1.5
-"""Distance from the ceiling that counts as near, in points of average CSIM."""
 FEW_REPEATS = 3
 WIDE_SCALE = 0.005
 """Relative width of pix2len's interval above which it matters: half a percent of every length."""
@@ -55,7 +54,7 @@ def verdict(report: Report) -> Iterator[str]:
         _avg(report, name) for name in (report.shown, CEILING, who.BEZIER_REFITTED, "ccd-bsm")
     )
     if shown is not None:
-        below = "" if top is None else f", {top.avg - shown.avg:.1f} points below the ceiling of {top.avg:.1f} %"
+        below = "" if top is None or shown.below is None else f"{_below(shown)} of {top.avg:.1f} %"
         unseen = " from cells that it has not seen" if report.shown == who.FITTED_HELD_OUT else ""
         label = _label(report, report.shown)
         yield f"{label} predicts presses{unseen} with an average CSIM of {shown.avg:.1f} %{below}."
@@ -75,20 +74,20 @@ def verdict(report: Report) -> Iterator[str]:
 
 def findings(report: Report) -> Iterator[str]:
     """How well the models predict: the ceiling, the best model that had not seen the strokes, the published one."""
-    top = _avg(report, CEILING)
-    if top is not None:
+    again, top = _avg(report, ANOTHER_PRESS), _avg(report, CEILING)
+    if again is not None and top is not None:
         yield (
             f"Repeatability of the brush: one press predicts another of the same H and α with a CSIM of "
-            f"{_interval(top)}. No model can be expected to do much better; this is the ceiling."
+            f"{again.avg:.1f} %. A perfect model of this brush, which draws the best image of each cell, would reach "
+            f"{_interval(top)}: this is the ceiling, and no model can be expected to do better."
         )
     held, bezier = _avg(report, who.FITTED_HELD_OUT), _avg(report, who.BEZIER_REFITTED)
     if held is not None:
-        gap = "" if top is None else f", {top.avg - held.avg:.1f} points below the ceiling"
-        yield f"Calibrated to this brush, CCD-BSM reaches {_interval(held)}{gap}, on cells that the fit had not seen."
+        unseen = "on cells that the fit had not seen"
+        yield f"Calibrated to this brush, CCD-BSM reaches {_interval(held)}{_below(held)}, {unseen}."
     tuned = _avg(report, who.GENERATOR_HELD_OUT)
     if tuned is not None:
-        gap = "" if top is None else f", {top.avg - tuned.avg:.1f} points below the ceiling"
-        yield f"Tuned to this brush, CCD-BSMG reaches {_interval(tuned)}{gap}, on cells that it had not seen."
+        yield f"Tuned to this brush, CCD-BSMG reaches {_interval(tuned)}{_below(tuned)}, on cells that it had not seen."
     if bezier is not None:
         peer = "" if held is None else f": {abs(held.avg - bezier.avg):.1f} points {_less(bezier.avg, held.avg)}"
         yield f"A Bézier stroke fitted to the same captures reaches {_interval(bezier)}{peer}."
@@ -203,11 +202,15 @@ def trust(report: Report) -> Iterator[Point]:
             f"Some cells were pressed only {min(repeats)} times, so the ceiling is rough. The paper presses ten times."
         )
         yield Point(None, words)
-    held, bezier, top = (_avg(report, name) for name in (who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING))
-    if held is not None and top is not None:
-        near = top.avg - held.avg <= NEAR_CEILING
-        how = "within" if near else "not within"
-        yield Point(near, f"The calibrated model is {how} {NEAR_CEILING} points of the ceiling (mm, binary, CSIM).")
+    held, bezier = (_avg(report, name) for name in (who.FITTED_HELD_OUT, who.BEZIER_REFITTED))
+    if held is not None and held.below is not None:
+        span = held.below_interval
+        near = is_near(held.below, None if span is None else (span.low, span.high))
+        how = {True: "within", False: "not within", None: "not certainly within"}[near]
+        yield Point(
+            near,
+            f"The calibrated model is {how} {NEAR_POINTS} points of the ceiling (mm, binary, CSIM): {_points(held)}.",
+        )
     if held is not None and bezier is not None and held.avg < bezier.avg:
         yield Point(False, "The refitted Bézier predicts unseen cells better than the calibrated CCD-BSM.")
     for loop in report.loops:
@@ -260,6 +263,15 @@ def _avg(report: Report, model: str) -> Stat | None:
 def _interval(stat: Stat) -> str:
     span = stat.avg_interval
     return f"{stat.avg:.1f} %" + ("" if span is None else f" (95 % {span.low:.1f} to {span.high:.1f})")
+
+
+def _points(stat: Stat) -> str:
+    span = stat.below_interval
+    return f"{stat.below:.1f} points" + ("" if span is None else f" (95 % {span.low:.1f} to {span.high:.1f})")
+
+
+def _below(stat: Stat) -> str:
+    return "" if stat.below is None else f", {_points(stat)} below the ceiling"
 
 
 def _count(report: Report) -> int:

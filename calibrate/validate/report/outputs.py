@@ -101,7 +101,7 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
 def summary_csv(report: Report) -> str:
     """Return every statistic, per cell and overall; “robot writing” is what `brushloop loop` pressed again."""
     head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
-    ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "source")
+    ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "below_ceiling", "source")
     rows = [(*_stat_row(stat), report.label) for stat in report.stats]
     return csv_text((*head, *ends), [*rows, *_loop_rows(report)])
 
@@ -111,7 +111,7 @@ def _stat_row(stat: Stat) -> tuple[object, ...]:
     low, high = (stat.avg_interval.low, stat.avg_interval.high) if stat.avg_interval is not None else ("", "")
     middle = (stat.median_interval.low, stat.median_interval.high) if stat.median_interval is not None else ("", "")
     known = (stat.model, stat.alignment, stat.tone, stat.measure, *cell, stat.n, stat.max, stat.min, stat.avg)
-    return (*known, low, high, stat.median, *middle)
+    return (*known, low, high, stat.median, *middle, stat.below)
 
 
 def _loop_rows(report: Report) -> Iterator[tuple[object, ...]]:
@@ -122,7 +122,7 @@ def _loop_rows(report: Report) -> Iterator[tuple[object, ...]]:
             name = f"{REPEATED} ({loop.again})"
             for measure, three, median in (("csim", row.csim, row.csim_median), ("ssim", row.ssim, row.ssim_median)):
                 known = (name, row.alignment, row.tone, measure, "", "", row.n, *three)
-                yield (*known, "", "", median, "", "", str(row.source))
+                yield (*known, "", "", median, "", "", "", str(row.source))
 
 
 def table_3_csv(report: Report) -> str:
@@ -204,7 +204,8 @@ def _heads(*, with_paper: bool) -> list[str]:
     return ["n", *scores, *(["paper's avg"] if with_paper else [])]
 
 
-def _cells(row: tables.PaperRow, ours: Sequence[float], *, with_paper: bool) -> list[str]:
+def _cells(row: tables.PaperRow, ours: Sequence[float | None], *, with_paper: bool) -> list[str]:
     scores = [ours[2], ours[5]] if narrow() else ours
     paper = f"{row.paper[2]:.2f} / {row.paper[5]:.2f}" if row.paper is not None else ""
-    return [str(row.n), *(f"{score:.2f}" for score in scores), *([paper] if with_paper else [])]
+    words = ("" if score is None else f"{score:.2f}" for score in scores)
+    return [str(row.n), *words, *([paper] if with_paper else [])]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.artefact import FOLDER
+from calibrate.compare.ceiling import CEILING
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import TABLE_3
 from calibrate.fit.artefact import FOLDER as FITS
@@ -18,7 +19,7 @@ from calibrate.validate.report import figures, findings, tables
 from calibrate.validate.report.data import Extreme, Report, Session
 from calibrate.validate.report.figures import Curve
 from calibrate.validate.report.summary import Extremes
-from calibrate.validate.run import CEILING, Outcome
+from calibrate.validate.run import Outcome
 from calibrate.validate.sources import LoadedSession
 
 CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.compare.ceiling import CEILING, average, ceiling_values
 from calibrate.compare.field import KEYS, Alignment, Key, Tone
 from calibrate.compare.images import brush_of
 from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.compare.stats import summarise
+from calibrate.compare.stats import Summary, summarise
 from calibrate.validate import candidates as who
 from calibrate.validate.extras import Extras
 from calibrate.validate.report.data import (
@@ -26,7 +28,7 @@ from calibrate.validate.report.data import (
     software,
 )
 from calibrate.validate.rows import Cell, Rows
-from calibrate.validate.run import CEILING, REPEATED, Outcome
+from calibrate.validate.run import ANOTHER, REPEATED, Outcome
 from calibrate.validate.sources import LoadedSession, one_source
 from model.brush import DomainError
 from sessions.history import history_of
@@ -37,15 +39,21 @@ MAX_CELLS = 60
 EXTREMES = 6
 JUDGED: Key = (Alignment.MM, Tone.BINARY)
 """Best and worst are judged in millimetres, where place and size count."""
+NO_SPREAD: dict[str, Any] = dict.fromkeys(("max", "min", "median", "median_interval"))
 PRESSES = {
-    CEILING: (
+    ANOTHER: (
         "another press",
-        "A capture predicted by the average of other captures of its cell: about what a perfect model of this brush "
-        "could reach.",
+        "A capture predicted by other captures of its cell, averaged: how well the brush repeats a press. A model can "
+        "do better, because only one of two presses strays from its image.",
     ),
     REPEATED: (
         "robot writing",
         "A stroke pressed again with the depth and tilt that were recovered from it, against the original.",
+    ),
+    CEILING: (
+        CEILING,
+        "The score of a perfect model, which draws the best image of each cell: estimated from the similarity of other "
+        "presses of the cell.",
     ),
 }
 
@@ -61,7 +69,8 @@ def report_of(
     cells = list(outcome.rows.first_of_cells())
     each_cell = len(cells) <= MAX_CELLS
     stats = _stats(outcome, cells if each_cell else [])
-    present = [name for name in outcome.names if any(stat.model == name for stat in stats)]
+    scored = {stat.model for stat in stats}
+    present = [name for name in (*outcome.names, CEILING) if name in scored]
     shown = _shown(present)
     best, worst = _extremes(outcome, shown)
     report = Report(
@@ -92,31 +101,48 @@ def _stats(outcome: Outcome, cells: list[Cell]) -> list[Stat]:
     groups: list[tuple[Cell | None, NDArray[np.int64]]] = [(None, np.arange(len(outcome.rows)))]
     groups += [(cell, outcome.rows.of_cell(cell)) for cell in cells]
     stats: list[list[Stat]] = [[] for _ in groups]
-    for model in outcome.names:
-        scores = outcome.scores.of(model)
+    top = np.apply_along_axis(ceiling_values, 0, 100.0 * outcome.scores.of(ANOTHER), stratum)
+    for model in (*outcome.names, CEILING):
+        scores = top if model == CEILING else 100.0 * outcome.scores.of(model)
         for mine, (cell, at) in zip(stats, groups, strict=True):
-            for k, (alignment, tone) in enumerate(KEYS):
-                for j, measure in enumerate(MEASURES):
-                    found = summarise(100.0 * scores[at, k, j], stratum[at])
-                    if found is None:
-                        continue
-                    mine.append(
-                        Stat(
-                            model=model,
-                            alignment=alignment,
-                            tone=tone,
-                            measure=measure,
-                            cell=cell,
-                            n=found.n,
-                            max=_round(found.max),
-                            min=_round(found.min),
-                            avg=_round(found.avg),
-                            avg_interval=_interval(found.avg_interval),
-                            median=_round(found.median),
-                            median_interval=_interval(found.median_interval),
-                        )
+            for (k, (alignment, tone)), (j, measure) in itertools.product(enumerate(KEYS), enumerate(MEASURES)):
+                values = scores[at, k, j]
+                found = summarise(values, stratum[at])
+                if found is None:
+                    continue
+                span, rest = found.avg_interval, _spread(found)
+                if model == CEILING:
+                    own = average(values, stratum[at])
+                    span, rest = None if own is None else own.interval, NO_SPREAD
+                below = None
+                if cell is None and model not in PRESSES:
+                    below = average(top[at, k, j] - values, stratum[at])
+                mine.append(
+                    Stat(
+                        model=model,
+                        alignment=alignment,
+                        tone=tone,
+                        measure=measure,
+                        cell=cell,
+                        n=found.n,
+                        avg=_round(found.avg),
+                        avg_interval=_interval(span),
+                        below=None if below is None else _round(below.mean),
+                        below_interval=None if below is None else _interval(below.interval),
+                        **rest,
                     )
+                )
     return list(itertools.chain.from_iterable(stats))
+
+
+def _spread(found: Summary) -> dict[str, Any]:
+    """The statistics of single scores."""
+    return {
+        "max": _round(found.max),
+        "min": _round(found.min),
+        "median": _round(found.median),
+        "median_interval": _interval(found.median_interval),
+    }
 
 
 def _shown(present: list[str]) -> str:

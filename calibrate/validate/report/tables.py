@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calibrate.compare.ceiling import CEILING
 from calibrate.compare.field import Alignment, Tone
 from calibrate.compare.paper import TABLE_1, TABLE_2, Printed
 from calibrate.compare.similarity import Polarity
 from calibrate.loop.scores import AGAIN, LoopRecord
 from calibrate.validate import candidates as who
 from calibrate.validate.report.data import CandidateInfo, Report, Stat
-from calibrate.validate.run import CEILING, REPEATED
+from calibrate.validate.run import ANOTHER as ANOTHER_PRESS
+from calibrate.validate.run import REPEATED
 from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 
 MISSING = {
@@ -29,12 +31,15 @@ WRITTEN_ROWS = {
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One row in the paper's layout: CSIM max, min, avg, then SSIM; None if one side has no such row."""
+    """One row in the paper's layout: CSIM max, min, avg, then SSIM; None if one side has no such row.
+
+    The ceiling has an average only.
+    """
 
     label: str
     basis: str
     n: int
-    ours: tuple[float, ...] | None
+    ours: tuple[float | None, ...] | None
     paper: tuple[float, ...] | None
     ceiling: bool
 
@@ -51,7 +56,8 @@ class FullRow:
 
 def table_1(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
     """Rows of the generated models and robot writing, with calibrated models and the ceiling."""
-    names = [*TABLE_1, *_present(report, (who.FITTED_HELD_OUT, who.GENERATOR_HELD_OUT)), CEILING]
+    names = [*TABLE_1, *_present(report, (who.FITTED_HELD_OUT, who.GENERATOR_HELD_OUT))]
+    names += [ANOTHER_PRESS, CEILING]
     rows: list[PaperRow] = []
     for name in names:
         again = robot_writing(report, alignment, tone) if name == REPEATED else []
@@ -84,8 +90,9 @@ def _loop_row(loop: LoopRecord, report: Report, alignment: Alignment, tone: Tone
 
 def table_2(report: Report, alignment: Alignment, tone: Tone) -> list[PaperRow]:
     """Rows of the paper's models in its order, then of all others."""
-    others = [rival.name for rival in report.rivals if rival.name not in (*TABLE_2, CEILING, REPEATED, *who.LAMBDAS)]
-    names = [*TABLE_2, *others, CEILING]
+    last = (ANOTHER_PRESS, CEILING)
+    others = [rival.name for rival in report.rivals if rival.name not in (*TABLE_2, *last, REPEATED, *who.LAMBDAS)]
+    names = [*TABLE_2, *others, *last]
     return [_row(report, name, TABLE_2.get(name), alignment, tone) for name in names]
 
 

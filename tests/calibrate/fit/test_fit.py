@@ -5,9 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from calibrate.compare.ceiling import CEILING
 from calibrate.fit.captures import Grid, Pressed
 from calibrate.fit.fit import STAGES, condition_number, draw, fit_presses, refit, zero_touch
-from calibrate.fit.heldout import CEILING, FITTED, leave_cell_out
+from calibrate.fit.heldout import FITTED, leave_cell_out
 from calibrate.fit.prior import learned
 from model.fitted import NAMES, PARAMETERS, FittedPress, published
 
@@ -120,13 +121,27 @@ def test_edges_that_the_profile_does_not_have_are_found() -> None:
     assert fit.press.edges[0, 1, 0] - fit.press.edges[1, 1, 0] == pytest.approx(0.5, abs=0.15)
 
 
-def test_held_out_cells_are_scored_beside_the_template() -> None:
+def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
     strokes = presses(a_brush(), CELLS * 3, noise=0.05)
-    fit = fit_presses(strokes, GRID, 6.0, 48.0, stages=STAGES[:4])
-    rows = {row.model: row for row in leave_cell_out(fit, strokes, GRID)}
+    rows = {row.model: row for row in leave_cell_out(strokes, GRID, 6.0, 48.0)}
     assert rows[FITTED].n == rows[CEILING].n == 15
     assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
-    assert rows[FITTED].csim > rows[CEILING].csim - 2.0
+    below = rows[FITTED].below
+    assert below is not None
+    assert below.mean == pytest.approx(rows[CEILING].csim - rows[FITTED].csim)
+    assert below.mean < 2.5
+    assert below.interval is not None
+    assert below.interval[0] < below.mean < below.interval[1]
+    assert rows[CEILING].below is None
+
+
+def test_two_presses_of_a_cell_are_enough_for_the_ceiling_and_one_is_not() -> None:
+    for repeats, known in ((2, True), (1, False)):
+        strokes = presses(a_brush(), CELLS[:3] * repeats, noise=0.05)
+        rows = {row.model: row for row in leave_cell_out(strokes, GRID, 6.0, 48.0)}
+        assert (CEILING in rows) is known
+        assert (rows[FITTED].below is not None) is known
+    assert leave_cell_out(presses(a_brush(), CELLS[:1] * 2), GRID, 6.0, 48.0) == []
 
 
 def test_a_fit_needs_a_stroke() -> None:

@@ -125,8 +125,8 @@ def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
 
 def test_the_interval_draws_whole_groups() -> None:
     # Three cells, each of which agrees with itself: ten presses a cell tell no more than three numbers do.
-    found = interval_over_groups([[0.0] * 10, [1.0] * 10, [2.0] * 10])
+    found = interval_over_groups(np.repeat([0.0, 1.0, 2.0], 10), np.repeat([0, 1, 2], 10))
     assert found is not None
     assert found[0] < 0.4
     assert found[1] > 1.6
-    assert interval_over_groups([[0.0], [1.0]]) is None
+    assert interval_over_groups(np.array([0.0, 1.0]), np.array([0, 1])) is None

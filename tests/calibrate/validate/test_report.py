@@ -193,7 +193,7 @@ def test_what_is_no_gate_is_refused_before_any_work(text: str, words: str) -> No
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
     run(session, "--out", tmp_path, "--model", "line", "--model", "circle", "--no-held-out")
     report = load_report(tmp_path / "report.json")
-    assert {stat.model for stat in report.stats} == {"line", "circle", "another press"}
+    assert {stat.model for stat in report.stats} == {"line", "circle", "another press", "ceiling"}
     ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path), "--model", "square"])
     assert isinstance(ran.exception, CalibrationError)
     assert "'square' is not one of: ccd-bsm" in str(ran.exception)

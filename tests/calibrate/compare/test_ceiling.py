@@ -1,0 +1,100 @@
+"""The ceiling is the score of a perfect model: here the stray of every press is drawn, so that one can be drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibrate.compare.ceiling import average, ceiling_values, is_near, others_of, pair_means
+from calibrate.compare.similarity import binary_scores
+
+CELLS = 6
+Y, X = np.mgrid[:60, :120]
+
+
+def presses(rng: np.random.Generator, cell: int, count: int, stray_px: float = 1.5) -> np.ndarray:
+    """Marks of one cell: ellipses whose ends and width stray independently."""
+    left, right, half = rng.normal(0.0, stray_px, (3, count, 1, 1))
+    long, wide = 40.0 + cell + 0.5 * (right - left), 12.0 + cell + 0.5 * half
+    return ((X - 60.0 - 0.5 * (left + right)) / long) ** 2 + ((Y - 30.0) / wide) ** 2 < 1.0
+
+
+def scored(seen: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    return 100.0 * binary_scores(np.broadcast_to(seen, cell.shape), cell)[:, 0]
+
+
+def perfect(cell: int) -> float:
+    """What the best image of a cell scores on fresh presses of it."""
+    best = presses(np.random.default_rng(0), cell, 1, stray_px=0.0)[0]
+    return float(scored(best, presses(np.random.default_rng(1), cell, 400)).mean())
+
+
+def session(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Ceiling values, cells and presses."""
+    rng = np.random.default_rng(seed)
+    drawn = [presses(rng, cell, count) for cell in range(CELLS)]
+    pairs = [
+        pair_means(count, lambda k, others, of=one: binary_scores(of[[k] * len(others)], of[others])) for one in drawn
+    ]
+    number = np.repeat(np.arange(CELLS), count)
+    return ceiling_values(100.0 * np.concatenate(pairs)[:, 0], number), number, drawn
+
+
+@pytest.mark.parametrize(("count", "within"), [(10, 0.3), (3, 0.3), (2, 0.4)])
+def test_it_is_what_a_perfect_model_scores_however_few_presses_a_cell_has(count: int, within: float) -> None:
+    truth = np.mean([perfect(cell) for cell in range(CELLS)])
+    found = np.mean([session(seed, count)[0].mean() for seed in range(20)])
+    assert found == pytest.approx(truth, abs=within)
+    pairs = 100.0 - np.sqrt(2.0) * (100.0 - found)  # both presses of a pair stray
+    assert pairs < truth - 0.8
+
+
+def test_its_interval_holds_the_truth_and_is_no_narrower_for_pairs_that_share_presses() -> None:
+    truth = np.mean([perfect(cell) for cell in range(CELLS)])
+    held = 0
+    for seed in range(40):
+        values, number, _ = session(100 + seed, 3)
+        found = average(values, number)
+        assert found is not None
+        assert found.interval is not None
+        held += found.interval[0] <= truth <= found.interval[1]
+    assert held >= 36
+
+
+def test_the_values_of_a_cell_are_its_jackknife() -> None:
+    _, _, [cell, *_] = session(3, 6)
+    pairs = pair_means(6, lambda k, others: 100.0 * binary_scores(cell[[k] * len(others)], cell[others]))[:, 0]
+
+    def mean_pair(at: list[int]) -> float:
+        each = [100.0 * binary_scores(cell[[a]], cell[[b]])[0, 0] for a in at for b in at if a < b]
+        return 100.0 - (100.0 - float(np.mean(each))) / np.sqrt(2.0)
+
+    every = list(range(6))
+    pseudo = [6 * mean_pair(every) - 5 * mean_pair([a for a in every if a != k]) for k in every]
+    assert ceiling_values(pairs, np.zeros(6, np.int64)) == pytest.approx(pseudo)
+
+
+def test_a_press_alone_in_its_cell_has_no_ceiling() -> None:
+    assert np.isnan(pair_means(1, lambda k, others: np.zeros((len(others), 2)))).all()
+    values = ceiling_values(np.array([np.nan, 90.0, 90.0]), np.array([0, 1, 1]))
+    assert np.isnan(values[0])
+    assert values[1:] == pytest.approx(100.0 - 10.0 / np.sqrt(2.0))
+    assert average(np.array([np.nan]), np.array([0])) is None
+
+
+def test_a_press_is_compared_with_nine_others_at_most() -> None:
+    assert others_of(1, 3) == [2, 0]
+    assert others_of(25, 28) == [26, 27, 0, 1, 2, 3, 4, 5, 6]
+
+
+def test_a_model_is_near_where_the_interval_of_the_difference_says_so() -> None:
+    cells = np.repeat(np.arange(5), 4)
+    ceiling = 90.0 + 3.0 * cells + np.random.default_rng(0).normal(0.0, 1.0, 20)
+    # The cells differ by much more than the model is below the ceiling in each.
+    found = average(ceiling - (ceiling - 1.0 + 0.1 * cells), cells)
+    assert found is not None
+    assert found.mean == pytest.approx(0.8)
+    assert is_near(found.mean, found.interval, points=1.5) is True
+    assert is_near(found.mean, found.interval, points=0.9) is None
+    assert is_near(found.mean, found.interval, points=0.1) is False
+    assert is_near(2.0, None) is False

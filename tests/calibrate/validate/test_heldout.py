@@ -1,0 +1,36 @@
+"""`fit` and `validate` leave out the same cells and print the same scores of one session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calibrate.compare.ceiling import CEILING
+from calibrate.compare.field import Alignment, Field, Tone
+from calibrate.fit.captures import read_presses
+from calibrate.fit.heldout import BEZIER, FITTED
+from calibrate.fit.run import fit_session
+from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT
+from calibrate.validate.main import Request, validate
+from sessions.progress import unseen
+
+NAMES = {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}
+
+
+def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path: Path) -> None:
+    captures = read_presses(session, Field())
+    fitted = fit_session(captures, Field())
+    fit = fitted.artefact.save(tmp_path)
+    report = validate(Request((str(session),), "test", fit=fit, out=tmp_path / "report", parquet=False), unseen).report
+    assert report is not None
+    rows = {NAMES[row.model]: row for row in fitted.held_out if row.model in NAMES}
+    assert set(rows) == set(NAMES.values())
+    for name, row in rows.items():
+        for measure in ("csim", "ssim"):
+            stat = report.stat(name, Alignment.MM, Tone.BINARY, measure)
+            assert stat is not None
+            assert (stat.avg, stat.n) == (pytest.approx(getattr(row, measure), abs=0.005), row.n)
+        below = report.stat(name, Alignment.MM, Tone.BINARY, "csim")
+        assert below is not None
+        assert below.below == (None if row.below is None else pytest.approx(row.below.mean, abs=0.005))
