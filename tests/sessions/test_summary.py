@@ -13,7 +13,11 @@ from sessions.show import Summary, summaries
 def root(make, tmp_path, out, photos, run):
     """`sessions/` with one session of every state, and two folders that are none."""
     root = out.parent
-    make.photographs(photos, {"file": "a.png", "px_per_mm": "10", "height_mm": "13", "tilt_deg": "5"})
+    make.photographs(
+        photos,
+        {"file": "a.png", "px_per_mm": "10", "height_mm": "13", "tilt_deg": "5"}
+        | {"start_x_px": "1", "start_y_px": "1"},
+    )
     run()
     for name, strokes in (("2026-01-02-grid-01", 3), ("2026-01-02-grid-02", 1)):
         store = make.store(root / name)
