@@ -58,7 +58,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Mean error of the ceiling over `n` sessions (default 40) of each brush, by presses of a cell.
 
     ratio = the goal over the error. The interval is widened by the error of the truth before its coverage is counted.
-    SSIM has no goal: only CSIM decides anything.
+    SSIM has the same goals, but only CSIM decides anything.
     """
     sessions = SESSIONS if n is None else n
     if sessions < 1:
