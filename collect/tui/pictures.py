@@ -1,4 +1,4 @@
-"""Pictures in a terminal: braille cells that work anywhere, or pixels (sixels, kitty's protocol) where it has them."""
+"""Pictures in a terminal: braille cells that work anywhere, or pixels where textual-image finds that it has them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.segment import ControlType, Segment
-from rich.style import Style
 from textual.app import ComposeResult
 from textual.containers import Container
 from textual.geometry import Region, Size
@@ -15,9 +13,7 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from collect.tui.dots import Cells
-from collect.tui.graphics import PixelKind, pixels_of_terminal
 from collect.tui.levels import Coloured
-from collect.tui.sixel import SIXEL_GRAYS, VT340_CELL_PX, lines_of, sixels, terminal_cell_px
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,79 +62,8 @@ class CellPicture(Widget):
         self._cells, self._made_for = Cells(self._image, self.size, before), self.size
 
 
-class SixelPicture(Container):
-    """A picture in sixels, as large as its place allows, its shape kept.
-
-    The border belongs to this container, not to the pixels' widget: textual cuts and pads the lines of a widget with a
-    border, and drops the pixels.
-    """
-
-    DEFAULT_CSS = """
-    SixelPicture { width: 1fr; height: 1fr; }
-    """
-
-    def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
-        super().__init__(id=id)
-        self._pixels = Pixels()
-
-    def compose(self) -> ComposeResult:
-        """Lay out the pixels."""
-        yield self._pixels
-
-    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
-        """Draw this picture, unless it is the same object."""
-        self._pixels.show(image)
-
-
-class Pixels(Widget):
-    """The sixels themselves, one image for each line of cells.
-
-    textual repaints lines, not pictures: an image over many lines would be drawn again at every change of one of them,
-    and where it reaches below the last line it scrolls the screen.
-    """
-
-    DEFAULT_CSS = """
-    Pixels { width: 1fr; height: 1fr; }
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._image: NDArray[np.uint8] | Coloured | None = None
-        self._lines: list[NDArray[np.int64]] = []
-        self._made_for: Size | None = None
-
-    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
-        """Draw the lines of this picture that changed; nothing where it is the same object."""
-        if image is self._image:
-            return
-        self._image = image
-        before, size = self._lines, self.size
-        self._fit()
-        for y in range(size.height):
-            old, new = (lines[y] if y < len(lines) else None for lines in (before, self._lines))
-            if old is None or new is None or old.shape != new.shape or (old != new).any():
-                self.refresh(Region(0, y, size.width, 1))
-
-    def render_line(self, y: int) -> Strip:
-        """Draw blank cells, which erase what was there, and the pixels over them."""
-        if self._made_for != self.size:
-            self._fit()
-        width, ground = self.size.width, self.rich_style
-        # While something lies over the screen, textual dims what is below; pixels cannot be dimmed.
-        if y >= len(self._lines) or not self.screen.is_active:
-            return Strip.blank(width, ground)
-        drawn = sixels(self._lines[y], self._image.colours if isinstance(self._image, Coloured) else SIXEL_GRAYS)
-        pixels = f"\x1b[{width}D\x1b7{drawn}\x1b8\x1b[{width}C"
-        control = Segment(pixels, Style.null(), ((ControlType.CURSOR_FORWARD, 0),))
-        return Strip([Segment(" " * width, ground), control], width)
-
-    def _fit(self) -> None:
-        self._made_for = self.size
-        self._lines = lines_of(self._image, self.size, terminal_cell_px() or VT340_CELL_PX)
-
-
 class ImagePicture(Container):
-    """A picture by textual-image, in pixels by kitty's protocol."""
+    """A picture in pixels, drawn by textual-image."""
 
     DEFAULT_CSS = """
     ImagePicture { width: 1fr; height: 1fr; }
@@ -170,7 +95,7 @@ class ImagePicture(Container):
         self._inner.image = Image.fromarray(image)
 
 
-AnyPicture = CellPicture | SixelPicture | ImagePicture
+AnyPicture = CellPicture | ImagePicture
 
 
 class Pictures:
@@ -178,24 +103,22 @@ class Pictures:
 
     def __init__(self, preview: Preview = "cells") -> None:
         self.camera_shown = preview != "off"
-        self._make = _best_kind(pixels_of_terminal()) if preview == "auto" else CellPicture
+        self._make = _best_kind() if preview == "auto" else CellPicture
 
     def make(self, id: str) -> AnyPicture:  # noqa: A002 - textual's name
         """Make a widget."""
         return self._make(id)
 
 
-def _best_kind(pixels: PixelKind) -> Callable[[str], AnyPicture]:
-    """The widget for the pixels that the terminal has; kitty's protocol needs the package textual-image."""
-    if pixels == "sixel":
-        return SixelPicture
-    if pixels == "kitty":
-        try:
-            from textual_image.widget import TGPImage
-        except (ImportError, OSError, ValueError):
-            # The extra is missing, or textual-image does not understand the terminal's answer.
-            return CellPicture
-        return partial(ImagePicture, TGPImage)
+def _best_kind() -> Callable[[str], AnyPicture]:
+    """textual-image's widget, if that package is installed and has found that this terminal draws pixels."""
+    try:
+        from textual_image import renderable, widget
+    except (ImportError, OSError, ValueError):
+        # The extra is missing, or textual-image does not understand the terminal's answer.
+        return CellPicture
+    if renderable.Image in (renderable.SixelImage, renderable.TGPImage):
+        return partial(ImagePicture, widget.Image)
     return CellPicture
 
 

@@ -21,9 +21,8 @@ from collect.tui.capture_screen import CaptureScreen
 from collect.tui.dots import Cells
 from collect.tui.finish_screen import FinishScreen, run_command, verdict_content
 from collect.tui.force_text import force_bar, plot, plot_title, scale_n, spark
-from collect.tui.graphics import kind_of
 from collect.tui.levels import Coloured
-from collect.tui.pictures import CellPicture, ImagePicture, Pictures, SixelPicture, _best_kind
+from collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from collect.tui.question_screens import Confirm
 from collect.tui.start_screen import StartScreen
 from sessions.remarks import remarks_of
@@ -247,16 +246,19 @@ def test_a_command_shows_its_progress_and_keeps_it_where_it_fails(monkeypatch: p
     assert lines == ["3 of 30", "3 of 30"]
 
 
-def test_pixels_are_drawn_where_the_terminal_says_that_it_can() -> None:
-    assert kind_of(b"s\x1b[?62;4;22c") == "sixel"
-    assert kind_of(b"\x1b[?64;22;40c") == kind_of(b"") == "none"
-    assert isinstance(_best_kind("sixel")("x"), SixelPicture)
-    assert isinstance(Pictures("auto").make("x"), CellPicture), "no terminal"
+@pytest.mark.parametrize(("drawn_by", "kind"), [("SixelImage", ImagePicture), ("HalfcellImage", CellPicture)])
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:textual_image")
+def test_pixels_are_drawn_where_the_terminal_has_them(
+    monkeypatch: pytest.MonkeyPatch, drawn_by: str, kind: type[object]
+) -> None:
+    renderable = pytest.importorskip("textual_image.renderable")
+    monkeypatch.setattr(renderable, "Image", getattr(renderable, drawn_by))
+    assert isinstance(Pictures("auto").make("x"), kind)
 
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "textual_image.widget", None)
-    assert isinstance(_best_kind("kitty")("x"), CellPicture)
+    monkeypatch.setitem(sys.modules, "textual_image", None)
+    assert isinstance(Pictures("auto").make("x"), CellPicture)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:textual_image")
