@@ -24,6 +24,7 @@ def benches() -> dict[str, Bench]:
         "brushfit": _late("brushfit"),
         "ceiling": _late("ceiling"),
         "characters": _late("characters"),
+        "coverage": _late("coverage"),
         "curves": _late("curves"),
         "drawing": _late("generator", "run_drawing"),
         "export": _late("export"),

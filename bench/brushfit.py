@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.brushfit_brushes import DEVELOPMENT, FROZEN
+from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, Chosen, bristles, simulated
-from bench.brushfit_prior import BRISTLE, RIG
+from bench.brushfit_prior import BRISTLE
 from bench.harness import BenchError, Result, machine
 from calibrate.fit.captures import Grid
 from calibrate.fit.fit import fit_presses
@@ -29,8 +29,6 @@ from model.fitted import FittedPress
 DRAWS = 10
 DESIGN = tuple(CELLS.index(cell) for cell in spread_out(sorted({h for h, _ in CELLS}), sorted({a for _, a in CELLS})))
 GOALS = {5: 1.5, 9: 1.0, 12: 1.0}
-GRID_SIZES = (4, 5, 6, 7, 8, 10, 12)
-"""Numbers of strokes at which the fixed design is compared with the shuffled grid."""
 FULL = 4
 """Presses of a cell in a full fit."""
 
@@ -40,7 +38,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     draws = DRAWS if n is None else n
     if draws < 1:
         raise ValueError(f"n = {n}: at least one draw is needed")
-    brushes = [(simulated(spec, f"frozen {k}"), learned((RIG,))) for k, spec in enumerate(FROZEN, 1)]
+    brushes = [(simulated(spec, f"frozen {k}"), learned()) for k, spec in enumerate(FROZEN, 1)]
     try:
         brushes += [(bristles(name), learned((BRISTLE,))) for name in BRISTLE_SETS]
     except BenchError as error:
@@ -76,7 +74,7 @@ def measure(brushes: Sequence[tuple[BrushPresses, Prior]], draws: int, seed: int
     results.append(
         Result("brushfit.gap.full", float(np.mean(full)), "CSIM points", "goal 1 at most", 1.0 / worst, 1, seed, where)
     )
-    return [*results, *_grid_results(brushes, draws, seed)]
+    return results
 
 
 def few(brush: BrushPresses, prior: Prior, chosen: Chosen) -> float:
@@ -129,27 +127,8 @@ def _gap_results(
     ]
 
 
-def _grid_results(brushes: Sequence[tuple[BrushPresses, Prior]], draws: int, seed: int) -> Sequence[Result]:
-    """The fixed design beside the shuffled grid at equal strokes, over all cells."""
-    results: list[Result] = []
-    for size in GRID_SIZES:
-        gaps: dict[str, list[float]] = {"design": [], "shuffled": []}
-        for brush, prior in brushes:
-            for kind, found in gaps.items():
-                for k in range(draws):
-                    chosen = _draw(brush, kind, size, k, seed)
-                    press = _fitted(brush, prior, chosen)
-                    found.append(brush.gap(range(len(CELLS)), predictor(press, brush.grid)))
-        ours, peer = (float(np.mean(gaps[kind])) for kind in ("design", "shuffled"))
-        where = f"simulated; {len(brushes)} brushes, all cells; shuffled grid {peer:.2f}"
-        results.append(
-            Result(f"brushfit.design.{size}", ours, "CSIM points", "the shuffled grid", peer / ours, draws, seed, where)
-        )
-    return results
-
-
 def _fitted(brush: BrushPresses, prior: Prior, chosen: Chosen) -> FittedPress:
-    return fit_presses(brush.strokes(chosen), brush.grid, brush.radius_mm, brush.length_mm, prior=prior).press
+    return fit_presses(brush.strokes(chosen), brush.grid, brush.radius_mm, brush.length_mm, prior=prior)
 
 
 def _image_of(bezier: RefittedBezier, grid: Grid) -> Callable[[float, float], NDArray[np.floating]]:
@@ -158,18 +137,3 @@ def _image_of(bezier: RefittedBezier, grid: Grid) -> Callable[[float, float], ND
 
 def _list(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.2f}" for value in values)
-
-
-def main(arguments: Sequence[str]) -> None:
-    """`python -m bench.brushfit [--development]`: the brushes of `run`, or those of the rig that the prior holds."""
-    if "--development" in arguments:
-        develop = [(simulated(spec, f"development {k}"), learned((RIG,))) for k, spec in enumerate(DEVELOPMENT, 1)]
-        found = measure(develop, 2, 0)
-    else:
-        found = run()
-    for line in found:
-        sys.stdout.write(f"# {line.conditions}\n{line.to_line()}\n")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

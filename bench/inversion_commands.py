@@ -17,7 +17,7 @@ import numpy as np
 from bench.brushfit import DESIGN
 from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, PX_MM, SIZE_PX, BrushPresses, bristles, simulated
-from bench.brushfit_prior import BRISTLE, RIG
+from bench.brushfit_prior import BRISTLE
 from bench.harness import BenchError, Result
 from calibrate.compare.field import Field
 from calibrate.fit.fit import fit_presses
@@ -82,7 +82,7 @@ def recover(brush: BrushPresses, prior: Prior, seed: int) -> Recovery:
     rng = np.random.default_rng(seed)
     chosen = [(c, int(r)) for c in range(len(CELLS)) for r in rng.permutation(brush.ink.shape[1])[:PRESSES]]
     strokes = brush.strokes([(c, r) for c, r in chosen if c in DESIGN[:FITTED_CELLS]])
-    press = fit_presses(strokes, brush.grid, brush.radius_mm, brush.length_mm, prior=prior).press
+    press = fit_presses(strokes, brush.grid, brush.radius_mm, brush.length_mm, prior=prior)
     within = Range((max(2.0, 0.5 - float(press.values[NAMES.index("h0_mm")])), 30.0))
     inverter = Inverter.of_model(
         fitted_model(press), within=within, known=Known.ANCHOR, noise=Noise.BLOCKS, px_mm=PX_MM, anchor_sigma_mm=0.1
@@ -115,7 +115,7 @@ def held(rows: Sequence[Row], letter: str) -> float:
 
 def _brushes() -> Iterator[tuple[BrushPresses, Prior]]:
     for number, spec in enumerate(FROZEN, 1):
-        yield simulated(spec, f"frozen {number}", PRESSES), learned((RIG,))
+        yield simulated(spec, f"frozen {number}", PRESSES), learned()
     try:
         for name in BRISTLE_SETS:
             yield bristles(name), learned((BRISTLE,))

@@ -34,6 +34,7 @@ ACCURACY = {
     "ceiling": 120,
     "inversion": 300,
     "curves": 300,
+    "coverage": 400,
     "loop": 600,
     "realink": 900,
     "tables": 900,

@@ -64,15 +64,7 @@ PARAMETERS = (
     Parameter("width_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the width with tilt"),
     Parameter("length_tilt", "1/deg", 0.0, 0.02, -0.1, 0.1, "growth of the length with tilt"),
     Parameter("lean", "1", 1.0, 0.5, -2.0, 3.0, "share of H tan(alpha) by which the widest place moves with tilt"),
-    Parameter(
-        "heel_tilt",
-        "1/deg",
-        0.0,
-        0.03,
-        -0.09,
-        0.2,
-        "growth of the heel side with tilt, in addition to that of the length",
-    ),
+    Parameter("heel_tilt", "1/deg", 0.0, 0.03, -0.09, 0.2, "growth of the heel side with tilt, beside the length's"),
 )
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 

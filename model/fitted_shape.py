@@ -30,10 +30,7 @@ def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeMod
             press.sizes(h, a)  # raises DomainError
         return {"height_mm": height, "tilt_deg": tilt}
 
-    definition = (
-        "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes: dilation "
-        f"{press.values[0]:.3f}, zero offset {press.values[1]:+.2f} mm."
-    )
+    definition = "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes."
     return Parametric(NAME, label, definition, PARAMETERS, lambda v: outlines(press, v), of_press, fitted=True)
 
 

@@ -88,10 +88,6 @@ def _tables(captures: Captures, fitted: Twin, noise: float | None) -> Iterator[o
         interval = f"{one.low:.3g} to {one.high:.3g}" if one.determined else "not determined"
         out.add_row(one.constant.name, one.constant.unit, f"{one.constant.default:.4g}", f"{one.value:.4g}", interval)
     yield out
-    yield (
-        f"The captured brush touched {fitted.offset.depth_mm:+.2f} mm deeper than commanded, and "
-        f"({fitted.offset.x_mm:+.2f}, {fitted.offset.y_mm:+.2f}) mm beside the point of touch; the twin does not."
-    )
     if noise is None:
         yield "The camera's noise was not measured: no two stills show the same view."
     else:

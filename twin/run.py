@@ -28,7 +28,7 @@ from calibrate.fit.heldout import (
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.config import SoundHead
 from sessions.progress import Progress, unseen
-from twin.constants import SHAPE, SPREAD, Constant, Offset, Vector, brush_at, offset_at, with_values
+from twin.constants import SHAPE, SPREAD, Constant, Vector, brush_at, offset_at, with_values
 from twin.drawing import Cell
 from twin.quality import sound_head
 from twin.score import TWIN, parts_of, predicted
@@ -63,7 +63,6 @@ class Twin:
     """A fitted twin, and all that is reported about it."""
 
     spec: BrushSpec
-    offset: Offset
     estimates: tuple[Estimate, ...]
     spread: Spread | None
     """None where no cell has enough captures; the spread is then the default brush's."""
@@ -161,7 +160,7 @@ def fit_twin(
         spec = with_values(spec, SPREAD, spread.point)
         estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
     held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
-    return Twin(spec, offset, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
+    return Twin(spec, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
 
 
 def _score_part(

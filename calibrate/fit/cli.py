@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibrate.compare import MM_PER_PX
-from sessions.terminal import narrow, say
+from sessions.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,8 +29,8 @@ def fit(
         typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
     ] = None,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
-    correction: Annotated[bool, typer.Option("--correction", help="Print the zero-touch offset for rig.toml.")] = False,
-    reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush, for --correction.")] = None,
+    correction: Annotated[bool, typer.Option("--correction", help="Print the change of the zero touch.")] = False,
+    reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush; for --correction.")] = None,
     drags: Annotated[
         bool, typer.Option("--drags", help="Fit bristle lag to drags; writes dragfit/<hash>.json.")
     ] = False,
@@ -44,8 +44,10 @@ def fit(
     """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json and its page."""
     if (prior is not None and not drags) or (strokes is not None and prior is None):
         raise typer.BadParameter("--prior needs --drags, and --strokes needs --prior")
+    if correction != (reference is not None):
+        raise typer.BadParameter("--correction and --reference go together: ink alone does not show the zero touch")
     if drags:
-        if correction or reference is not None:
+        if correction:
             raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
         _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
@@ -67,8 +69,8 @@ def fit(
         fitted = fit_session(captures, view, progress)
     path = put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)
     say(*_tables(captures, fitted))
-    if correction:
-        say(*_correction(corrected(captures, fitted.artefact, before)))
+    if before is not None:
+        say(*_correction(corrected(captures, before)))
     say(f"Fit: {path}", f"Page: {write_fit_page(captures, fitted, path)}")
 
 
@@ -137,30 +139,27 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     from rich.table import Table
 
-    from calibrate.fit.run import NAMES
+    from calibrate.fit.sizes import FEWEST_CELLS, middle
     from calibrate.report import source_label, source_note
-    from model.fitted import PARAMETERS
 
-    artefact = fitted.artefact
     yield f"{source_note(captures.header.source, captures.header.brush)}; {len(captures.strokes)} presses fitted"
     for name, why in captures.refused:
         yield f"left out: {name}: {why}"
     label = source_label(captures.header.source, [captures.header.brush])
-    published = [] if narrow() else ["published"]
-    out = Table("parameter", *published, "fitted", "95 %", "from strokes", title=f"brush ({label})")
-    for name, parameter in zip(NAMES, PARAMETERS, strict=True):
-        found, share = artefact.parameters[name], artefact.from_strokes[name]
-        start = [f"{parameter.start:.3f}"] if published else []
-        out.add_row(name, *start, f"{found.value:.3f}", f"{found.low:.3f} to {found.high:.3f}", f"{share:.0%}")
-    yield out
-    yield (
-        "The intervals assume that the model is right. “From strokes” is the share of the variance among known brushes "
-        "that these strokes removed; at 0 %, value and interval are those of known brushes."
+    out = Table(
+        "size, mm",
+        "at {:g} mm, {:g}°".format(*middle(captures.strokes)),
+        "per mm of depth",
+        "per degree of tilt",
+        title=f"sizes of the marks with 95 % intervals ({label})",
     )
-    out = Table("stage", "condition", title="condition numbers")
-    for stage in artefact.stages:
-        out.add_row(stage.name, "infinite" if stage.condition is None else f"{stage.condition:.1f}")
-    yield out
+    for size in fitted.sizes:
+        out.add_row(size.name, str(size.here), str(size.by_depth), str(size.by_tilt))
+    yield (
+        out
+        if fitted.sizes
+        else f"Intervals of the sizes of the marks need {FEWEST_CELLS} combinations of depth and tilt."
+    )
     if not fitted.held_out:
         yield "Only one cell: nothing can be held out."
         return
@@ -171,17 +170,8 @@ def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
 
 
 def _correction(found: Correction) -> Iterator[str]:
-    low, high = found.lift_interval_mm
-    if found.reference:
-        yield f"Zero touch relative to the fit of {found.reference}, with all other parameters of the brush fixed:"
-    else:
-        yield (
-            "Absolute zero touch: where the sizes of the marks, assumed proportional to depth, become zero. "
-            "Ink that spreads, or a brush that does not open evenly, looks like an offset; with an earlier fit of "
-            "the same brush (--reference) it does not."
-        )
-    yield f"  paper.touch_z_mm: add {found.lift_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
-    low, high = found.along_interval_mm
-    yield f"  along the heading: the ink is off by {found.along_mm:+.2f} mm (95 % {low:+.2f} to {high:+.2f})"
-    if found.lift_interval_mm[0] <= 0.0 <= found.lift_interval_mm[1]:
+    yield f"Zero touch relative to the fit of {found.reference}, with all else of the brush held:"
+    yield f"  paper.touch_z_mm: add {found.lift_mm} mm, 95 % interval in brackets"
+    yield f"  along the heading: the ink is off by {found.along_mm} mm"
+    if found.lift_mm.low <= 0.0 <= found.lift_mm.high:
         yield "  The interval includes 0: leave rig.toml as it is."

@@ -14,8 +14,7 @@ from calibrate.compare.ceiling import CEILING, Average, average, ceiling_values,
 from calibrate.compare.field import SIZE_PX
 from calibrate.compare.images import draw_loop, to_pixels
 from calibrate.fit.captures import SPREAD_MM, Grid, Pressed, inked_rows
-from calibrate.fit.fit import refit
-from calibrate.fit.prior import learned
+from calibrate.fit.fit import fit_presses
 from model.brush import DomainError
 from model.fitted import FittedPress
 from model.loops import BEZIER_PIECES, Loop, bezier_side, closed
@@ -78,8 +77,7 @@ def fit_held_out(strokes: Sequence[Pressed], grid: Grid, radius_mm: float, lengt
     """Fit these strokes, cut to the inked rows, from the prior: it knows no other stroke of their session."""
     rows = inked_rows([one.ink for one in strokes], grid.px_mm)
     cut = [replace(one, ink=one.ink[rows]) for one in strokes]
-    start = FittedPress(radius_mm, length_mm, learned().values)
-    return refit(start, cut, Grid(grid.x_mm, grid.y_mm[rows]))
+    return fit_presses(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm)
 
 
 def leave_cell_out(

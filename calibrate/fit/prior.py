@@ -49,8 +49,6 @@ class Prior:
 
     mean: Floats
     precision: Floats
-    gradual: bool = False
-    """Free the stages one after the other, because the start is far from any brush."""
 
     @property
     def values(self) -> Floats:
@@ -58,22 +56,26 @@ class Prior:
         low, high = (np.array([getattr(p, end) for p in PARAMETERS]) for end in ("low", "high"))
         return np.clip(published() + spreads() * self.mean, low, high)
 
+    def off(self, values: Floats) -> Floats:
+        """Distance of parameters from the mean, over their spreads, (17,)."""
+        return (values - published()) / spreads() - self.mean
+
 
 def spreads() -> Floats:
     """The plausible spread of each parameter, (17,)."""
     return np.array([parameter.spread for parameter in PARAMETERS])
 
 
-def wide() -> Prior:
-    """A prior that holds only the plausible spread of each parameter about its published value."""
-    return Prior(np.zeros(len(NAMES)), np.eye(len(NAMES)), gradual=True)
+def about(values: Floats) -> Prior:
+    """A prior that holds only the plausible spread of each parameter about these values (17,)."""
+    return Prior((values - published()) / spreads(), np.eye(len(NAMES)))
 
 
 @cache
-def learned(without_families: tuple[str, ...] = (), without_brushes: tuple[str, ...] = ()) -> Prior:
-    """The prior from `prior.json`; a bench leaves out the family or the brush that it scores."""
+def learned(without_families: tuple[str, ...] = ()) -> Prior:
+    """The prior from `prior.json`; a bench leaves out the family that it scores."""
     known = KnownBrushes.model_validate(json.loads(FILE.read_text(encoding="utf-8"))).brushes
-    return of_brushes([b for b in known if b.family not in without_families and b.name not in without_brushes])
+    return of_brushes([b for b in known if b.family not in without_families])
 
 
 def of_brushes(known: Sequence[KnownBrush]) -> Prior:

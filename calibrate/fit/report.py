@@ -1,4 +1,4 @@
-"""The page of a fit: the fitted outline over the ink of each cell, sizes by depth, parameters, held-out scores."""
+"""The page of a fit: the fitted outline over the ink of each cell, sizes of the marks, held-out scores."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from calibrate.files import write_whole
 from calibrate.fit.captures import Captures, Floats, Grid, Pressed
 from calibrate.fit.heldout import FITTED, UNCALIBRATED, Cell, by_cell, predictor
 from calibrate.fit.run import Fitted
+from calibrate.fit.sizes import measure, middle
 from calibrate.report import (
     BLUE,
     ORANGE,
@@ -27,21 +28,19 @@ from calibrate.report import (
     source_point,
 )
 from model.brush import DomainError
-from model.fitted import PARAMETERS, FittedPress
+from model.fitted import FittedPress
 from model.loops import Loop
 
 MAX_CELLS = 48
 MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
-LITTLE = 0.1
-"""Share of a parameter's variance below which the strokes say next to nothing about it."""
 COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Of Okabe and Ito, one for each tilt in turn."""
 
 
 def write_fit_page(captures: Captures, fitted: Fitted, path: Path) -> Path:
     """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
-    header, artefact = captures.header, fitted.artefact
+    header = captures.header
     label = source_label(header.source, [header.brush])
     cells = by_cell(captures.strokes)
     published = FittedPress(captures.radius_mm, captures.length_mm)
@@ -51,16 +50,14 @@ def write_fit_page(captures: Captures, fitted: Fitted, path: Path) -> Path:
         session=header.session_id,
         label=label,
         note=source_note(header.source, header.brush),
-        window=_window(captures, (fitted.fit.press, published)),
-        cells=[_cell(cell, cells[cell], fitted.fit.press, published, captures.grid) for cell in list(cells)[::step]],
+        window=_window(captures, (fitted.press, published)),
+        cells=[_cell(cell, cells[cell], fitted.press, published, captures.grid) for cell in list(cells)[::step]],
         left_out=len(cells) - len(range(0, len(cells), step)),
         verdict=list(_verdict(captures, fitted, len(cells))),
         trust=[source_point(header.source), *_trust(captures, fitted)],
-        sizes=_sizes(captures, fitted.fit.press, label),
-        parameters=[
-            (parameter, artefact.parameters[parameter.name], artefact.from_strokes[parameter.name])
-            for parameter in PARAMETERS
-        ],
+        sizes=_sizes(captures, fitted.press, label),
+        measured=fitted.sizes,
+        middle="{:g} mm, {:g}°".format(*middle(captures.strokes)),
         held_out=fitted.held_out,
         refused=captures.refused,
         facts=[(name, text) for name, text in _facts(captures, fitted, path) if text],
@@ -139,7 +136,10 @@ def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
     tilts = sorted({one.tilt_deg for one in strokes})
     shown = tilts if len(tilts) <= len(COLOURS) else [tilts[0], tilts[len(tilts) // 2], tilts[-1]]
     for tilt, colour in zip(shown, COLOURS, strict=False):
-        seen = np.array([(s.height_mm, *_measured(s.ink, grid)) for s in strokes if s.tilt_deg == tilt])
+        pressed = [(s.height_mm, *measure(s, grid)) for s in strokes if s.tilt_deg == tilt]
+        seen = np.array(
+            [(height, toward_tip + toward_heel, width) for height, toward_tip, toward_heel, width in pressed]
+        )
         drawn = np.array([_fitted_sizes(press, height, tilt, grid.x_mm) for height in heights])
         for axis, column in zip(axes, (0, 1), strict=True):
             axis.plot(seen[:, 0], seen[:, 1 + column], "o", ms=4, alpha=0.7, color=colour)
@@ -151,11 +151,6 @@ def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
         axis.grid(alpha=0.3)
     axes[0].legend()
     return plot_uri(figure)
-
-
-def _measured(ink: Any, grid: Grid) -> tuple[float, float]:
-    inked = np.flatnonzero((ink > 0.5).any(axis=0))
-    return float(inked[-1] - inked[0] + 1) * grid.px_mm, float(ink.sum(axis=0).max()) * grid.px_mm
 
 
 def _fitted_sizes(press: FittedPress, height_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:
@@ -195,10 +190,6 @@ def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
         yield Point(False, f"{len(captures.refused)} presses could not be used; each is named below.")
     else:
         yield Point(True, "Every press was used.")
-    little = [name for name, share in fitted.artefact.from_strokes.items() if share < LITTLE]
-    if little:
-        words = "These presses say next to nothing about some parameters, whose values are those of known brushes"
-        yield Point(None, f"{words}: {', '.join(little)}.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")
 
 

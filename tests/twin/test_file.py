@@ -12,7 +12,7 @@ from calibrate.fit.heldout import HeldOut
 from drivers.sim.brush.spec import BrushSpec
 from drivers.sim.brush_file import load_brush
 from drivers.sim.config import SoundHead
-from twin.constants import SHAPE, Offset
+from twin.constants import SHAPE
 from twin.file import Notes, notes_path, resumed, save_notes, twin_toml
 from twin.run import Estimate, Twin
 from twin.shape import Found
@@ -20,7 +20,6 @@ from twin.shape import Found
 SPEC = BrushSpec(radius_mm=5.0, length_mm=42.0, friction=0.3, set_deg=9.0, seed=7)
 TWIN = Twin(
     SPEC,
-    Offset(0.1, 0.0, 0.0),
     tuple(Estimate(one, float(getattr(SPEC, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE),
     None,
     (HeldOut("twin", 95.1, 90.2, 45),),

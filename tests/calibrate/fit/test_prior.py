@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.fit.prior import KnownBrush, learned, of_brushes, wide
+from calibrate.fit.prior import KnownBrush, about, learned, of_brushes
 from calibrate.fit.residual import regress
 from model.fitted import NAMES, TERMS, FittedPress, command_terms, published
 
@@ -18,13 +18,17 @@ def test_the_prior_lies_among_the_known_brushes_and_admits_others() -> None:
     assert 1.0 < prior.values[lam] < 2.5, "far from the published pi"
     deviation = np.sqrt(np.diag(np.linalg.inv(prior.precision)))
     assert np.all(deviation >= 0.15)
-    assert np.all(wide().values == published())
+    assert np.all(about(published()).values == published())
 
 
 def test_a_family_can_be_left_out() -> None:
-    without = learned(("loopback rig",))
+    without = learned(("leaf",))
     assert not np.allclose(without.mean, learned().mean)
     assert np.allclose(learned(("no such family",)).mean, learned().mean)
+
+
+def test_no_brush_of_the_loopback_rig_is_known_beforehand() -> None:
+    assert np.array_equal(learned(("loopback rig",)).mean, learned().mean)
 
 
 def test_a_large_family_does_not_outweigh_a_small_one() -> None:

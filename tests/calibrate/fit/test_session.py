@@ -30,13 +30,13 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> None:
     narrow = CliRunner(env={"COLUMNS": "60"})
-    ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction"])
+    ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4"])
     assert ran.exit_code == 0, ran.output
     said = " ".join(ran.output.split())
-    for head in (*NAMES, "95 %", "from strokes", "brush (imported"):
-        assert head in said, "a column head or a name is cut in 60 columns"
-    for words in ("leave one cell out", "refitted Bezier", "uncalibrated", "from strokes", "paper.touch_z_mm: add"):
+    for words in ("heel", "width", "95 %", "leave one cell out", "refitted Bezier", "uncalibrated"):
         assert words in said
+    assert "…" not in said, "a size is cut in 60 columns"
+    assert not any(name in said for name in NAMES), "a parameter alone says nothing about another brush"
     path = current(session, FOLDER)
     assert path is not None
     fit = load_artefact(path, BrushFit)
@@ -53,9 +53,13 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     mean = {name: report.stat(name, Alignment.MM, Tone.BINARY, "csim") for name in ("ccd-bsm", NAME)}
     assert mean[NAME].avg > mean["ccd-bsm"].avg + 5.0
 
-    captures = read_presses(session, VIEW)
-    same = correction(captures, fit, fit)
-    assert same.lift_mm == pytest.approx(0.0, abs=0.3)
+    ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction", "--reference", str(path)])
+    assert ran.exit_code == 0, ran.output
+    assert "paper.touch_z_mm: add" in ran.output
+    assert "The interval includes 0" in ran.output
+    same = correction(read_presses(session, VIEW), fit)
+    assert same.lift_mm.value == pytest.approx(0.0, abs=0.3)
+    assert same.lift_mm.low < 0.0 < same.lift_mm.high
     assert same.reference == "presses"
 
     edited = path.with_name("0" * 16 + ".json")
@@ -64,14 +68,18 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
         load_artefact(edited, BrushFit)
 
 
-def test_one_press_alone_says_what_it_cannot_tell(session: Path) -> None:
+def test_ink_alone_gives_no_correction_of_the_zero_touch(tmp_path: Path) -> None:
+    ran = CliRunner().invoke(app, ["fit", str(tmp_path / "not-read"), "--correction"])
+    assert ran.exit_code == 2
+    assert "--reference" in ran.output
+    assert "not-read" not in ran.output, "refused before the session is opened"
+
+
+def test_a_reference_of_few_cells_gives_no_correction(session: Path) -> None:
     captures = read_presses(session, VIEW)
     del captures.strokes[1:]
     fitted = fit_session(captures, VIEW)
     assert fitted.held_out == []
-    tilt, scale = (fitted.artefact.from_strokes[name] for name in ("width_tilt", "lam"))
-    assert tilt < 0.5 < scale
-    found = fitted.artefact.parameters["width_tilt"]
-    assert found.low is not None
-    assert found.high is not None
-    assert found.low < found.value < found.high
+    assert fitted.sizes == []
+    with pytest.raises(CalibrationError, match="5 are needed"):
+        correction(captures, fitted.artefact)
