@@ -44,7 +44,7 @@ class Asking:
     def __init__(self, *kinds: str) -> None:
         self.kinds = kinds
         self.answers: list[object] = []
-        self.stopped_arm = False
+        self.at_work = self.stopped_arm = False
 
     async def __call__(self, guide: ScreenGuide) -> None:
         await guide.overview(STEPS)
@@ -80,6 +80,7 @@ class Asking:
 
     async def _move(self, kind: str) -> None:
         """A move that a driver stops when it is cancelled, or a run that ends by itself then."""
+        self.at_work = True
         try:
             await asyncio.sleep(60.0)
         except asyncio.CancelledError:

@@ -105,7 +105,7 @@ async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str, work: st
     asking = Asking("choose", work)
     async with running(asking) as (app, pilot):
         await pilot.press("y")
-        await seen(app, pilot, lambda: not app._screen.asking)
+        await seen(app, pilot, lambda: asking.at_work and not app._screen.asking)
         assert re.search(r"at work, \d+ s; s: software stop", shown(app))
         await pilot.press(key)
         await seen(app, pilot, lambda: asking.stopped_arm and "Stopped." in shown(app))
@@ -137,7 +137,7 @@ async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_ov
     asking = Asking("choose", "move")
     async with running(asking) as (app, pilot):
         await pilot.press("y")
-        await seen(app, pilot, lambda: not app._screen.asking)
+        await seen(app, pilot, lambda: asking.at_work and not app._screen.asking)
         await pilot.press("q")
         await pilot.pause()
         assert isinstance(app.screen, Confirm)
