@@ -33,7 +33,7 @@ NAMED = {
     Trap.SWAPPED_CORNER: r"are swapped|as in a mirror",
     Trap.MIRRORED_CAMERA: r"mirrored.*Switch mirroring",
     Trap.WRONG_BOARD_SIZE: r"% of its printed size.*Print it again at 100 %",
-    Trap.PARK_IN_PICTURE: r"the parked arm, or its shadow, is in the picture.*Park it farther",
+    Trap.PARK_IN_PICTURE: r"in one of the two pictures.*Park it farther",
     Trap.SHEET_OUT_OF_REACH: r"nearer to",
     Trap.OLD_SOFTWARE: r"older software AUBOPE.*upgrade to ARCS",
     Trap.CABLE_PULLED: r"Check power, cable and address",
