@@ -53,7 +53,8 @@ def replacing(path: Path) -> Generator[Path]:
         yield part
         part.replace(path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # a full disk does not say which file it had no room for
+        if error.errno is not None and not error.filename:
+            error.filename = str(path)  # a full disk does not say which file it had no room for
         raise
     finally:
         part.unlink(missing_ok=True)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
@@ -76,6 +75,8 @@ class CameraDelay:
     @property
     def exact(self) -> bool:
         """Whether most of the trips agree, and by their spread the mean is known to a tenth of its value (95 %)."""
+        from scipy.special import stdtrit  # slow to import
+
         alike_s = self._alike_s
         if len(alike_s) < max(LEAST_ALIKE, ALIKE_SHARE * len(self.looks)):
             return False

@@ -162,7 +162,7 @@ def test_check_names_the_remedy_for_a_lens_that_bends(tmp_path: Path) -> None:
     [
         (b"", "not a complete PNG or JPEG"),
         (b"\x89PNG\r\n\x1a\nabc", "not a complete PNG or JPEG"),
-        (None, "No such file"),
+        (None, "no such file"),
     ],
     ids=["empty", "torn", "missing"],
 )

@@ -150,7 +150,7 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
     small = kept_lens(tmp_path / "small", -0.15, (1024, 768))
     with pytest.raises(CalibrationError, match=r"is 2048 x 1536 px, the lens was calibrated at 1024 x 768 px"):
         calibrate_session(session, small)
-    with pytest.raises(CalibrationError, match="No such file"):
+    with pytest.raises(CalibrationError, match="no such file"):
         calibrate_session(session, tmp_path / "nosuch.json")
 
 

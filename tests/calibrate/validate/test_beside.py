@@ -205,7 +205,7 @@ def test_what_is_no_loop_at_all_is_refused(place: Path, text: str) -> None:
 def test_a_file_too_large_is_not_read(place: Path, a_loop: Callable[..., LoopRecord]) -> None:
     path = put(place / "loop", a_loop().to_json() + " " * 9_000_000)
     assert "is larger than" in refused(place, "--loop", path)
-    assert "No such file" in refused(place, "--loop", place / "nowhere.json")
+    assert "no such file" in refused(place, "--loop", place / "nowhere.json")
 
 
 def test_table_3_has_the_papers_rows_beside_and_figure_13(lab: Path, place: Path) -> None:

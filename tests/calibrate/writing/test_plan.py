@@ -124,9 +124,9 @@ def test_with_a_drag_fit_the_plan_makes_up_for_the_lag(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (("一",), "is not shipped (子 字 永)"),
-        (("一", "--data", "nowhere"), "nowhere: No such file"),
+        (("一", "--data", "nowhere"), "nowhere: no such file"),
         (("字字",), "the same character twice"),
-        (("no.csv",), "no.csv: No such file"),
+        (("no.csv",), "no.csv: no such file"),
         (("字", "--tilt-range", "0", "45"), "tilts end at 30 deg"),
         (("字", "--tilt", "12"), "--tilt: 12 deg is outside 0 to 10"),
         (("字", "--height-range", "5", "5"), "height_mm = (5, 5)"),

