@@ -1,4 +1,4 @@
-"""A straight line by least squares, with the interval of its slope."""
+"""A straight line by least squares with the interval of its slope, and Student's factor for any interval."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+
+def student_95(freedom: int) -> float:
+    """Half width of a 95 % interval in standard errors that were estimated with so many degrees of freedom."""
+    from scipy.special import stdtrit  # slow to import
+
+    return float(stdtrit(freedom, 0.975))
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,9 +28,7 @@ class Line:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
-        from scipy.special import stdtrit  # slow to import
-
-        reach = float(stdtrit(self.n - 2, 0.975)) * self.slope_se
+        reach = student_95(self.n - 2) * self.slope_se
         return self.slope - reach, self.slope + reach
 
 

@@ -14,6 +14,7 @@ from calibrate.board.detect import BoardView
 from calibrate.board.lens import Floats, Lens, unknown_lens
 from calibrate.board.pix2len import homography
 from calibrate.errors import CalibrationError
+from calibrate.line import student_95
 
 Ways = NDArray[np.int64]
 LEAST_VIEWS = 4
@@ -71,9 +72,7 @@ class Fitted:
         """Half widths of the 95 % intervals of fx and fy: for noise in these views, not for a curved board."""
         if self.focal_se_px is None:
             return None
-        from scipy.special import stdtrit  # slow to import
-
-        reach = float(stdtrit(min(self.ways, MOST_LEFT_OUT) - 1, 0.975))
+        reach = student_95(min(self.ways, MOST_LEFT_OUT) - 1)
         return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
 
 

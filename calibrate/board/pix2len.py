@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calibrate.board.lens import Floats, Lens, rms
 from calibrate.errors import CalibrationError
+from calibrate.line import student_95
 
 MOST_OUTLIERS = 0.1
 WORST_RMS_PX = 1.0
@@ -98,7 +99,6 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     `WORST_RMS_PX`: a wrong or curled board.
     """
     from scipy.optimize import least_squares  # slow to import
-    from scipy.special import stdtrit
 
     model = _Model.of(lens, paper_mm, radial_terms)
     start = model.start(pixels, paper_mm, where)
@@ -125,7 +125,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     # Change of the scale with each corner's error, (n, 2).
     pull = (jacobian @ np.linalg.pinv(jacobian.T @ jacobian) @ model.slope(fitted.x, middle)).reshape(-1, 2)
     spread = _spread(pull, left.reshape(-1, 2), paper_mm[kept], float(left @ left) / free)
-    reach = float(stdtrit(free, 0.975)) * spread
+    reach = student_95(free) * spread
     refined, image_to_paper = model.parts(fitted.x)
     undistorted = lens.undistorted(pixels[kept])
     flat = apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.line import student_95
+
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]
 """Ends of a 95 % interval."""
@@ -75,15 +77,12 @@ def interval_over_groups(values: Floats, groups: NDArray[np.int64]) -> Interval 
 
     It is Student's, because a bootstrap of a few groups is too narrow.
     """
-    import scipy.special  # slow to import
-
-    untyped: Any = scipy.special
     _, group = np.unique(groups, return_inverse=True)
     mean, many = float(values.mean()), int(group.max()) + 1
     if many < MIN_CELLS:
         return None
     off = np.bincount(group, values - mean)
-    half = float(untyped.stdtrit(many - 1, 0.975) * np.sqrt(many / (many - 1) * (off**2).sum()) / len(values))
+    half = float(student_95(many - 1) * np.sqrt(many / (many - 1) * (off**2).sum()) / len(values))
     return mean - half, mean + half
 
 

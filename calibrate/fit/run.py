@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from calibrate.artefact import made_by
 from calibrate.compare.field import Field
@@ -15,6 +14,7 @@ from calibrate.fit.captures import Captures, Floats
 from calibrate.fit.fit import fit_presses, touch_errors, zero_touches
 from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
 from calibrate.fit.sizes import FEWEST_CELLS, Estimate, Size, sizes_of
+from calibrate.line import student_95
 from model.fitted import NAMES, FittedPress
 from sessions.progress import Progress, unseen
 
@@ -96,6 +96,6 @@ def touch_estimates(touches_mm: Floats, errors_mm: Floats) -> tuple[Estimate, Es
     freedom = before + cells - 1
     square = (np.sum(errors_mm**2, axis=0) + np.sum((touches_mm - moved) ** 2, axis=0)) / freedom
     variance = square * (1.0 / cells + PLANE / before)
-    factor = float(stdtrit(freedom, 0.975))
+    factor = student_95(freedom)
     lift, along = (Estimate.of(float(v), float(s), factor) for v, s in zip(moved, variance, strict=True))
     return lift, along

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from calibrate.fit.captures import Floats, Grid, Pressed
 from calibrate.fit.heldout import by_cell
+from calibrate.line import student_95
 from model.plane import fit_plane
 
 SIZES = ("reach toward the tip", "reach toward the heel", "width")
@@ -84,7 +84,7 @@ def sizes_of(strokes: Sequence[Pressed], grid: Grid) -> list[Size]:
     except ValueError:
         return []
     variance = (1.0 - 1.0 / len(cells)) * ((without - whole) ** 2).sum(axis=0)
-    factor = float(stdtrit(len(cells) - 1, 0.975))
+    factor = student_95(len(cells) - 1)
     return [
         Size(name, *(Estimate.of(float(v), float(s), factor) for v, s in zip(values, squares, strict=True)))
         for name, values, squares in zip(SIZES, whole.T, variance.T, strict=True)

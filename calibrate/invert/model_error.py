@@ -17,7 +17,8 @@ from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+
+from calibrate.line import student_95
 
 Floats = NDArray[np.float64]
 Cell = tuple[float, float]
@@ -66,4 +67,4 @@ def _spread(off: Floats, sd: Floats, cells: int) -> float:
     """The deviation from presses of so many cells, enlarged; 0 from too few."""
     if cells < LEAST_CELLS:
         return 0.0
-    return math.sqrt(common_variance(off, sd)) * float(stdtrit(cells, 0.975)) / NORMAL_95
+    return math.sqrt(common_variance(off, sd)) * student_95(cells) / NORMAL_95

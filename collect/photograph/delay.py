@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.line import student_95
+
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03
 """The delay is known well enough within a tenth of its value, or within 30 ms."""
@@ -75,12 +77,10 @@ class CameraDelay:
     @property
     def exact(self) -> bool:
         """Whether most of the trips agree, and by their spread the mean is known to a tenth of its value (95 %)."""
-        from scipy.special import stdtrit  # slow to import
-
         alike_s = self._alike_s
         if len(alike_s) < max(LEAST_ALIKE, ALIKE_SHARE * len(self.looks)):
             return False
-        reach_s = float(stdtrit(len(alike_s) - 1, 0.975) * alike_s.std(ddof=1) / len(alike_s) ** 0.5)
+        reach_s = float(student_95(len(alike_s) - 1) * alike_s.std(ddof=1) / len(alike_s) ** 0.5)
         return reach_s <= max(GOOD_SHARE * self.delay_s, EXACT_S)
 
     @property

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import stdtrit
 
+from calibrate.line import student_95
 from collect.errors import CannotTeach
 from drivers.samples import Pose
 
@@ -56,7 +56,7 @@ class TipFit:
     @property
     def reach_mm(self) -> float:
         """Half width of the 95 % interval of the worst component, by Student's t."""
-        return float(stdtrit(self.freedom, 0.975)) * max(self.sigma_mm)
+        return student_95(self.freedom) * max(self.sigma_mm)
 
     def slip(self) -> tuple[int, float] | None:
         """Number of the touch that does not fit the others, and its residual in mm; None if all do."""
