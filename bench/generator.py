@@ -13,13 +13,11 @@ from torch import Tensor, nn
 
 from bench.harness import Result, interleave, machine
 from bench.learning_to_paint import LearningToPaint
-from model.generator.basis import fit_basis
 from model.generator.metrics import Quality, quality
 from model.generator.network import Generator
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig, preset
 from model.train.data import Exact, batch_numbers, batches, exact_sets
-from model.train.distributed import Group
 from model.train.loop import Validation, learning_rate, new_state, train
 
 BUDGET_S = 360
@@ -34,13 +32,13 @@ _SHARE = 0.95  # of the budget: steps are counted out beforehand, and their cost
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """CCD-BSMG of (H, alpha) and the field basis beside the peer; see `_compare`."""
-    return _compare("press", "generator", n, seed, with_basis=True)
+    """CCD-BSMG of (H, alpha) compared with the peer; see `_compare`."""
+    return _compare("press", "generator", n, seed)
 
 
 def run_qbc(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """The same network on QBC strokes, 8 inputs (the paper's ablation), compared with the peer; see `_compare`."""
-    return _compare("qbc", "generator-qbc", n, seed, with_basis=False)
+    return _compare("qbc", "generator-qbc", n, seed)
 
 
 def run_drawing(*, n: int | None = None, seed: int = 0) -> Result:
@@ -69,14 +67,13 @@ def _drawn(name: str, share: float, seed: int, conditions: str) -> Result:
     )
 
 
-def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bool) -> Sequence[Result]:
+def _compare(target: str, name: str, n: int | None, seed: int) -> Sequence[Result]:
     """Train both for `n` seconds of this process' CPU time each (360 by default) and compare on 2,000 held-out images.
 
     Both run on one thread, see the same 20,000 images in the same batches of 64, and fall in learning rate along the
     same half cosine; how many steps fit is measured beforehand. MSE, IoU, CSIM and SSIM are means over the images;
     their ratio is the peer's shortfall over ours. `-drawing` is the share of our time in which the batches are drawn.
-    `-forward` is images/s at batch 64, taking turns. The field basis is an interpolator fitted by least squares, not a
-    network.
+    `-forward` is images/s at batch 64, taking turns.
     """
     budget_s = BUDGET_S if n is None else n
     if budget_s < 1:
@@ -93,7 +90,6 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         with torch.no_grad():
             turns = interleave(lambda: ours(batch), lambda: draw_peer(batch), _ROUNDS)
             drawing_s = _drawing_s(config, training, ours_steps)
-            fitted = _basis_results(config, validation, other.mse, draw_peer, seed) if with_basis else []
     ours_weights, peer_weights = (sum(part.numel() for part in net.parameters()) for net in (ours, peer))
     conditions = (
         f"{target}, {budget_s} s of CPU time each, one thread: ours {ours_weights:,} weights, "
@@ -102,10 +98,6 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         f"MSE {other.mse:.3g}, PSNR {other.psnr_db:.1f} dB, IoU {other.iou:.5f}, CSIM {other.csim:.5f}, "
         f"SSIM {other.ssim:.5f} (least {other.ssim_min:.5f}); {machine()}"
     )
-    assert found.ssim is not None
-    assert found.ssim_min is not None
-    assert other.ssim is not None
-    assert other.ssim_min is not None
     forward, peer_forward = turns.median_s
     rows = [
         ("mse", found.mse, "MSE", other.mse / found.mse),
@@ -122,14 +114,14 @@ def _compare(target: str, name: str, n: int | None, seed: int, *, with_basis: bo
         for what, value, kind, ratio in rows
     ]
     results[-1] = replace(results[-1], **turns.ratios())
-    return [*results, _drawn(name, drawing_s / ours_s, seed, conditions), *fitted]
+    return [*results, _drawn(name, drawing_s / ours_s, seed, conditions)]
 
 
 def _drawing_s(config: TrainConfig, training: Exact, steps: int) -> float:
     """The CPU seconds for drawing the batches of this many steps, measured on some of them."""
     some = min(steps, _DRAWN)
     began = time.process_time()
-    for _ in batches(config.model_copy(update={"steps": some}), training, Group(), 0):
+    for _ in batches(config.model_copy(update={"steps": some}), training, 0):
         pass
     return (time.process_time() - began) * steps / some
 
@@ -139,14 +131,14 @@ def _shortfall(peer: float, ours: float) -> float:
     return (1 - peer) / (1 - ours) if ours < 1 else math.inf
 
 
-def _quality(draw: Callable[[Tensor], Tensor], images: Exact, *, with_ssim: bool = True) -> Quality:
+def _quality(draw: Callable[[Tensor], Tensor], images: Exact) -> Quality:
     def pairs() -> Iterator[tuple[Tensor, Tensor]]:
         for numbers in torch.arange(len(images)).split(64):
             inputs, target = images.pick(numbers)
             with torch.no_grad():
                 yield draw(inputs), target
 
-    return quality(pairs(), with_ssim=with_ssim)
+    return quality(pairs())
 
 
 @dataclass(slots=True)
@@ -206,35 +198,6 @@ def _train_peer(config: TrainConfig, training: Exact, budget_s: float) -> tuple[
     optimiser.state.clear()
     used_s = steps_of(steps, config.model_copy(update={"steps": steps, "learning_rate": PEER_RATE}))
     return network.eval(), used_s, steps
-
-
-def _basis_results(
-    config: TrainConfig, images: Exact, peer_mse: float, draw_peer: Callable[[Tensor], Tensor], seed: int
-) -> list[Result]:
-    """The field basis: how close, how long the fit took, and how fast it draws."""
-    began = time.process_time()
-    basis = fit_basis(config.build_target())
-    fit_s = time.process_time() - began
-    found = _quality(basis, images, with_ssim=False)
-    batch = images.inputs[: config.batch]
-    turns = interleave(lambda: basis(batch), lambda: draw_peer(batch), _ROUNDS)
-    forward, peer_forward = turns.median_s
-    peer = "Learning-to-Paint-type network"
-    conditions = f"interpolator, fitted in {fit_s:.1f} s of CPU time, PSNR {found.psnr_db:.1f} dB, IoU {found.iou:.5f}"
-    return [
-        Result("field-basis-mse", found.mse, "MSE", peer, peer_mse / found.mse, len(images), seed, conditions),
-        Result(
-            "field-basis-forward",
-            config.batch / forward,
-            "images/s",
-            peer,
-            peer_forward / forward,
-            _ROUNDS,
-            seed,
-            conditions,
-            **turns.ratios(),
-        ),
-    ]
 
 
 @contextmanager

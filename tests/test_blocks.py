@@ -21,7 +21,7 @@ from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 ALL = [block for document in DOCUMENTS for block in blocks_of(document)]
 NOT_RUN = re.compile(r"needs (?:an arm|a person|a network)|takes many minutes|tested by (tests/\S+\.py)")
-COMMAND = re.compile(r"^(\$ )?(brushloop|make|python3?|pip|torchrun) [a-z-]", re.M)
+COMMAND = re.compile(r"^(\$ )?(brushloop|make|python3?|pip) [a-z-]", re.M)
 STOPPED = 4
 """Exit code of a run that the same command continues."""
 PAGES = [

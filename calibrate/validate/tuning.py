@@ -173,7 +173,6 @@ def _tune(
 ) -> None:
     from model.train.checkpoint import load_weights, sha256
     from model.train.config import checked
-    from model.train.distributed import joined
     from model.train.run import Tuning, run_training
 
     config, _, _ = load_weights(generator.path)
@@ -193,8 +192,7 @@ def _tune(
         "tuning": tuning,
     }
     files = Tuning(generator.path, captures)
-    with joined(config.device) as group:
-        run_training(checked("tune", fields), folder, group, progress, lambda: False, tuning=files)
+    run_training(checked("tune", fields), folder, progress, lambda: False, files)
 
 
 def _with_images(

@@ -21,8 +21,8 @@ class Quality:
     mse: float
     iou: float
     csim: float
-    ssim: float | None = None
-    ssim_min: float | None = None
+    ssim: float
+    ssim_min: float
 
     @property
     def psnr_db(self) -> float:
@@ -30,7 +30,7 @@ class Quality:
         return 10 * math.log10(1 / self.mse) if self.mse else math.inf
 
 
-def quality(pairs: Iterable[tuple[Tensor, Tensor]], *, with_ssim: bool = False) -> Quality:
+def quality(pairs: Iterable[tuple[Tensor, Tensor]]) -> Quality:
     """Compare (drawn, target) batches, each (B, N, N) in [0, 1]. SSIM takes some milliseconds per image.
 
     Raises ValueError if there are no images.
@@ -45,13 +45,11 @@ def quality(pairs: Iterable[tuple[Tensor, Tensor]], *, with_ssim: bool = False) 
         ink, wanted = a > 0.5, b > 0.5
         overlaps.append((ink & wanted).sum(-1).double() / (ink | wanted).sum(-1).clamp(min=1))
         cosines.append((a * b).sum(-1) / (a.norm(dim=-1) * b.norm(dim=-1)).clamp(min=1e-12))
-        if with_ssim:
-            structures += [_ssim(x.double().numpy(), y.double().numpy()) for x, y in zip(drawn, target, strict=True)]
+        structures += [_ssim(x.double().numpy(), y.double().numpy()) for x, y in zip(drawn, target, strict=True)]
     if not errors:
         raise ValueError("no images to compare")
     mse, iou, csim = (float(torch.cat(parts).mean()) for parts in (errors, overlaps, cosines))
-    mean = sum(structures) / len(structures) if structures else None
-    return Quality(sum(map(len, errors)), mse, iou, csim, mean, min(structures, default=None))
+    return Quality(len(structures), mse, iou, csim, sum(structures) / len(structures), min(structures))
 
 
 def _ssim(drawn: Any, target: Any) -> float:

@@ -52,12 +52,6 @@ def chebyshev(unit: Tensor, degree: int) -> Tensor:
     return torch.stack(terms[: degree + 1], dim=-1)
 
 
-def nodes(degree: int) -> Tensor:
-    """The zeros of T_(degree + 1), the best points to sample polynomials of that degree, (degree + 1,) in (-1, 1)."""
-    k = torch.arange(degree + 1, dtype=torch.float64)
-    return torch.cos(torch.pi * (k + 0.5) / (degree + 1))
-
-
 @dataclass(frozen=True, slots=True)
 class Layers:
     """Sizes of a network.

@@ -1,4 +1,4 @@
-"""`brushloop train`: train, tune and export the generator. Heavy imports wait until a command runs.
+"""`brushloop train`: train and tune the generator. Heavy imports wait until a command runs.
 
 A command that trains returns the folder of the training, of which `brushloop.py` has the page written.
 """
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(help="Train the neural stroke generator, tune it on captures, export it.")
+app = typer.Typer(help="Train the neural stroke generator, or tune it on captures.")
 
 
 @app.callback(invoke_without_command=True)
@@ -23,12 +23,11 @@ def train(
     config: Annotated[Path | None, typer.Option(help="A train.toml instead of a target's defaults.")] = None,
     steps: Annotated[int | None, typer.Option(help="Largest number of steps, G in Algorithm 1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights and images.")] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of each process.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Threads of each process that draw images ahead.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of torch.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Threads that draw images ahead.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
-    tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
 ) -> Path | None:
-    """Train on exact images of a stroke model (Algorithm 1). Under torchrun, its processes share each batch."""
+    """Train on exact images of a stroke model (Algorithm 1), in one process on one device."""
     if context.invoked_subcommand is not None:
         return None
     from model.train import config as configs
@@ -40,7 +39,7 @@ def train(
         chosen = configs.preset(target, **changes)
     else:
         chosen = configs.checked(config, configs.load_config(config).model_dump() | changes)
-    return train_with_bar(chosen, out, None, tensorboard)
+    return train_with_bar(chosen, out)
 
 
 @app.command()
@@ -52,8 +51,7 @@ def tune(
     learning_rate: Annotated[float, typer.Option(min=0, max=1, help="Peak learning rate.")] = 3e-4,
     held_out: Annotated[float, typer.Option(min=0, max=1, help="Share of conditions to validate on.")] = 0.2,
     seed: Annotated[int, typer.Option(min=0, help="Which conditions are held out, and the order of the rest.")] = 0,
-    tensorboard: Annotated[bool, typer.Option(help="Write TensorBoard's event files too.")] = False,
-) -> Path | None:
+) -> Path:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""
     from model.train.checkpoint import load_weights, sha256
     from model.train.config import checked
@@ -74,33 +72,4 @@ def tune(
             "held_out": held_out,
         },
     }
-    return train_with_bar(checked("tune", fields), out, Tuning(generator, captures), tensorboard)
-
-
-@app.command()
-def export(
-    generator: Annotated[Path, typer.Argument(help="A generator.safetensors.")],
-    form: Annotated[str, typer.Option(help="onnx, or pt2 for torch.export.")] = "onnx",
-) -> None:
-    """Write a generator for other programs, checked against the network, with its card."""
-    import rich
-    from rich.markup import escape
-
-    from model.train.export import export as write
-
-    path, worst = write(generator, form)
-    rich.print(f"{escape(str(path))}: at most {worst:.1e} off the network in any pixel")
-
-
-@app.command()
-def basis(
-    target: Annotated[str, typer.Option(help="press or anchored.")] = "press",
-    validation_images: Annotated[int, typer.Option(min=1, max=100_000, help="Images to compare with.")] = 2000,
-    out: Annotated[Path | None, typer.Option(help="Write its coefficients as safetensors here.")] = None,
-) -> None:
-    """Fit the field basis, an alternative to the network, by least squares in seconds, and report its accuracy."""
-    import rich
-
-    from model.train.export import fit_and_compare
-
-    rich.print(fit_and_compare(target, validation_images, out))
+    return train_with_bar(checked("tune", fields), out, Tuning(generator, captures))

@@ -72,7 +72,7 @@ class TrainConfig(_Frozen):
     training_images: Annotated[int, Field(ge=1, le=1_000_000)] = 20_000
     validation_images: Annotated[int, Field(ge=1, le=1_000_000)] = 2_000
     batch: Annotated[int, Field(ge=1, le=4_096)] = 64
-    """Images per step, over all processes."""
+    """Images per step."""
     steps: Annotated[int, Field(ge=1, le=1_000_000)] = 6_000
     """G of Algorithm 1."""
     picture_every: Annotated[int, Field(ge=1)] = 1_000
@@ -93,10 +93,11 @@ class TrainConfig(_Frozen):
     tuning: TuningConfig | None = None
     """Origin of weights and images when training on captures."""
     threads: Annotated[int, Field(ge=1, le=256)] = 1
-    """Threads of torch in each process; a different number changes the last bits of the weights."""
+    """Threads of torch; a different number changes the last bits of the weights."""
     workers: Annotated[int, Field(ge=0, le=64)] = 1
-    """Threads of each process that draw batches ahead; 0 draws each when its step comes. Changes no image."""
+    """Threads that draw batches ahead; 0 draws each when its step comes. Changes no image."""
     device: Literal["cpu", "cuda"] = "cpu"
+    """The device that trains: the CPU, or the first NVIDIA GPU."""
 
     @model_validator(mode="after")
     def _build(self) -> TrainConfig:

@@ -1,6 +1,6 @@
 """Training and validation images by number: any step's batch follows from (seed, step) alone.
 
-So a resumed training needs no random-generator state, and every process of a group can take its share.
+So a resumed training needs no random-generator state.
 
 Captured strokes to tune on come as one safetensors file. Tensors: `images` (n, N, N) uint8 (255 is ink) or float32 in
 [0, 1], and one (n,) float32 or float64 tensor for each of the generator's inputs, by name, in its unit. Metadata:
@@ -25,7 +25,6 @@ from torch import Tensor
 from model.generator.targets import Target
 from model.train.checkpoint import read_tensors, write_whole
 from model.train.config import TrainConfig
-from model.train.distributed import Group
 from model.train.errors import TrainError
 
 _TRAINING, _VALIDATION, _ORDER, _SPLIT = range(4)
@@ -165,34 +164,25 @@ def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
     return Kept(inputs, images), metadata.get("source", "not stated")[:200].replace("\n", " ")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Batch:
-    """This process' share of a step's images: `inputs` (n, P), `target` (n, N, N), out of `count` in all processes."""
+def batches(config: TrainConfig, images: Images, start: int) -> Generator[tuple[Tensor, Tensor]]:
+    """Inputs (n, P) and images (n, N, N) of the steps from `start` to the last, in order.
 
-    count: int
-    inputs: Tensor
-    target: Tensor
-
-
-def batches(config: TrainConfig, images: Images, group: Group, start: int) -> Generator[Batch]:
-    """The batches of the steps from `start` to the last, in order; close the iterator to end the threads early.
+    Close the iterator to end the threads early.
 
     A batch follows from the seed and its step alone, so the number of `config.workers` changes no image. Without
     workers each batch is drawn when it is asked for. The compiled rasters release the interpreter's lock, so threads
     draw beside the training.
     """
 
-    def draw(step: int) -> Batch:
-        numbers = batch_numbers(len(images), config.batch, config.seed, step)
-        inputs, target = images.pick(group.share(numbers))
-        return Batch(len(numbers), inputs, target)
+    def draw(step: int) -> tuple[Tensor, Tensor]:
+        return images.pick(batch_numbers(len(images), config.batch, config.seed, step))
 
     steps = range(start, config.steps)
     if config.workers == 0:
         yield from map(draw, steps)
         return
     pool = ThreadPoolExecutor(config.workers)
-    waiting: deque[Future[Batch]] = deque()
+    waiting: deque[Future[tuple[Tensor, Tensor]]] = deque()
     try:
         for step in steps:
             waiting.append(pool.submit(draw, step))

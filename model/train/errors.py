@@ -4,7 +4,6 @@ TrainError              a file or a setting cannot be used; nothing half-written
 TrainingStopped         the training cannot usefully continue
  +-- BlankOutput        the generator draws nothing, or ink everywhere, for all inputs
  +-- Diverged           the loss became NaN or infinite
-MissingExtra            an optional package is not installed
 """
 
 from __future__ import annotations
@@ -52,13 +51,3 @@ class Diverged(TrainingStopped):
 
     def __init__(self, step: int) -> None:
         super().__init__(step, "the loss is no longer a number; train again with a smaller learning_rate")
-
-
-class MissingExtra(Exception):
-    """A package that only this command needs is not installed."""
-
-    exit_code: ClassVar[int] = 2
-
-    def __init__(self, package: str, extra: str) -> None:
-        self.package = package
-        super().__init__(f"{package} is not installed: pip install 'brushloop[{extra}]'")

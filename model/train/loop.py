@@ -14,8 +14,7 @@ from torch import Tensor
 from model.generator.network import Generator, squared_error
 from model.train.checkpoint import State, put_weights
 from model.train.config import TrainConfig
-from model.train.data import Batch, Images, batches
-from model.train.distributed import Group
+from model.train.data import Images, batches
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 
 BLANK_SHARE = 0.05
@@ -42,7 +41,7 @@ class Validation:
 
 
 class Progress(Protocol):
-    """Shows the progress of a training, in the first process only."""
+    """Shows the progress of a training."""
 
     def stepped(self, step: int, loss: float) -> None:
         """Called after a step."""
@@ -76,48 +75,43 @@ def train(
     state: State,
     sets: tuple[Images, Images],
     watcher: Watcher,
-    group: Group | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> State:
     """Train from `state` to the end; returns the last state, which is also passed to `watcher.checkpoint`.
 
-    Sets torch's threads to `config.threads`. A single process gives the same bits however often it is interrupted and
-    resumed; several give the same sums per global batch up to rounding. Raises BlankOutput, Diverged, or
-    TrainingStopped when `stopping` returns true in any process.
+    Sets torch's threads to `config.threads`. The result has the same bits however often the training is interrupted
+    and resumed. Raises BlankOutput, Diverged, or TrainingStopped when `stopping` returns true.
     """
-    group = group or Group()
     torch.set_num_threads(config.threads)
     network = config.build_network()
     put_weights(network, state.weights)
-    network.to(group.device)
+    network.to(config.device)
     optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     _put_moments(optimiser, network, state)
-    run = _Run(config, network, optimiser, sets, watcher, group, state.losses.tolist(), state.validations.tolist())
-    with closing(batches(config, sets[0], group, state.step)) as drawn:
+    run = _Run(config, network, optimiser, sets, watcher, state.losses.tolist(), state.validations.tolist())
+    with closing(batches(config, sets[0], state.step)) as drawn:
         return _steps(run, drawn, state.step, stopping)
 
 
-def _steps(run: _Run, drawn: Iterator[Batch], step: int, stopping: Callable[[], bool]) -> State:
+def _steps(run: _Run, drawn: Iterator[tuple[Tensor, Tensor]], step: int, stopping: Callable[[], bool]) -> State:
     """Make the steps that are left, and what falls due between them."""
-    config, group, watcher, saved = run.config, run.group, run.watcher, step
+    config, watcher, saved = run.config, run.watcher, step
     while step < config.steps and not converged(config, run.validations):
-        loss, stop = run.step(step, next(drawn), stopping())
+        stop = stopping()
+        loss = run.step(step, *next(drawn))
         step += 1
         if not math.isfinite(loss):
             raise Diverged(step)
-        if group.first:
-            watcher.stepped(step, loss)
+        watcher.stepped(step, loss)
         last = step == config.steps
         if last or step % config.validate_every == 0:
             run.validate(step)
-        if group.first and (last or step % config.picture_every == 0):
+        if last or step % config.picture_every == 0:
             run.show(step)
         if last or stop or step % config.checkpoint_every == 0 or converged(config, run.validations):
             saved = step
-            if group.first:
-                watcher.checkpoint(run.state(step))
+            watcher.checkpoint(run.state(step))
         if stop and not last:
-            group.wait()
             raise TrainingStopped(saved, "stopped as requested; the same command resumes here")
     return run.state(step)
 
@@ -141,21 +135,20 @@ def learning_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * step / config.steps))
 
 
-def validate(network: Generator, images: Images, group: Group, batch: int, step: int = 0) -> Validation:
-    """Compute means over the whole set; each process evaluates its share."""
+def validate(network: Generator, images: Images, config: TrainConfig, step: int) -> Validation:
+    """Compute means over the whole set."""
     sums = torch.zeros(5, dtype=torch.float64)
     with torch.no_grad():
-        for numbers in group.share(torch.arange(len(images))).split(batch):
+        for numbers in torch.arange(len(images)).split(config.batch):
             inputs, target = images.pick(numbers)
-            drawn = network(inputs.to(group.device)).cpu()
+            drawn = network(inputs.to(config.device)).cpu()
             a, b = drawn.flatten(1), target.flatten(1)
             ink, wanted = a > 0.5, b > 0.5
             iou = (ink & wanted).sum(-1) / (ink | wanted).sum(-1).clamp(min=1)
             cosine = torch.nn.functional.cosine_similarity(a, b)
             parts = ((a - b).square().mean(-1), iou, cosine, a.mean(-1), b.mean(-1))
             sums += torch.stack([part.double().sum() for part in parts])
-    sums = group.add(sums.to(group.device)).cpu() / len(images)
-    return Validation(step, *sums.tolist())
+    return Validation(step, *(sums / len(images)).tolist())
 
 
 @dataclass(slots=True, eq=False)
@@ -167,45 +160,30 @@ class _Run:
     optimiser: torch.optim.Adam
     sets: tuple[Images, Images]
     watcher: Watcher
-    group: Group
     losses: list[float]
     validations: list[list[float]]
     blanks: int = 0
 
-    def step(self, step: int, batch: Batch, stopping: bool) -> tuple[float, bool]:
-        """Make one update; return Eq. 6 over the global batch and whether any process was asked to stop."""
+    def step(self, step: int, inputs: Tensor, target: Tensor) -> float:
+        """Make one update; return Eq. 6 over the batch."""
         config = self.config
-        inputs, target = (part.to(self.group.device) for part in (batch.inputs, batch.target))
+        inputs, target = inputs.to(config.device), target.to(config.device)
         for options in self.optimiser.param_groups:
             options["lr"] = learning_rate(config, step)
-        pixels = batch.count * config.target.size_px**2
-        loss = squared_error(self.network.field(inputs), target, config.ink_weight) / pixels
+        loss = squared_error(self.network.field(inputs), target, config.ink_weight) / target.numel()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        total, stop = self._summed(loss.detach(), stopping)
-        if math.isfinite(total):  # keep the last good weights
+        value = float(loss.detach())
+        if math.isfinite(value):  # keep the last good weights
             self.optimiser.step()
-            self.losses.append(total)
-        return total, stop
-
-    def _summed(self, loss: Tensor, stopping: bool) -> tuple[float, bool]:
-        """Sum loss, requests to stop and gradients over the group, in one message."""
-        if self.group.world == 1:
-            return float(loss), stopping
-        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        flags = torch.stack((loss, torch.tensor(float(stopping), device=loss.device)))
-        message = self.group.add(torch.cat([flags, *(gradient.flatten() for gradient in gradients)]))
-        parts = message[2:].split([gradient.numel() for gradient in gradients])
-        for gradient, part in zip(gradients, parts, strict=True):
-            gradient.copy_(part.view(gradient.shape))
-        return float(message[0]), bool(message[1] > 0)
+            self.losses.append(value)
+        return value
 
     def validate(self, step: int) -> None:
         """Validate, and raise BlankOutput if the output was blank too often."""
-        found = validate(self.network, self.sets[1], self.group, self.config.batch, step)
+        found = validate(self.network, self.sets[1], self.config, step)
         self.validations.append([float(step), found.mse, found.iou, found.csim])
-        if self.group.first:
-            self.watcher.validated(found)
+        self.watcher.validated(found)
         self.blanks = self.blanks + 1 if found.blank else 0
         if self.blanks >= self.config.blank_after:
             raise BlankOutput(step, found.ink_share, found.target_share)
@@ -214,7 +192,7 @@ class _Run:
         """Hand eight validation strokes to the watcher."""
         inputs, target = self.sets[1].pick(torch.arange(min(8, len(self.sets[1]))))
         with torch.no_grad():
-            drawn = self.network(inputs.to(self.group.device)).cpu()
+            drawn = self.network(inputs.to(self.config.device)).cpu()
         self.watcher.pictures(step, inputs, target, drawn)
 
     def state(self, step: int) -> State:

@@ -1,4 +1,4 @@
-"""Reports of a training: loss curves (the paper's figure 9), pictures, samples, TensorBoard's events, model card."""
+"""Reports of a training: loss curves (the paper's figure 9), pictures, samples, model card."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import csv
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 from model.protocol import ParameterSpec
 from model.train.checkpoint import COLUMNS, State, read_tensors, sha256, write_whole
 from model.train.config import TrainConfig
-from model.train.errors import MissingExtra, TrainError
+from model.train.errors import TrainError
 
 
 def write_curves(folder: Path, state: State, title: str) -> None:
@@ -104,30 +103,6 @@ def load_samples(folder: Path, count: int) -> Samples:
     return Samples(inputs, targets, drawn)
 
 
-class Events:
-    """TensorBoard event files; steps that an earlier, killed run wrote after `step` are hidden. Raises MissingExtra."""
-
-    def __init__(self, folder: Path, step: int) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise MissingExtra("tensorboard", "train") from error
-        untyped: Any = SummaryWriter
-        self._writer: Any = untyped(log_dir=str(folder), purge_step=step)
-
-    def scalar(self, name: str, value: float, step: int) -> None:
-        """Write one number."""
-        self._writer.add_scalar(name, value, step)
-
-    def __enter__(self) -> Events:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.close()
-
-
 def _table(head: tuple[str, ...], rows: Any) -> bytes:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -140,15 +115,12 @@ _NUMBERS = (("MSE", "mse", ".3g"), ("PSNR, dB", "psnr_db", ".2f"), ("IoU", "iou"
 _NUMBERS += (("SSIM, mean", "ssim", ".5f"), ("SSIM, least", "ssim_min", ".5f"))
 
 
-def write_card(path: Path, config: TrainConfig, report: dict[str, Any], checks: tuple[str, ...] = ()) -> Path:
-    """Write the card of the file at `path` as `<stem>.md`, or `<name>.md` for an export; raises OSError."""
-    name = path.stem if path.suffix == ".safetensors" else path.name
-    card = path.with_name(f"{name}.md")
-    write_whole(card, card_text(path, config, report, checks).encode())
-    return card
+def write_card(path: Path, config: TrainConfig, report: dict[str, Any]) -> None:
+    """Write the card of the generator at `path` beside it, as `<stem>.md`; raises OSError."""
+    write_whole(path.with_suffix(".md"), card_text(path, config, report).encode())
 
 
-def card_text(path: Path, config: TrainConfig, report: dict[str, Any], checks: tuple[str, ...] = ()) -> str:
+def card_text(path: Path, config: TrainConfig, report: dict[str, Any]) -> str:
     """The card as Markdown."""
     target, tuning = config.target, config.tuning
     side_mm = target.size_px * target.px_mm
@@ -189,7 +161,6 @@ def card_text(path: Path, config: TrainConfig, report: dict[str, Any], checks: t
             "- It has seen no real ink: it reproduces a closed-form model, and is no better on paper than that."
         )
     lines.append("- Outside the ranges above it extrapolates polynomials: do not use it there.")
-    lines += [f"- {check}" for check in checks]
     return "\n".join(lines) + "\n"
 
 

@@ -1,7 +1,7 @@
 """One training in one folder: start or resume, write the outputs of Algorithm 1, finish with a generator and its card.
 
 A folder holds `checkpoint.safetensors` during and after training, `generator.safetensors` with `generator.md` at the
-end, `samples.safetensors`, `loss.png`, `loss.csv`, `validation.csv`, `pictures/`, and `tensorboard/` if requested.
+end, `samples.safetensors`, `loss.png`, `loss.csv`, `validation.csv` and `pictures/`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from filelock import FileLock, Timeout
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 from torch import Tensor
@@ -33,10 +33,9 @@ from model.train.checkpoint import (
 )
 from model.train.config import TrainConfig, differences
 from model.train.data import Images, exact_sets, load_captures, split
-from model.train.distributed import Group, joined
 from model.train.errors import TrainError
 from model.train.loop import Progress, Validation, converged, new_state, train
-from model.train.report import MOST_SAMPLES, Events, Samples, save_samples, write_card, write_curves, write_pictures
+from model.train.report import MOST_SAMPLES, Samples, save_samples, write_card, write_curves, write_pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,40 +49,33 @@ class Tuning:
 def run_training(
     config: TrainConfig,
     folder: Path,
-    group: Group,
     progress: Progress,
     stopping: Callable[[], bool],
-    *,
     tuning: Tuning | None = None,
-    events: bool = False,
 ) -> Path:
     """Train to the end, from the folder's checkpoint if it has one; return the generator's path.
 
-    Raises TrainError if the folder holds another training or is in use, and as `model.train.loop.train`.
+    Raises TrainError for "cuda" without a GPU and if the folder holds another training or is in use, and as
+    `model.train.loop.train`.
     """
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise TrainError("device", "cuda was asked for, but this machine has no usable GPU")
+    folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as held:
-        if group.first:
-            folder.mkdir(parents=True, exist_ok=True)
-            try:
-                held.enter_context(FileLock(folder / ".lock", timeout=0))
-            except Timeout as error:
-                raise TrainError(folder, "another training writes here") from error
-        group.wait()
+        try:
+            held.enter_context(FileLock(folder / ".lock", timeout=0))
+        except Timeout as error:
+            raise TrainError(folder, "another training writes here") from error
         state = _start(config, folder, tuning)
         done = state.step == config.steps or converged(config, state.validations.tolist())
         path = folder / "generator.safetensors"
-        finished = done and path.exists()
-        group.wait()  # no process writes before all have read
-        if finished:
+        if done and path.exists():
             return path
         sets = _sets(config, tuning)
-        shown = held.enter_context(Events(folder / "tensorboard", state.step)) if events and group.first else None
-        files = _Files(config, folder, progress, shown)
+        files = _Files(config, folder, progress)
         began = time.process_time()
-        state = train(config, state, sets, files, group, stopping)
-        if group.first:
-            _finish(config, folder, state, sets[1], time.process_time() - began)
-        group.wait()
+        state = train(config, state, sets, files, stopping)
+        _finish(config, folder, state, sets[1], time.process_time() - began)
         return path
 
 
@@ -119,12 +111,11 @@ def _sets(config: TrainConfig, tuning: Tuning | None) -> tuple[Images, Images]:
 
 @dataclass(slots=True, eq=False)
 class _Files:
-    """Writes pictures, checkpoints and events of a training."""
+    """Writes pictures and checkpoints of a training."""
 
     config: TrainConfig
     folder: Path
     progress: Progress
-    events: Events | None
     specs: Any = field(init=False)
 
     def __post_init__(self) -> None:
@@ -132,15 +123,9 @@ class _Files:
 
     def stepped(self, step: int, loss: float) -> None:
         self.progress.stepped(step, loss)
-        if self.events and step % 10 == 0:
-            self.events.scalar("loss/training", loss, step)
 
     def validated(self, validation: Validation) -> None:
         self.progress.validated(validation)
-        if self.events:
-            self.events.scalar("loss/validation", validation.mse, validation.step)
-            self.events.scalar("validation/iou", validation.iou, validation.step)
-            self.events.scalar("validation/csim", validation.csim, validation.step)
 
     def pictures(self, step: int, inputs: Tensor, targets: Tensor, drawn: Tensor) -> None:
         (self.folder / "pictures").mkdir(exist_ok=True)
@@ -152,8 +137,6 @@ class _Files:
 
 def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu_s: float) -> None:
     """Write the generator, its card and the curves."""
-    import torch
-
     network = config.build_network().eval()
     put_weights(network, state.weights)
 
@@ -163,7 +146,7 @@ def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu
             with torch.no_grad():
                 yield network(inputs), target
 
-    found = quality(pairs(), with_ssim=True)
+    found = quality(pairs())
     rows = state.validations.tolist()
     end = "converged" if converged(config, rows) else "all steps done"
     report: dict[str, Any] = asdict(found) | {"psnr_db": found.psnr_db, "ssim_settings": SSIM_SETTINGS}
@@ -177,8 +160,6 @@ def _finish(config: TrainConfig, folder: Path, state: State, images: Images, cpu
 
 def _drawn(network: Generator, images: Images) -> Samples:
     """Validation strokes, evenly chosen, with what the network draws for them."""
-    import torch
-
     numbers = torch.linspace(0, len(images) - 1, min(MOST_SAMPLES, len(images))).long()
     inputs, targets = images.pick(numbers)
     with torch.no_grad():
@@ -213,20 +194,15 @@ class Bar:
             )
 
 
-def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None, events: bool) -> Path | None:
-    """Train with a progress bar in the first process, which returns the folder; others None.
-
-    Raises as `run_training`.
-    """
-    with joined(config.device) as group, _asked_to_stop() as stopping:
-        console = Console(quiet=not group.first)
-        words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
-        columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True), words)
-        with ProgressBar(*columns, console=console, disable=not group.first) as progress:
-            bar = Bar(progress, config.steps)
-            path = run_training(config, folder, group, bar, stopping, tuning=tuning, events=events)
-        console.print(f"Generator: {path}, its card: {path.with_suffix('.md')}", markup=False, soft_wrap=True)
-        return folder if group.first else None
+def train_with_bar(config: TrainConfig, folder: Path, tuning: Tuning | None = None) -> Path:
+    """Train with a progress bar; return the folder. Raises as `run_training`."""
+    words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
+    columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True), words)
+    with _asked_to_stop() as stopping, ProgressBar(*columns) as progress:
+        path = run_training(config, folder, Bar(progress, config.steps), stopping, tuning)
+    card = path.with_suffix(".md")
+    progress.console.print(f"Generator: {path}, its card: {card}", markup=False, soft_wrap=True)
+    return folder
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Targets, network, loss, field basis, and a generator as a stroke model."""
+"""Targets, network, loss, and a generator as a stroke model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 
 from model.brush import Brush, DomainError
 from model.ccdbsm import ccdbsm
-from model.generator.basis import FieldBasis, fit_basis, signed_distance
 from model.generator.metrics import quality
 from model.generator.network import Generator, Inputs, Layers, chebyshev, covered, squared_error
 from model.generator.stroke import generator_model, traced
@@ -115,31 +114,6 @@ def test_the_loss_is_eq_6_and_its_gradient_passes_the_clamp() -> None:
     assert field.grad[0, 1, 1] == 0
 
 
-def test_the_field_basis_repeats_the_closed_form_within_seconds() -> None:
-    strokes = target()
-    basis = fit_basis(strokes, degrees=(5, 2), samples=256, rounds=20)
-    inputs = strokes.draw(64, torch.Generator().manual_seed(3))
-    with torch.no_grad():
-        found = quality([(basis(inputs), strokes.images(inputs))], with_ssim=True)
-    assert found.mse < 2e-5
-    assert found.iou > 0.999
-    assert found.ssim is not None
-    assert found.ssim > 0.998
-    with pytest.raises(ValueError, match="3 degrees for 2 inputs"):
-        FieldBasis(strokes.inputs, (1, 2, 3), 8)
-    with pytest.raises(ValueError, match="at most 512"):
-        FieldBasis(target("qbc").inputs, (3,) * 8, 8)
-
-
-def test_signed_distance_is_that_of_a_circle() -> None:
-    ranges = {"centre_mm": (-1.0, 1.0), "radius_mm": (4.0, 8.0)}
-    strokes = Target(stroke_model("circle", Brush()), ranges, {}, Placement.CENTRED)
-    field = signed_distance(strokes, torch.tensor([[0.0, 6.0]]))[0]
-    centres = (torch.arange(128) + 0.5) * 0.2 - 12.8
-    expected = (6 - torch.hypot(*torch.meshgrid(centres, centres, indexing="ij"))) / 0.2
-    torch.testing.assert_close(field, expected.float(), rtol=0, atol=0.02)
-
-
 def test_a_generator_is_a_stroke_model() -> None:
     strokes = target()
 
@@ -185,7 +159,7 @@ def test_inputs_are_scaled_to_one() -> None:
 
 def test_equal_images_are_perfect() -> None:
     images = target().images(torch.tensor([[15.0, 5.0], [12.0, 1.0]]))
-    found = quality([(images, images)], with_ssim=True)
+    found = quality([(images, images)])
     assert (found.images, found.mse, found.iou, found.psnr_db) == (2, 0, 1, math.inf)
     assert found.csim == pytest.approx(1)
     assert found.ssim_min == pytest.approx(1)

@@ -1,26 +1,22 @@
-"""`brushloop train`, `tune` and `export` as a user runs them, and what a generator then is to the rest."""
+"""`brushloop train` and `tune` as a user runs them, and what a generator then is to the rest."""
 
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
 import brushloop
-from model.train import export as exporting
 from model.train.checkpoint import load_generator
 from model.train.cli import app
 from model.train.data import save_captures
-from model.train.errors import MissingExtra, TrainError
-from model.train.export import export
+from model.train.errors import TrainError
 from model.train.report import Samples, load_samples, save_samples
 from tests.browser import BROWSER, content_widths_px
 
@@ -34,21 +30,15 @@ def once(tmp_path_factory: pytest.TempPathFactory, write_tiny: Callable[[Path], 
     return folder / "g" / "generator.safetensors"
 
 
-@pytest.fixture
-def trained(tmp_path: Path, once: Path) -> Path:
-    """A copy of it, to write beside."""
-    return Path(shutil.copy(once, tmp_path))
-
-
-def test_fine_tuning_on_captures_is_marked_as_such(trained: Path, tmp_path: Path) -> None:
-    before = load_generator(trained)
+def test_fine_tuning_on_captures_is_marked_as_such(once: Path, tmp_path: Path) -> None:
+    before = load_generator(once)
     assert not before.fitted
     inputs = torch.stack((torch.linspace(11, 20, 20), torch.linspace(0, 10, 20)), dim=-1)
     images = before.target.images(inputs).roll(2, dims=1)  # a brush that marks the paper two pixels lower
     captures = tmp_path / "captures.safetensors"
     named = {"height_mm": inputs[:, 0], "tilt_deg": inputs[:, 1]}
     save_captures(captures, named, images, 0.8, "centred", "loopback rig")
-    command = ["tune", str(trained), str(captures), "--out", str(tmp_path / "t"), "--steps", "60"]
+    command = ["tune", str(once), str(captures), "--out", str(tmp_path / "t"), "--steps", "60"]
     ran = CliRunner().invoke(app, [*command, "--learning-rate", "0.01"])
     assert ran.exit_code == 0, ran.exception
     after = load_generator(tmp_path / "t" / "generator.safetensors")
@@ -92,62 +82,6 @@ def test_samples_that_are_not_of_this_generator_are_refused(tmp_path: Path) -> N
         load_samples(tmp_path, 2)
 
 
-def test_exports_draw_what_the_network_draws(trained: Path) -> None:
-    out, worst = export(trained, "pt2")
-    assert worst <= 1e-5
-    network = load_generator(trained).network
-    inputs = torch.tensor([[13.0, 2.0], [19.0, 9.0]])
-    program: Any = torch.export.load(out).module()
-    torch.testing.assert_close(program(inputs), network(inputs))
-    assert "Checked against the network in batches of 1, 5, 64" in out.with_name("generator.pt2.md").read_text()
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_onnx_draws_what_the_network_draws(trained: Path) -> None:
-    runtime: Any = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
-    out, worst = export(trained, "onnx")
-    assert worst <= 1e-5
-    session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
-    inputs = torch.tensor([[13.0, 2.0], [19.0, 9.0]])
-    (drawn,) = session.run(None, {"inputs": inputs.numpy()})
-    torch.testing.assert_close(torch.from_numpy(drawn), load_generator(trained).network(inputs), rtol=0, atol=1e-5)
-
-
-def test_an_export_that_draws_something_else_is_thrown_away(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = exporting._program
-
-    def darker(*arguments: Any) -> Any:
-        draw = real(*arguments)
-        return lambda values: draw(values) * 0.99
-
-    monkeypatch.setattr(exporting, "_program", darker)
-    with pytest.raises(TrainError, match="away from the network"):
-        export(trained, "pt2")
-    assert not list(trained.parent.glob("*.pt2*"))
-
-
-def test_what_is_missing_is_named(trained: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(exporting.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtra, match=r"onnx is not installed: pip install 'brushloop\[export\]'"):
-        export(trained, "onnx")
-    with pytest.raises(TrainError, match="form 'exe' is not known; known: onnx, pt2"):
-        export(trained, "exe")
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    from model.train.report import Events
-
-    with pytest.raises(MissingExtra, match="tensorboard"):
-        Events(tmp_path, 0)
-
-
-def test_tensorboard_gets_the_losses(toml: Path, tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    ran = CliRunner().invoke(app, ["--config", str(toml), "--out", str(tmp_path / "g"), "--tensorboard"])
-    assert ran.exit_code == 0, ran.exception
-    (events,) = (tmp_path / "g" / "tensorboard").iterdir()
-    assert b"loss/validation" in events.read_bytes()
-
-
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys, model.train.cli; assert not {'torch', 'numpy', 'pydantic', 'rich.progress'} & sys.modules.keys()"
@@ -162,8 +96,7 @@ def test_help_loads_nothing_heavy() -> None:
         (["--config", "no.toml"], "no.toml: No such file"),
         (["--steps", "0"], "steps: Input should be greater than or equal to 1"),
         (["--device", "tpu"], "device: Input should be 'cpu' or 'cuda'"),
-        (["export", "no.safetensors"], "no.safetensors: no such file"),
-        (["basis", "--target", "qbc"], "qbc: has 8 inputs"),
+        (["tune", "no.safetensors", "captures.safetensors"], "no.safetensors: no such file"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], words: str, tmp_path: Path) -> None:

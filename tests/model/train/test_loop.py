@@ -12,7 +12,6 @@ from torch import Tensor
 from model.train.checkpoint import State
 from model.train.config import TrainConfig, differences
 from model.train.data import Exact, batch_numbers, batches, exact_sets
-from model.train.distributed import Group
 from model.train.errors import BlankOutput, Diverged, TrainingStopped
 from model.train.loop import converged, learning_rate, new_state, train
 from tests.waiting import PATIENCE_S
@@ -59,10 +58,9 @@ def test_batches_follow_from_seed_and_step(tiny: TrainConfig) -> None:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_batches_drawn_ahead_are_those_drawn_in_time(tiny: TrainConfig, notes, workers: int) -> None:
     in_time, ahead = (tiny.model_copy(update={"workers": n, "steps": 8}) for n in (0, workers))
-    pairs = zip(*(batches(config, exact_sets(config)[0], Group(), 3) for config in (in_time, ahead)), strict=True)
-    for one, other in pairs:
-        assert torch.equal(one.inputs, other.inputs)
-        assert torch.equal(one.target, other.target)
+    pairs = zip(*(batches(config, exact_sets(config)[0], 3) for config in (in_time, ahead)), strict=True)
+    for drawn_in_time, drawn_ahead in pairs:
+        assert all(map(torch.equal, drawn_in_time, drawn_ahead))
     assert same(*(train(config, new_state(config), exact_sets(config), notes) for config in (in_time, ahead)))
     assert differences(in_time, ahead) == []  # so either goes on where the other stopped
 
@@ -75,7 +73,7 @@ def test_batches_are_drawn_while_earlier_ones_are_in_use(tiny: TrainConfig) -> N
 
     drawn = threading.Semaphore(0)
     training = exact_sets(tiny)[0]
-    with closing(batches(tiny, Noted(training.target, training.inputs), Group(), 0)) as ahead:
+    with closing(batches(tiny, Noted(training.target, training.inputs), 0)) as ahead:
         next(ahead)
         assert all(drawn.acquire(timeout=PATIENCE_S) for _ in range(3))  # the first and two more
 

@@ -1,10 +1,9 @@
-"""A training in a folder: killed and resumed, shared by two processes, refused where it is another's."""
+"""A training in a folder: killed and resumed, refused where it is another's."""
 
 from __future__ import annotations
 
 import multiprocessing
 import random
-import socket
 from collections.abc import Callable
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
@@ -15,14 +14,12 @@ from filelock import FileLock
 from safetensors.torch import load_file
 
 from model.train.config import TrainConfig, load_config
-from model.train.distributed import Group, joined
 from model.train.errors import TrainError
 from model.train.run import run_training
 
 TELLING = """
 from pathlib import Path
 from model.train.config import load_config
-from model.train.distributed import Group
 from model.train.run import run_training
 
 class Reporter:
@@ -31,15 +28,7 @@ class Reporter:
     def validated(self, validation):
         pass
 
-run_training(load_config(Path(toml)), Path(out), Group(), Reporter(), lambda: False)
-"""
-SHARING = """
-import os, sys
-from model.train.cli import app
-
-os.environ |= environment
-sys.stdout = open(said, "w")
-app(["--config", toml, "--out", out], standalone_mode=False)
+run_training(load_config(Path(toml)), Path(out), Reporter(), lambda: False)
 """
 
 
@@ -47,9 +36,7 @@ app(["--config", toml, "--out", out], standalone_mode=False)
 def processes() -> ForkServerContext:
     """Makes processes that begin with everything imported: imports would be most of what they do."""
     context = multiprocessing.get_context("forkserver")
-    needed = (
-        "pytest torch._dynamo torch.distributed matplotlib.figure skimage.metrics numba model.train.run model.train.cli"
-    )
+    needed = "pytest torch._dynamo matplotlib.figure skimage.metrics numba model.train.run"
     context.set_forkserver_preload(needed.split())
     return context
 
@@ -69,7 +56,7 @@ class Silent:
 
 
 def finish(config: TrainConfig, folder: Path) -> dict[str, torch.Tensor]:
-    run_training(config, folder, Group(), Silent(), lambda: False)
+    run_training(config, folder, Silent(), lambda: False)
     return load_file(folder / "checkpoint.safetensors")
 
 
@@ -129,43 +116,9 @@ def test_a_folder_in_use_is_refused(tmp_path: Path, tiny: TrainConfig) -> None:
         finish(tiny, tmp_path)
 
 
-def test_two_processes_share_each_batch_and_reach_the_same_weights(
-    tmp_path: Path, finished: Path, toml: Path, processes: ForkServerContext
-) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    said = [tmp_path / "first.txt", tmp_path / "second.txt"]
-    pair = [
-        processes.Process(
-            target=exec,
-            args=(
-                SHARING,
-                {
-                    "toml": str(toml),
-                    "out": str(tmp_path / "pair"),
-                    "said": str(said[rank]),
-                    "environment": shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
-                },
-            ),
-        )
-        for rank in (0, 1)
-    ]
-    for process in pair:
-        process.start()
-    for process in pair:
-        process.join()
-    assert [process.exitcode for process in pair] == [0, 0]
-    assert "Generator:" in said[0].read_text()
-    assert said[1].read_text() == ""
-    together = load_file(tmp_path / "pair" / "checkpoint.safetensors")
-    for name, tensor in load_file(finished / "checkpoint.safetensors").items():
-        torch.testing.assert_close(together[name], tensor, rtol=1e-3, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
-
-
-def test_cuda_without_a_gpu_is_refused() -> None:
+def test_cuda_without_a_gpu_is_refused_before_anything_is_written(tmp_path: Path, tiny: TrainConfig) -> None:
     if torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
-    with pytest.raises(TrainError, match="no usable GPU"), joined("cuda"):
-        pass
+    with pytest.raises(TrainError, match="no usable GPU"):
+        finish(tiny.model_copy(update={"device": "cuda"}), tmp_path / "g")
+    assert not (tmp_path / "g").exists()
