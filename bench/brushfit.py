@@ -19,12 +19,12 @@ from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, Chosen, bristles, simulated
 from bench.brushfit_prior import BRISTLE
 from bench.harness import BenchError, Result, machine
-from calibrate.fit.captures import Grid
-from calibrate.fit.fit import fit_presses
-from calibrate.fit.heldout import RefittedBezier, image_of, predictor, refit_bezier
-from calibrate.fit.prior import Prior, learned
-from calibrate.spread import spread_out
-from model.fitted import FittedPress
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.heldout import RefittedBezier, image_of, predictor, refit_bezier
+from brushloop.calibrate.fit.prior import Prior, learned
+from brushloop.calibrate.spread import spread_out
+from brushloop.model.fitted import FittedPress
 
 DRAWS = 10
 DESIGN = tuple(CELLS.index(cell) for cell in spread_out(sorted({h for h, _ in CELLS}), sorted({a for _, a in CELLS})))

@@ -7,7 +7,7 @@ the lean had been added to it.
 
 from __future__ import annotations
 
-from drivers.sim.brush.brush import BrushSpec
+from brushloop.drivers.sim.brush.brush import BrushSpec
 
 FROZEN: tuple[BrushSpec, ...] = (
     BrushSpec(seed=11),

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.captures import Grid, Pressed
-from model.fitted import chance_within
+from brushloop.calibrate.fit.captures import Grid, Pressed
+from brushloop.model.fitted import chance_within
 
 Floats = NDArray[np.float64]
 Shape = Callable[[Floats], Floats]

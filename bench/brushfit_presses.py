@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError
-from calibrate.compare.ceiling import ceiling_values, pair_means
-from calibrate.compare.field import Field
-from calibrate.compare.similarity import binary_scores
-from calibrate.fit.captures import Grid, Pressed, read_presses
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.paper import Footprint
-from sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.calibrate.compare.ceiling import ceiling_values, pair_means
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
 
 PX_MM, SIZE_PX = 0.3, 128
 LEFT_MM, TOP_MM = 29.1, 19.2

@@ -14,10 +14,10 @@ import numpy as np
 
 from bench.brushfit_families import BRUSHES, FAMILIES, made_up
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, bristles, grid
-from calibrate.fit.captures import Grid, Pressed
-from calibrate.fit.fit import fit_presses
-from calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, about
-from model.fitted import NAMES, published
+from brushloop.calibrate.fit.captures import Grid, Pressed
+from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, about
+from brushloop.model.fitted import NAMES, published
 
 BRISTLE = "bristle simulation"
 STAGES = (

@@ -6,10 +6,10 @@ import asyncio
 import itertools
 
 from bench.harness import Result, percentile
-from collect.rig.config import RigConfig
-from collect.rig.devices import make_robot
-from drivers.clock import HostClock
-from drivers.samples import PoseSample
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import make_robot
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.samples import PoseSample
 
 PERIOD_MS = 10.0
 TURNS = 4

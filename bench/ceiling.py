@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLES, CELLS, simulated
 from bench.harness import Result
-from calibrate.compare.ceiling import average, ceiling_values, pair_means
-from calibrate.compare.compiled import compare
-from calibrate.compare.field import SIZE_PX
+from brushloop.calibrate.compare.ceiling import average, ceiling_values, pair_means
+from brushloop.calibrate.compare.compiled import compare
+from brushloop.calibrate.compare.field import SIZE_PX
 
 SESSIONS = 40
 PRESSES = 28

@@ -18,26 +18,26 @@ from numpy.typing import NDArray
 
 from bench.brushfit_brushes import FROZEN
 from bench.harness import Result, machine
-from calibrate.calibration import Calibration
-from calibrate.compare.field import SIZE_PX, Alignment, Tone
-from calibrate.compare.similarity import Polarity
-from calibrate.writing.compare import WritingComparison, as_ink
-from calibrate.writing.learn import learned
-from calibrate.writing.plan import Settings, plan
-from calibrate.writing.plan_files import record_of
-from calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, arrays
-from calibrate.writing.practice import PER_FIGURE, practice_strokes
-from calibrate.writing.rounds import lost_in_words, round_of
-from calibrate.writing.scores import HEADLINE, Character, compare_ink
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.drag import Waypoint
-from drivers.sim.brush_file import PAPER, load_brush
-from model.brush import Brush as Size
-from model.characters.brush import Reach
-from model.characters.plan import grid, without_tilt
-from model.footprint import Footprint, fit_footprint
-from model.strokes import stroke_model
-from sessions.recording.schemas import Header, Source
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import SIZE_PX, Alignment, Tone
+from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.writing.compare import WritingComparison, as_ink
+from brushloop.calibrate.writing.learn import learned
+from brushloop.calibrate.writing.plan import Settings, plan
+from brushloop.calibrate.writing.plan_files import record_of
+from brushloop.calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, arrays
+from brushloop.calibrate.writing.practice import PER_FIGURE, practice_strokes
+from brushloop.calibrate.writing.rounds import lost_in_words, round_of
+from brushloop.calibrate.writing.scores import HEADLINE, Character, compare_ink
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.drag import Waypoint
+from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.model.brush import Brush as Size
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.plan import grid, without_tilt
+from brushloop.model.footprint import Footprint, fit_footprint
+from brushloop.model.strokes import stroke_model
+from brushloop.sessions.recording.schemas import Header, Source
 
 Floats = NDArray[np.float64]
 CHARACTERS, ROUNDS, WRITINGS, IN_A_ROUND = "字子永", 3, 10, 2

@@ -18,11 +18,11 @@ from bench.brushfit_families import BRUSHES, FAMILIES, made_up
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, REPEATS, BrushPresses, Chosen, bristles, grid, simulated
 from bench.brushfit_prior import BRISTLE
 from bench.harness import Result
-from calibrate.fit.captures import Pressed
-from calibrate.fit.fit import fit_presses, touch_errors, zero_touches
-from calibrate.fit.prior import Prior, learned
-from calibrate.fit.run import touch_estimates
-from calibrate.fit.sizes import Estimate, measure, middle, plane_at, sizes_of
+from brushloop.calibrate.fit.captures import Pressed
+from brushloop.calibrate.fit.fit import fit_presses, touch_errors, zero_touches
+from brushloop.calibrate.fit.prior import Prior, learned
+from brushloop.calibrate.fit.run import touch_estimates
+from brushloop.calibrate.fit.sizes import Estimate, measure, middle, plane_at, sizes_of
 
 DRAWS = 12
 SESSIONS = (5, 7, 9, 12)

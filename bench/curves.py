@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from bench.harness import Result, machine
-from model.generator.targets import PRESETS
-from model.train.checkpoint import State
-from model.train.config import LayerConfig, TrainConfig, preset
-from model.train.data import exact_sets
-from model.train.loop import Validation, new_state, train
+from brushloop.model.generator.targets import PRESETS
+from brushloop.model.train.checkpoint import State
+from brushloop.model.train.config import LayerConfig, TrainConfig, preset
+from brushloop.model.train.data import exact_sets
+from brushloop.model.train.loop import Validation, new_state, train
 
 STEPS = 1000
 CHECKS = 25

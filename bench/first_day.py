@@ -18,14 +18,14 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
-from collect.teach.day import Day
-from collect.teach.guide import Target
-from collect.teach.watch import watched
-from collect.teach.wizard import Wizard
-from collect.tui.teach_app import TeachApp
-from collect.tui.teach_guide import Question, ScreenGuide
-from drivers.clock import HostClock
-from drivers.sim.lab.lab import UnknownLab
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Target
+from brushloop.collect.teach.watch import watched
+from brushloop.collect.teach.wizard import Wizard
+from brushloop.collect.tui.teach_app import TeachApp
+from brushloop.collect.tui.teach_guide import Question, ScreenGuide
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.lab.lab import UnknownLab
 
 SIZE = (120, 34)
 RATE = 4.0

@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.paper import Footprint
-from model.brush import Brush as ModelBrush
-from model.ccdbsm import ccdbsm
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.model.brush import Brush as ModelBrush
+from brushloop.model.ccdbsm import ccdbsm
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "loopback-brush.png"
 HEIGHTS_MM = tuple(range(11, 21))

@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from bench.harness import Result, interleave, machine
 from bench.learning_to_paint import LearningToPaint
-from model.generator.metrics import Quality, quality
-from model.generator.network import Generator
-from model.train.checkpoint import State, put_weights
-from model.train.config import TrainConfig, preset
-from model.train.data import Exact, batch_numbers, batches, exact_sets
-from model.train.loop import Validation, learning_rate, new_state, train
+from brushloop.model.generator.metrics import Quality, quality
+from brushloop.model.generator.network import Generator
+from brushloop.model.train.checkpoint import State, put_weights
+from brushloop.model.train.config import TrainConfig, preset
+from brushloop.model.train.data import Exact, batch_numbers, batches, exact_sets
+from brushloop.model.train.loop import Validation, learning_rate, new_state, train
 
 BUDGET_S = 360
 PEER_RATE = 1e-3

@@ -26,8 +26,8 @@ from bench import table
 from bench.harness import BenchError, Result, machine
 from bench.peak import Used, measure
 from bench.press_sessions import CLOSE, STILL, Presses, photographs, session, write_table
-from calibrate.artefact import current
-from calibrate.fit.artefact import FOLDER as FITS
+from brushloop.calibrate.artefact import current
+from brushloop.calibrate.fit.artefact import FOLDER as FITS
 
 SIZES = (100, 300, 1000, 5000, 20_000)
 LARGEST = 300
@@ -165,7 +165,7 @@ def kept(measured_now: Sequence[Point], path: Path = POINTS) -> list[Point]:
             )
     points |= {(point.view, point.command, point.strokes): point for point in measured_now}
     with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
+        writer = csv.writer(file, lineterminator="\n")  # noqa: TID251
         writer.writerow(COLUMNS)
         for (view, command, strokes), point in points.items():
             used = point.used

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from bench.harness import Result, machine
 from bench.inversion_autograd import invert_rendered
 from bench.inversion_commands import intervals
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
-from model.inversion.noise import Noise
-from model.inversion.press import Flag, Inverter, Known, Range, Recovered
-from model.protocol import Basis
-from model.raster.compiled import coverage_numpy
-from model.raster.exact import coverage_at
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.inversion.noise import Noise
+from brushloop.model.inversion.press import Flag, Inverter, Known, Range, Recovered
+from brushloop.model.protocol import Basis
+from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster.exact import coverage_at
 
 Floats = NDArray[np.float64]
 DRAWS, BATCH, SLOW = 500, 50, 50

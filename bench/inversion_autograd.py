@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.inversion.forward import BLOCK_PX, PARAMETERS, Floats, Images, Normal, Rows
-from model.inversion.noise import Noise
-from model.inversion.press import TABLE_DEPTHS, TABLE_TILTS, Range, Recovered, limits_of, recover
-from model.inversion.start import MIN_INK_MM2, Table, moments_of
-from model.raster.frame import PX_MM
+from brushloop.model.inversion.forward import BLOCK_PX, PARAMETERS, Floats, Images, Normal, Rows
+from brushloop.model.inversion.noise import Noise
+from brushloop.model.inversion.press import TABLE_DEPTHS, TABLE_TILTS, Range, Recovered, limits_of, recover
+from brushloop.model.inversion.start import MIN_INK_MM2, Table, moments_of
+from brushloop.model.raster.frame import PX_MM
 
 Render = Callable[[Tensor], Tensor]
 

@@ -19,14 +19,14 @@ from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, PX_MM, SIZE_PX, BrushPresses, bristles, simulated
 from bench.brushfit_prior import BRISTLE
 from bench.harness import BenchError, Result
-from calibrate.compare.field import Field
-from calibrate.fit.fit import fit_presses
-from calibrate.fit.prior import Prior, learned
-from calibrate.invert.invert import USELESS, Row, with_model_error
-from model.fitted import NAMES
-from model.fitted_shape import fitted_model
-from model.inversion.noise import Noise
-from model.inversion.press import Inverter, Known, Range
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.prior import Prior, learned
+from brushloop.calibrate.invert.invert import USELESS, Row, with_model_error
+from brushloop.model.fitted import NAMES
+from brushloop.model.fitted_shape import fitted_model
+from brushloop.model.inversion.noise import Noise
+from brushloop.model.inversion.press import Inverter, Known, Range
 
 FITTED_CELLS, PRESSES = 9, 4
 """Cells that the brush is fitted to, and presses of each cell that are used."""

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from bench.brushfit_brushes import FROZEN
 from bench.processes import lines_of_input, tell
-from drivers.sim.brush_file import PAPER, load_brush
-from drivers.sim.config import SimConfig
-from drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import LoopbackRig
 
 
 async def serve(path: Path, brush: str, rate: float, seed: int | None = None) -> None:

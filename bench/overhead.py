@@ -109,7 +109,7 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
 
 def share_out(spans: Spans, begin_s: float, end_s: float) -> dict[str, float]:
     """Seconds of [begin, end] by part; an instant that no part covers is `the rest`."""
-    from drivers.sim.arm.motion import STEADY_LAG_S
+    from brushloop.drivers.sim.arm.motion import STEADY_LAG_S
 
     moves = [_around(move, spans["motion"]) for move in spans["move"]]
     parts = dict(spans) | {
@@ -137,9 +137,9 @@ def _around(move: Span, motion: list[Span]) -> tuple[Span, Span]:
 
 
 def _collect(folder: Path) -> None:
-    from collect.engine.engine import Engine
-    from collect.engine.open_or_resume import Opening, find_resumable, open_store
-    from drivers.clock import HostClock
+    from brushloop.collect.engine.engine import Engine
+    from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
+    from brushloop.drivers.clock import HostClock
 
     opening = Opening.load(folder / "sessions", folder / "rig.toml", folder / "protocol.toml")
     resume, clock = find_resumable(opening), HostClock()
@@ -156,13 +156,13 @@ def _collect(folder: Path) -> None:
 @contextlib.contextmanager
 def _watching(watch: Watch) -> Iterator[None]:
     """Note when each part begins and ends."""
-    from collect.engine.perform import Performer
-    from collect.engine.recorder import Recorder
-    from collect.engine.steps import capture as capturing
-    from collect.engine.steps import dip as dipping
-    from drivers.arcs.robot import AuboArcs
-    from drivers.camera import OpenCvCamera
-    from sessions.store import SessionStore
+    from brushloop.collect.engine.perform import Performer
+    from brushloop.collect.engine.recorder import Recorder
+    from brushloop.collect.engine.steps import capture as capturing
+    from brushloop.collect.engine.steps import dip as dipping
+    from brushloop.drivers.arcs.robot import AuboArcs
+    from brushloop.drivers.camera import OpenCvCamera
+    from brushloop.sessions.store import SessionStore
 
     def noted(function: Callable[..., Any], part: str | None) -> Callable[..., Any]:
         async def later(*arguments: Any, **options: Any) -> Any:
@@ -216,9 +216,9 @@ def _motion(controller: Process) -> list[Span]:
 
 async def _controller(path: Path, seed: int) -> None:
     """Serves the rig; each line on the input is answered with the spans of time in which the arm moved."""
-    from collect.rig.config_devices import MOST_STALE_LOOPBACK_MS
-    from drivers.sim.config import SimConfig
-    from drivers.sim.rig import LoopbackRig
+    from brushloop.collect.rig.config_devices import MOST_STALE_LOOPBACK_MS
+    from brushloop.drivers.sim.config import SimConfig
+    from brushloop.drivers.sim.rig import LoopbackRig
 
     spans: list[Span] = []
     async with LoopbackRig(SimConfig(seed=seed + 1)) as rig:

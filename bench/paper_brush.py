@@ -15,12 +15,12 @@ from pathlib import Path
 from bench.harness import BenchError, Result
 from bench.press_sessions import CELLS, Presses, session
 from bench.processes import brushloop
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.paper import TABLE_2
-from calibrate.validate.report.data import Report, load_report
-from calibrate.validate.run import ANOTHER
-from drivers.sim.brush_file import PAPER, load_brush
-from model.train import SHIPPED_GENERATOR
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.paper import TABLE_2
+from brushloop.calibrate.validate.report.data import Report, load_report
+from brushloop.calibrate.validate.run import ANOTHER
+from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.model.train import SHIPPED_GENERATOR
 
 REPEATS = 10
 """Presses of each cell, as in the paper."""

@@ -29,20 +29,20 @@ import numpy as np
 
 from bench.harness import machine, percentile
 from bench.processes import ROOT, lines_of_input, started, tell
-from collect.errors import StepError
-from collect.motion.moves import press_moves
-from collect.motion.procedures import Procedures
-from collect.photograph import frames as frames_of
-from collect.rig.config import RigConfig
-from collect.rig.devices import connected
-from collect.rig.paper import Sheet
-from drivers.camera.opencv import OpenCvCamera
-from drivers.clock import HostClock
-from drivers.errors import DeviceError
-from drivers.samples import Frame, Stamp
-from drivers.sim.camera.scene import STRIP_PX, read_strip
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import LoopbackRig
+from brushloop.collect.errors import StepError
+from brushloop.collect.motion.moves import press_moves
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.photograph import frames as frames_of
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import connected
+from brushloop.collect.rig.paper import Sheet
+from brushloop.drivers.camera.opencv import OpenCvCamera
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.samples import Frame, Stamp
+from brushloop.drivers.sim.camera.scene import STRIP_PX, read_strip
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
 
 EACH = 30
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.12, fps=20.0, stamp_strip=True)

@@ -16,10 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
-from model.raster.exact import coverage_at
-from model.raster.frame import to_pixels
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import to_pixels
 
 SIZE_PX, PX_MM = 16, 1.6
 ORIGIN_MM = (17.0, 16.8)

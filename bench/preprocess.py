@@ -13,9 +13,9 @@ import skimage.transform
 from numpy.typing import NDArray
 
 from bench.harness import Result, interleave, machine
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import rectify
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import rectify
 
 SIDE_MM = 25.6
 SIZE_PX = 128

@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.spec import BoardSpec
-from drivers.geometry import brush_pose
-from drivers.sim.brush.brush import BrushSpec
-from drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
-from drivers.sim.camera.optics import Optics
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.world import World
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.brush.brush import BrushSpec
+from brushloop.drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
+from brushloop.drivers.sim.camera.optics import Optics
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.world import World
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]

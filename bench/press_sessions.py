@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import Field
-from calibrate.validate.jobs import PrepareJob, Press, prepare_job
-from drivers.sim.brush.brush import Brush, BrushSpec
-from sessions.imports.photographs import ImportOptions, import_photographs
-from sessions.reader import Recording
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.reader import Recording
 
 CELLS = tuple((height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0))
 PX_MM = 10.0

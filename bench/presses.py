@@ -8,14 +8,14 @@ import time
 
 from bench.harness import BenchError, Result
 from bench.processes import Process
-from collect.rig.config import RigConfig
-from collect.rig.devices import make_robot
-from collect.rig.paper import to_base
-from drivers.arcs.robot import AuboArcs
-from drivers.clock import HostClock
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
-from drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import make_robot
+from brushloop.collect.rig.paper import to_base
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 
 HEIGHTS_MM = tuple(range(11, 21))
 TILTS_DEG = (0.0, 5.0, 10.0)

@@ -85,8 +85,8 @@ def tell(line: str) -> None:
 
 
 async def _controller(path: Path, rate: float) -> None:
-    from drivers.sim.config import SimConfig
-    from drivers.sim.rig import LoopbackRig
+    from brushloop.drivers.sim.config import SimConfig
+    from brushloop.drivers.sim.rig import LoopbackRig
 
     async with LoopbackRig(SimConfig(rate=rate, force_sensor=False, ink_device="none")) as rig:
         path.write_text(rig.toml(), encoding="utf-8")

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 from bench.harness import BenchError, Result, percentile
 from bench.quality_set import Patch, Sample, draw_set
-from collect.quality.checks import cell_is_blank, check_capture
-from collect.quality.verdict import Failure
-from collect.rig.config_quality import QualityConfig
+from brushloop.collect.quality.checks import cell_is_blank, check_capture
+from brushloop.collect.quality.verdict import Failure
+from brushloop.collect.rig.config_quality import QualityConfig
 
 GOAL = 0.95
 """Precision and recall of each failure."""

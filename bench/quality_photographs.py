@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from bench.harness import BenchError
-from calibrate.board.lens import unknown_lens
-from calibrate.board.pix2len import Plane
-from collect.quality.checks import check_capture
-from collect.quality.verdict import Failure, Verdict
-from collect.rig.config_quality import QualityConfig
-from collect.rig.paper import Cell
+from brushloop.calibrate.board.lens import unknown_lens
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.collect.quality.checks import check_capture
+from brushloop.collect.quality.verdict import Failure, Verdict
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.paper import Cell
 
 WHITENED = QualityConfig(bright_level=256.0, glare_mm2=1e6)
 """For paper that whoever published it has set to 255: neither exposure nor glare can be judged."""

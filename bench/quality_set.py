@@ -15,19 +15,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.pix2len import Plane
-from calibrate.board.spec import BoardSpec
-from calibrate.board.view import see_board
-from collect.quality.verdict import Failure
-from collect.rig.config import PaperConfig
-from collect.rig.paper import Cell, Sheet
-from drivers.geometry import brush_pose
-from drivers.sim.brush.brush import BrushSpec, Flaw
-from drivers.sim.brush.drag import Waypoint
-from drivers.sim.brush.paper import PX_PER_MM, Footprint
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.world import World
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.board.view import see_board
+from brushloop.collect.quality.verdict import Failure
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.paper import Cell, Sheet
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.brush.brush import BrushSpec, Flaw
+from brushloop.drivers.sim.brush.drag import Waypoint
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.world import World
 
 Gray = NDArray[np.uint8]
 GOOD_SHARE = 0.4

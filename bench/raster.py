@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.harness import Result, interleave, machine
-from model.brush import Brush
-from model.ccdbsm import CcdBsm, ccdbsm
-from model.press_images import press_images
-from model.raster.compiled import coverage_numpy
-from model.raster.exact import coverage_at
-from model.raster.frame import PX_MM, SIZE_PX, centred_origin, to_pixels
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import CcdBsm, ccdbsm
+from brushloop.model.press_images import press_images
+from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import PX_MM, SIZE_PX, centred_origin, to_pixels
 
 BATCH = 64
 BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a training set

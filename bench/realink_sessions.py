@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from bench.harness import BenchError, Result, machine
 from bench.realink_network import train_and_predict
 from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
-from calibrate.compare.similarity import binary_scores
-from calibrate.drags.captures import Drawn
-from calibrate.drags.predict import BETWEEN_SESSIONS, Predictor, learn
-from calibrate.drags.predicted import correction_helps
-from calibrate.drags.residual import captured_distance, clipped
-from calibrate.drags.run import adapt, different
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.drags.captures import Drawn
+from brushloop.calibrate.drags.predict import BETWEEN_SESSIONS, Predictor, learn
+from brushloop.calibrate.drags.predicted import correction_helps
+from brushloop.calibrate.drags.residual import captured_distance, clipped
+from brushloop.calibrate.drags.run import adapt, different
 
 SESSION_SPLITS = 5
 STROKES = 90

@@ -19,9 +19,9 @@ NAMES = {"number": "number", "integer": "whole number", "string": "text", "boole
 
 def commands() -> str:
     """Page with every command, its arguments and its options."""
-    import brushloop
+    import brushloop.__main__
 
-    root = typer.main.get_command(brushloop.app)
+    root = typer.main.get_command(brushloop.__main__.app)
     intro = (
         "Made from the code: what `--help` says of each command. Exit codes are on [their own page](../exit-codes.md)."
     )
@@ -30,7 +30,7 @@ def commands() -> str:
 
 def rig() -> str:
     """Page with every field of `rig.toml`."""
-    from collect.rig.config import RigConfig
+    from brushloop.collect.rig.config import RigConfig
 
     intro = "Made from the code. What the tables are for is explained in [configuration](../configuration.md)."
     return "\n\n".join(["# Fields of rig.toml", intro, *_model(RigConfig, "")]) + "\n"
@@ -38,7 +38,7 @@ def rig() -> str:
 
 def protocol() -> str:
     """Page with every field of each kind of `protocol.toml`."""
-    from collect.protocols.config import ProtocolConfig
+    from brushloop.collect.protocols.config import ProtocolConfig
 
     intro = "Made from the code. What the kinds do is explained in [protocols](../protocols.md)."
     kinds = [part for model in get_args(ProtocolConfig) for part in _model(model, f'kind = "{_kind(model)}"')]

@@ -13,9 +13,9 @@ from pathlib import Path
 from bench import cadence, presses, stops
 from bench.harness import Result, machine, percentile
 from bench.processes import HOST, started
-from collect.rig.config import RigConfig, load_rig
-from drivers.arcs.framing import encode
-from drivers.arcs.rpc import Framing, RpcConnection, encode_request, request_id
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.drivers.arcs.framing import encode
+from brushloop.drivers.arcs.rpc import Framing, RpcConnection, encode_request, request_id
 
 BLOCK = 50
 """Calls of one kind before it is another kind's turn."""

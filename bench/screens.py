@@ -20,21 +20,21 @@ from pathlib import Path
 from textual.pilot import Pilot
 
 from bench.moving import write_moving
-from collect.engine.control import State
-from collect.errors import CollectAborted
-from collect.start import engine_for
-from collect.tui.app import OperatorApp
-from collect.tui.browser import Paths, SessionBrowser
-from collect.tui.capture_screen import CaptureScreen
-from collect.tui.end_screen import EndScreen
-from collect.tui.finish_screen import FinishScreen
-from collect.tui.question_screens import AskScreen
-from collect.tui.review_screen import ReviewScreen
-from collect.tui.set_up_screen import SetUpScreen
-from collect.tui.start_screen import StartScreen
-from drivers.sim.brush.flaws import Flaw
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import LoopbackRig
+from brushloop.collect.engine.control import State
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.start import engine_for
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.capture_screen import CaptureScreen
+from brushloop.collect.tui.end_screen import EndScreen
+from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.review_screen import ReviewScreen
+from brushloop.collect.tui.set_up_screen import SetUpScreen
+from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
 
 SIZE = (120, 40)
 SMALL = (80, 24)

@@ -15,12 +15,12 @@ from contextlib import asynccontextmanager
 
 from bench.harness import BenchError, Result, percentile
 from bench.processes import HOST, ROOT
-from collect.rig.config import RigConfig
-from collect.rig.devices import make_robot
-from drivers.arcs.framing import encode
-from drivers.arcs.rpc import encode_request, request_id
-from drivers.clock import HostClock
-from drivers.geometry import brush_pose
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import make_robot
+from brushloop.drivers.arcs.framing import encode
+from brushloop.drivers.arcs.rpc import encode_request, request_id
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.geometry import brush_pose
 
 SPEED_MM_S, ACC_MM_S2 = 20.0, 800.0
 LATEST_KEY_S = 0.02

@@ -162,14 +162,14 @@ def _holds_image(value: Any) -> bool:
 
 def trace(out: Path, arguments: list[str]) -> None:
     """Run one brushloop command in this process and write down the product files that images went through."""
-    import brushloop
+    import brushloop.__main__
 
     tracer = Tracer()
     sys.argv = ["brushloop", *arguments]
     threading.setprofile_all_threads(tracer) if sys.version_info >= (3, 12) else threading.setprofile(tracer)
     sys.setprofile(tracer)
     try:
-        brushloop.main()
+        brushloop.__main__.main()
     finally:
         sys.setprofile(None)
         out.write_text(json.dumps(sorted(tracer.files)), encoding="utf-8")

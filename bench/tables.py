@@ -15,10 +15,10 @@ from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.press_sessions import CELLS, Presses, session
 from bench.processes import brushloop
-from calibrate.compare.ceiling import CEILING
-from calibrate.compare.field import Alignment, Tone
-from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
-from calibrate.validate.report.data import Report, load_report
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT
+from brushloop.calibrate.validate.report.data import Report, load_report
 
 REPEATS, TRAIN_STEPS, TUNE_STEPS = 3, 3000, 300
 PUBLISHED = ("ccd-bsm", "bezier", "ellipse", "line", "circle")

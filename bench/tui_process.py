@@ -67,7 +67,7 @@ class Values:
     def __init__(self, file: Path) -> None:
         import numpy as np
 
-        from collect.engine.telemetry import TRACE_SLOTS
+        from brushloop.collect.engine.telemetry import TRACE_SLOTS
 
         self._values = np.memmap(file, np.float64, "r+" if file.exists() else "w+", shape=(TRACE_SLOTS + 4,))
 
@@ -84,8 +84,8 @@ class Values:
 
 def feed(file: Path) -> None:
     """Telemetry at a rig's rates, until the input ends: the load, in a process that nobody is charged for."""
-    from collect.engine.telemetry import Telemetry
-    from drivers.samples import ForceSample, Stamp
+    from brushloop.collect.engine.telemetry import Telemetry
+    from brushloop.drivers.samples import ForceSample, Stamp
 
     telemetry, values, over = Telemetry(), Values(file), threading.Event()
 
@@ -116,8 +116,8 @@ def busy_engine(values: Values) -> Any:
     """An engine without an arm whose telemetry comes at a rig's rates."""
     import numpy as np
 
-    from collect.engine.control import State
-    from collect.engine.snapshot import CellCount, Picture, Snapshot
+    from brushloop.collect.engine.control import State
+    from brushloop.collect.engine.snapshot import CellCount, Picture, Snapshot
 
     class Busy:
         def __init__(self) -> None:
@@ -167,7 +167,7 @@ def main(kind: str, seconds: float, file: Path) -> None:
         figures = measured(idle, seconds)
         stops_ns = idle.stops_ns
     else:
-        from collect.tui.app import OperatorApp
+        from brushloop.collect.tui.app import OperatorApp
 
         engine = busy_engine(Values(file.with_suffix(LOAD)))
         figures = measured(OperatorApp(engine), seconds)

@@ -12,11 +12,11 @@ from collections.abc import Iterator, Sequence
 from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, simulated
 from bench.harness import BenchError, Result
-from calibrate.compare.ceiling import CEILING
-from calibrate.fit.heldout import BEZIER
-from sessions.progress import shown
-from twin.run import fit_twin, workers
-from twin.score import TWIN
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.fit.heldout import BEZIER
+from brushloop.sessions.progress import shown
+from brushloop.twin.run import fit_twin, workers
+from brushloop.twin.score import TWIN
 
 REPEATS = 3
 """Presses of each cell: 45 in all."""

@@ -28,14 +28,14 @@ from numpy.typing import NDArray
 from bench.harness import BenchError, Result, interleave, machine
 from bench.peak import measure
 from bench.press_sessions import STILL, Presses, pressed, session
-from calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
-from calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
-from calibrate.compare.similarity import csim, ssim
-from calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prepare_job, score_job
-from calibrate.validate.pool import Dask, Threads
-from model.brush import Brush as Bundle
-from model.strokes import stroke_models
-from sessions.reader import Recording
+from brushloop.calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
+from brushloop.calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
+from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prepare_job, score_job
+from brushloop.calibrate.validate.pool import Dask, Threads
+from brushloop.model.brush import Brush as Bundle
+from brushloop.model.strokes import stroke_models
+from brushloop.sessions.reader import Recording
 
 STROKES = 60
 FEW = 4

@@ -19,11 +19,11 @@ from pathlib import Path
 from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.processes import ROOT, Process, started
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.similarity import Polarity
-from calibrate.writing.report import TABLE
-from calibrate.writing.scores import ANOTHER, HEADLINE, REFERENCE, SIMULATED, Table3Row, read_written
-from drivers.sim.brush_file import PAPER
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.writing.report import TABLE
+from brushloop.calibrate.writing.scores import ANOTHER, HEADLINE, REFERENCE, SIMULATED, Table3Row, read_written
+from brushloop.drivers.sim.brush_file import PAPER
 
 CHARACTERS, WRITINGS, ROUNDS = "字子永", 10, 3
 BRUSHES = (PAPER, *map(str, range(len(FROZEN))))

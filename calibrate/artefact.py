@@ -16,8 +16,8 @@ from typing import Any, ClassVar, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calibrate.errors import CalibrationError, invalid
-from calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import read_bounded, write_whole
 
 FOLDER = "calibration"
 """Folder of a session that holds its calibrations."""

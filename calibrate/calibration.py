@@ -7,10 +7,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import Artefact, Frozen
-from calibrate.board.lens import LensUsed
-from calibrate.board.pix2len import apply
-from calibrate.board.spec import BoardSpec
+from brushloop.calibrate.artefact import Artefact, Frozen
+from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.pix2len import apply
+from brushloop.calibrate.board.spec import BoardSpec
 
 SCHEMA_VERSION = 2
 """Version 2 adds the lens, the board, the still, and whether the calibration was made for another session."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrate.path_or_command import PathOrCommand
-from sessions.terminal import say
+from brushloop.calibrate.path_or_command import PathOrCommand
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from sessions.export.rows import Cropper
-    from sessions.reader import Recording
+    from brushloop.sessions.export.rows import Cropper
+    from brushloop.sessions.reader import Recording
 
 LEFT_OUT = 3
 """Exit code of an export that left strokes out."""
@@ -26,12 +26,12 @@ def calibrate(
 ) -> None:
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
 
-    from calibrate.artefact import load_artefact
-    from calibrate.calibration import Calibration
-    from calibrate.pages.calibration import write_calibration_page
-    from calibrate.session import calibrate_session
-    from sessions.progress import shown
-    from sessions.reader import Recording
+    from brushloop.calibrate.artefact import load_artefact
+    from brushloop.calibrate.calibration import Calibration
+    from brushloop.calibrate.pages.calibration import write_calibration_page
+    from brushloop.calibrate.session import calibrate_session
+    from brushloop.sessions.progress import shown
+    from brushloop.sessions.reader import Recording
 
     with shown() as progress:
         path = calibrate_session(session, lens, progress)
@@ -59,7 +59,7 @@ def show(
     artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
 ) -> None:
     """Show the contents of an artefact, or of the calibration that a session uses."""
-    from calibrate.describe import described, read_any
+    from brushloop.calibrate.describe import described, read_any
 
     path, made = read_any(artefact)
     say(str(path), *described(made))
@@ -71,7 +71,7 @@ def diff(
     other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
 ) -> None:
     """Show how two artefacts differ, and for calibrations what that means on the paper."""
-    from calibrate.describe import differences, read_any
+    from brushloop.calibrate.describe import differences, read_any
 
     lines = differences(read_any(one)[1], read_any(other)[1])
     say(*(lines or ["they are equal"]))
@@ -86,9 +86,9 @@ def apply_to(
     ] = False,
 ) -> None:
     """Use a calibration for a session from now on; another session's needs --force."""
-    from calibrate.artefact import load_artefact
-    from calibrate.calibration import Calibration
-    from calibrate.session import apply_calibration
+    from brushloop.calibrate.artefact import load_artefact
+    from brushloop.calibrate.calibration import Calibration
+    from brushloop.calibrate.session import apply_calibration
 
     path = apply_calibration(calibration, session, force=force)
     if label := load_artefact(path, Calibration).label:
@@ -106,9 +106,9 @@ def preprocess(
     out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
 ) -> None:
     """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
-    from calibrate.files import check_target
-    from calibrate.show_stages import show_photograph, show_stroke
-    from sessions.progress import shown
+    from brushloop.calibrate.files import check_target
+    from brushloop.calibrate.show_stages import show_photograph, show_stroke
+    from brushloop.sessions.progress import shown
 
     check_target(out, ".png", capture, before)
     if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
@@ -126,7 +126,7 @@ def preprocess(
 def training_page(folder: Path | None, **_: object) -> None:
     """Write the page of a finished training; `folder` is what the commands of `brushloop train` return."""
     if folder is not None:
-        from calibrate.pages.training import write_training_page
+        from brushloop.calibrate.pages.training import write_training_page
 
         say(f"Page: {write_training_page(folder)}")
 
@@ -147,15 +147,15 @@ def export(
 
     Ends with exit code 3 if strokes could not be cropped; they are named.
     """
-    from calibrate.errors import CalibrationError
-    from sessions.export.export import export as write
-    from sessions.progress import shown
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.sessions.export.export import export as write
+    from brushloop.sessions.progress import shown
 
     if not crops and (frames or calibration is not None):
         raise CalibrationError("--frames" if frames else "--calibration", "needs --crops")
 
     def make_cropper(recording: Recording) -> Cropper:
-        from calibrate.crops import cropper_of
+        from brushloop.calibrate.crops import cropper_of
 
         return cropper_of(recording, calibration)
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sessions.terminal import say
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from calibrate.board.spec import Board
+    from brushloop.calibrate.board.spec import Board
 
 
 class Kind(StrEnum):
@@ -45,8 +45,8 @@ def board(
     page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
 ) -> None:
     """Write a printable board as a PDF at true scale, with a ruler to check the print."""
-    from calibrate.board.pdf import write_pdf
-    from calibrate.board.spec import describe
+    from brushloop.calibrate.board.pdf import write_pdf
+    from brushloop.calibrate.board.spec import describe
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     say(f"{write_pdf(made, out, page)}: {describe(made)}")
@@ -69,15 +69,15 @@ def intrinsics(
     """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
     import hashlib
 
-    from calibrate.artefact import made_by
-    from calibrate.board.artefact import lens_file
-    from calibrate.board.detect import BoardView, find_board
-    from calibrate.board.intrinsics import fit_lens, named
-    from calibrate.board.spec import describe
-    from calibrate.errors import CalibrationError
-    from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
-    from calibrate.pages.lens import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
-    from sessions.progress import counted, shown
+    from brushloop.calibrate.artefact import made_by
+    from brushloop.calibrate.board.artefact import lens_file
+    from brushloop.calibrate.board.detect import BoardView, find_board
+    from brushloop.calibrate.board.intrinsics import fit_lens, named
+    from brushloop.calibrate.board.spec import describe
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+    from brushloop.calibrate.pages.lens import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
+    from brushloop.sessions.progress import counted, shown
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
@@ -126,11 +126,11 @@ def check(
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
 ) -> None:
     """Measure pix2len with its interval on one photograph of the board before a session. Exit code 5 on warnings."""
-    from calibrate.artefact import load_artefact
-    from calibrate.board.artefact import LensFile
-    from calibrate.board.spec import BoardSpec
-    from calibrate.board.view import preflight
-    from calibrate.files import read_gray
+    from brushloop.calibrate.artefact import load_artefact
+    from brushloop.calibrate.board.artefact import LensFile
+    from brushloop.calibrate.board.spec import BoardSpec
+    from brushloop.calibrate.board.view import preflight
+    from brushloop.calibrate.files import read_gray
 
     spec = _board("", charuco, square_mm, marker_mm, dictionary)
     assert isinstance(spec, BoardSpec)
@@ -152,10 +152,10 @@ def drift(
     lens: LensOption = None,
 ) -> None:
     """Show pix2len at each view of the board in a session, and its trend. Exit code 5 on warnings."""
-    from calibrate.board.drift import board_over_session
-    from calibrate.board.session import board_of, known_lens
-    from sessions.progress import shown
-    from sessions.reader import Recording
+    from brushloop.calibrate.board.drift import board_over_session
+    from brushloop.calibrate.board.session import board_of, known_lens
+    from brushloop.sessions.progress import shown
+    from brushloop.sessions.reader import Recording
 
     recording = Recording(session)
     known = known_lens(recording, lens)
@@ -202,15 +202,15 @@ def register(
     """Locate the paper in the robot's base frame from touched or pressed marks; prints the lines for rig.toml."""
     import hashlib
 
-    from calibrate.artefact import made_by
-    from calibrate.board.artefact import read_lens, registration_file
-    from calibrate.board.register import read_points
-    from calibrate.board.register import register as fit
-    from calibrate.board.rig_file import PaperLines, read_rig
-    from calibrate.board.spec import BoardSpec
-    from calibrate.board.view import calibration_plane
-    from calibrate.errors import CalibrationError
-    from calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+    from brushloop.calibrate.artefact import made_by
+    from brushloop.calibrate.board.artefact import read_lens, registration_file
+    from brushloop.calibrate.board.register import read_points
+    from brushloop.calibrate.board.register import register as fit
+    from brushloop.calibrate.board.rig_file import PaperLines, read_rig
+    from brushloop.calibrate.board.spec import BoardSpec
+    from brushloop.calibrate.board.view import calibration_plane
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
     if write is not None and model is not Kind.RIGID:
         raise CalibrationError("--write", "needs --model rigid: rig.toml holds a place and a rotation but no scale")
@@ -259,8 +259,8 @@ def register(
 def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:
     from pydantic import ValidationError
 
-    from calibrate.board.spec import BoardSpec, Checkerboard
-    from calibrate.errors import CalibrationError, invalid
+    from brushloop.calibrate.board.spec import BoardSpec, Checkerboard
+    from brushloop.calibrate.errors import CalibrationError, invalid
 
     if bool(checkerboard) == bool(charuco):
         raise CalibrationError(
@@ -281,7 +281,7 @@ def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, 
 
 
 def _pair(text: str) -> tuple[int, int]:
-    from calibrate.errors import CalibrationError
+    from brushloop.calibrate.errors import CalibrationError
 
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdigit() and len(part) < 4 for part in parts):

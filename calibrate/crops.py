@@ -8,16 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.calibration import Calibration
-from calibrate.compare.field import Field
-from calibrate.errors import CaptureRefused
-from calibrate.session import calibration_of
-from calibrate.stroke.params import PX_PER_MM, Gray, Params
-from calibrate.stroke.preprocess import preprocess
-from calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
-from sessions.errors import SessionDamaged
-from sessions.export.rows import Crop, Cropper
-from sessions.reader import Capture, Recording
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
+from brushloop.calibrate.stroke.preprocess import preprocess
+from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.export.rows import Crop, Cropper
+from brushloop.sessions.reader import Capture, Recording
 
 
 def cropper_of(recording: Recording, calibration_path: Path | None = None) -> Cropper:

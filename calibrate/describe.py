@@ -9,12 +9,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from calibrate.artefact import Artefact, current, load_artefact
-from calibrate.board.artefact import LensFile, RegistrationFile
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded
-from calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.artefact import Artefact, current, load_artefact
+from brushloop.calibrate.board.artefact import LensFile, RegistrationFile
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded
+from brushloop.calibrate.fit.artefact import BrushFit
 
 KINDS: dict[str, type[Artefact]] = {
     "image_to_paper": Calibration,

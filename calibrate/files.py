@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calibrate.errors import CalibrationError
-from sessions import disk
-from sessions.disk import unwritable
-from sessions.errors import InputError
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.sessions import disk
+from brushloop.sessions.disk import unwritable
+from brushloop.sessions.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,8 +81,8 @@ def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 
 def read_gray(path: Path) -> NDArray[np.uint8]:
     """Read a PNG or JPEG photograph as (h, w) gray. Raises `CalibrationError` for other files and larger ones."""
-    from sessions.errors import SessionDamaged
-    from sessions.recording.messages import decode_gray
+    from brushloop.sessions.errors import SessionDamaged
+    from brushloop.sessions.recording.messages import decode_gray
 
     try:
         return decode_gray(read_bounded(path, MAX_PHOTOGRAPH_BYTES), str(path))

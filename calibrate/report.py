@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from calibrate.artefact import Frozen
-from calibrate.errors import CalibrationError, invalid
-from calibrate.files import read_bounded, write_whole
-from sessions.cells import CsvWriter
-from sessions.recording.schemas import Source
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.sessions.cells import CsvWriter
+from brushloop.sessions.recording.schemas import Source
 
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"

@@ -6,18 +6,18 @@ import dataclasses
 import hashlib
 from pathlib import Path
 
-from calibrate.artefact import current, load_artefact, made_by, put_to_use
-from calibrate.board.detect import find_board
-from calibrate.board.lens import LensUsed, rms
-from calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
-from calibrate.board.view import calibration_plane, paper_mm
-from calibrate.calibration import Calibration, Foreign
-from calibrate.errors import CalibrationError
-from calibrate.stroke.params import Params
-from sessions.progress import Progress, unseen
-from sessions.reader import Recording
-from sessions.recording.messages import decode_gray
-from sessions.recording.schemas import Stroke
+from brushloop.calibrate.artefact import current, load_artefact, made_by, put_to_use
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.lens import LensUsed, rms
+from brushloop.calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
+from brushloop.calibrate.board.view import calibration_plane, paper_mm
+from brushloop.calibrate.calibration import Calibration, Foreign
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke.params import Params
+from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.recording.schemas import Stroke
 
 FITTED = "k1 fitted on the board"
 STEPS = "steps done: read the session, fit the plane, check the file"

@@ -9,22 +9,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.artefact import current
-from calibrate.board.lens import Gray, unknown_lens
-from calibrate.board.pix2len import Plane
-from calibrate.board.session import NO_BOARD, board_of, known_lens
-from calibrate.board.view import calibration_plane
-from calibrate.compare.field import Field
-from calibrate.errors import CalibrationError
-from calibrate.files import read_gray, write_whole
-from calibrate.session import calibration_of
-from calibrate.stages import Trace, contact_sheet, trace_scaled, trace_seen
-from calibrate.stroke.difference import new_stroke
-from calibrate.stroke.params import Params
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Recording
-from sessions.recording.messages import decode_gray
-from sessions.recording.schemas import Stroke
+from brushloop.calibrate.artefact import current
+from brushloop.calibrate.board.lens import Gray, unknown_lens
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.session import NO_BOARD, board_of, known_lens
+from brushloop.calibrate.board.view import calibration_plane
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_gray, write_whole
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stages import Trace, contact_sheet, trace_scaled, trace_seen
+from brushloop.calibrate.stroke.difference import new_stroke
+from brushloop.calibrate.stroke.params import Params
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.recording.schemas import Stroke
 
 PAPER = 255
 PARAMS = Params()

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.board.pix2len import Plane
-from calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
-from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
-from calibrate.stroke.preprocess import preprocess, to_levels
-from calibrate.stroke.rectify import on_raster, on_window, rectify_distorted, rescale
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
+from brushloop.calibrate.stroke.preprocess import preprocess, to_levels
+from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_distorted, rescale
 
 TILE_PX = 300
 CAPTION_PX = 74

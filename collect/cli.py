@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from sessions.terminal import say
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from collect.engine.engine import Engine
-    from collect.engine.open_or_resume import Opening
+    from brushloop.collect.engine.engine import Engine
+    from brushloop.collect.engine.open_or_resume import Opening
 
 app = typer.Typer(invoke_without_command=True, pretty_exceptions_enable=False)
 
@@ -59,9 +59,9 @@ def collect(
         ctx.fail(f"Missing option '{'--config' if config is None else '--protocol'}'.")
     import sys
 
-    from collect import start
-    from collect.engine.live import LiveView
-    from collect.engine.open_or_resume import Opening
+    from brushloop.collect import start
+    from brushloop.collect.engine.live import LiveView
+    from brushloop.collect.engine.open_or_resume import Opening
 
     on_screen = tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()
     if dry_run is not None:
@@ -82,11 +82,11 @@ def collect(
 
 def browse() -> None:
     """Open the start screen: `brushloop` without arguments. The screen appears before the engine is imported."""
-    from collect.tui.browser import Paths, SessionBrowser
-    from collect.tui.runner import run_browser
+    from brushloop.collect.tui.browser import Paths, SessionBrowser
+    from brushloop.collect.tui.runner import run_browser
 
     def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
-        from collect import start
+        from brushloop.collect import start
 
         return start.engine_for(opening, watched=watched, guided=guided, preview=preview)
 
@@ -112,14 +112,14 @@ def plan(
     import asyncio
     import json
 
-    from collect.planning.limit_check import all_poses, check_protocol
-    from collect.planning.summary import make_plan, plan_table
-    from collect.protocols.config import load_protocol
-    from collect.rig.config import load_rig
-    from collect.rig.paper import PaperPlane
+    from brushloop.collect.planning.limit_check import all_poses, check_protocol
+    from brushloop.collect.planning.summary import make_plan, plan_table
+    from brushloop.collect.protocols.config import load_protocol
+    from brushloop.collect.rig.config import load_rig
+    from brushloop.collect.rig.paper import PaperPlane
 
     if picture is not None:
-        from collect.rig.drawing import check_picture
+        from brushloop.collect.rig.drawing import check_picture
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
@@ -129,12 +129,12 @@ def plan(
     made = make_plan(rig, wanted)
     asked = None
     if ask:
-        from collect.planning.limit_check import ask_reach
+        from brushloop.collect.planning.limit_check import ask_reach
 
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_cell=True)
         asked = asyncio.run(ask_reach(config, rig, poses))
     if picture is not None:
-        from collect.planning.picture import draw_plan
+        from brushloop.collect.planning.picture import draw_plan
 
         draw_plan(rig, wanted, made, picture)
     if as_json:
@@ -156,12 +156,12 @@ def doctor(
     import asyncio
     import json
 
-    from collect.rig.config import load_rig
-    from collect.rig.doctor import examine
-    from drivers.clock import HostClock
+    from brushloop.collect.rig.config import load_rig
+    from brushloop.collect.rig.doctor import examine
+    from brushloop.drivers.clock import HostClock
 
     if report is not None:
-        from collect.rig.report import check_report
+        from brushloop.collect.rig.report import check_report
 
         check_report(report)
         if not config.exists() and _first_report(config, report):
@@ -171,11 +171,11 @@ def doctor(
     if as_json:
         say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
-        from collect.rig.doctor import doctor_table
+        from brushloop.collect.rig.doctor import doctor_table
 
         say(doctor_table(findings))
     if report is not None:
-        from collect.rig.report import write_report
+        from brushloop.collect.rig.report import write_report
 
         asyncio.run(write_report(report, rig, findings))
         say(f"{report} holds what was asked and answered. Read it before you send it.", err=as_json)
@@ -187,8 +187,8 @@ def _first_report(config: Path, report: Path) -> bool:
     """Write the archive from what was taught so far, where there is no rig.toml yet; False if nothing was."""
     import asyncio
 
-    from collect.teach.report import write_first_report
-    from collect.teach.store import TaughtFile
+    from brushloop.collect.teach.report import write_first_report
+    from brushloop.collect.teach.store import TaughtFile
 
     taught = TaughtFile(config)
     if not taught.path.exists():
@@ -213,9 +213,9 @@ def loop(
     tui: Tui = None,
 ) -> None:
     """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
-    from collect.chains.commands import CommandFailed
-    from collect.chains.loop import LoopRequest, run_loop
-    from sessions.reader import Recording
+    from brushloop.collect.chains.commands import CommandFailed
+    from brushloop.collect.chains.loop import LoopRequest, run_loop
+    from brushloop.sessions.reader import Recording
 
     options = _collect_options(arm=arm, tui=tui)
     folder = out if out is not None else Recording(session).path.parent / "loop"
@@ -245,8 +245,8 @@ def write(
     tui: Tui = None,
 ) -> None:
     """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
-    from collect.chains.commands import CommandFailed
-    from collect.chains.writing import Writing, WritingRequest
+    from brushloop.collect.chains.commands import CommandFailed
+    from brushloop.collect.chains.writing import Writing, WritingRequest
 
     plan_options = ["--cell-mm", str(cell_mm), "--speed-mm-s", str(speed_mm_s)]
     plan_options += [] if data is None else ["--data", str(data)]

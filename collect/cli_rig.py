@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sessions.terminal import say
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from collect.tui.teach_guide import ScreenGuide
+    from brushloop.collect.tui.teach_guide import ScreenGuide
 
 app = typer.Typer(
     help="Teach a rig on its first day; show and check its rig.toml.",
@@ -51,17 +51,17 @@ def teach(
 def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
     import sys
 
-    from collect.errors import ConfigError
-    from collect.tui.teach_app import run_teaching
-    from drivers.clock import HostClock
+    from brushloop.collect.errors import ConfigError
+    from brushloop.collect.tui.teach_app import run_teaching
+    from brushloop.drivers.clock import HostClock
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
 
     async def watched_day(guide: ScreenGuide) -> Path | None:
-        from collect.teach.day import Day
-        from collect.teach.watch import watched
-        from collect.teach.wizard import Wizard
+        from brushloop.collect.teach.day import Day
+        from brushloop.collect.teach.watch import watched
+        from brushloop.collect.teach.wizard import Wizard
 
         day = Day(guide, rig, HostClock(), armed=arm)
         async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
@@ -83,15 +83,15 @@ def show(
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
     import json
 
-    from collect.rig.config import load_rig
-    from collect.rig.drawing import check_picture
-    from collect.rig.show import rig_json, rig_table
+    from brushloop.collect.rig.config import load_rig
+    from brushloop.collect.rig.drawing import check_picture
+    from brushloop.collect.rig.show import rig_json, rig_table
 
     if picture is not None:
         check_picture(picture)
     config = load_rig(rig)
     if picture is not None:
-        from collect.rig.picture import draw_rig
+        from brushloop.collect.rig.picture import draw_rig
 
         draw_rig(config, picture)
     say(json.dumps(rig_json(config)) if as_json else rig_table(config))
@@ -105,9 +105,9 @@ def check(rig: RigFile, as_json: Json = False) -> None:
     """
     import json
 
-    from collect.rig.check import check_page, check_rig, contradictions
-    from collect.rig.config import load_rig
-    from collect.teach.store import TaughtFile, gaps
+    from brushloop.collect.rig.check import check_page, check_rig, contradictions
+    from brushloop.collect.rig.config import load_rig
+    from brushloop.collect.teach.store import TaughtFile, gaps
 
     checks = [*check_rig(load_rig(rig)), *gaps(TaughtFile(rig).load())]
     if as_json:

@@ -21,7 +21,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from drivers.errors import (
+from brushloop.drivers.errors import (
     ArmMoved,
     DeviceError,
     LimitExceeded,

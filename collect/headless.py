@@ -12,8 +12,8 @@ from functools import partial
 from types import FrameType
 from typing import Protocol
 
-from collect.engine.snapshot import EngineView, Snapshot
-from sessions.terminal import plain_console
+from brushloop.collect.engine.snapshot import EngineView, Snapshot
+from brushloop.sessions.terminal import plain_console
 
 REFRESH_S = 0.1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

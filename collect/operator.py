@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from collect.errors import NeedsOperator
+from brushloop.collect.errors import NeedsOperator
 
 if TYPE_CHECKING:
     import numpy as np

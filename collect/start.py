@@ -10,18 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
-from collect.chains.commands import ending
-from collect.engine.dry_run import DryRunEngine
-from collect.engine.engine import Engine
-from collect.engine.live import LiveView
-from collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store
-from collect.headless import RunnableEngine, run_headless
-from collect.planning.limit_check import check_protocol
-from drivers.clock import HostClock
-from sessions.terminal import plain
+from brushloop.collect.chains.commands import ending
+from brushloop.collect.engine.dry_run import DryRunEngine
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.live import LiveView
+from brushloop.collect.engine.open_or_resume import Opening, check_writable, find_resumable, open_store
+from brushloop.collect.headless import RunnableEngine, run_headless
+from brushloop.collect.planning.limit_check import check_protocol
+from brushloop.drivers.clock import HostClock
+from brushloop.sessions.terminal import plain
 
 if TYPE_CHECKING:
-    from collect.tui.pictures import Preview
+    from brushloop.collect.tui.pictures import Preview
 
 
 class Settings(TypedDict):
@@ -102,7 +102,7 @@ def _run(
 ) -> RunnableEngine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
     if on_screen:
-        from collect.tui.runner import run_screen
+        from brushloop.collect.tui.runner import run_screen
 
         return run_screen(engine, preview, again)
     run_headless(engine)

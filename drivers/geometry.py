@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from drivers import rotation
-from drivers.samples import Pose
+from brushloop.drivers import rotation
+from brushloop.drivers.samples import Pose
 
 DOWN = rotation.of_vector((math.pi, 0.0, 0.0))
 """The tool pointing down."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-from drivers.samples import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
+from brushloop.drivers.samples import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 
 
 @runtime_checkable

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.ccdbsm import CcdBsm
-from model.outline import Outline, loop
+from brushloop.model.ccdbsm import CcdBsm
+from brushloop.model.outline import Outline, loop
 
 
 @dataclass(frozen=True, slots=True, eq=False)

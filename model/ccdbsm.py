@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.brush import Brush, DomainError, require_positive
-from model.outline import Outline, loop, safe_sqrt
+from brushloop.model.brush import Brush, DomainError, require_positive
+from brushloop.model.outline import Outline, loop, safe_sqrt
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -83,7 +83,7 @@ def trails(paths: Sequence[Floats], vector: Floats) -> tuple[Floats, NDArray[np.
     for path in paths:
         if path.ndim != 2 or path.shape[1] not in (3, 4) or len(path) < 2:
             raise ValueError(f"a path is (n, 3) or (n, 4) with n >= 2, got {path.shape}")
-    from model.drag_kernel import follow  # numba takes a fifth of a second to import
+    from brushloop.model.drag_kernel import follow  # numba takes a fifth of a second to import
 
     ends = np.cumsum([0, *(len(path) for path in paths)])
     starts = ends + 2 * np.arange(len(ends))
@@ -106,7 +106,7 @@ def distances(
 
     For images of several strokes, image i shows trails `groups[i]` to `groups[i + 1]`, (B + 1,).
     """
-    from model.drag_kernel import signed
+    from brushloop.model.drag_kernel import signed
 
     each = np.arange(len(starts)) if groups is None else groups
     out = np.empty((len(each) - 1, len(y_mm), len(x_mm)))

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from model.brush import DomainError
-from model.loops import Loop, closed
+from brushloop.model.brush import DomainError
+from brushloop.model.loops import Loop, closed
 
 Floats = NDArray[np.float64]
 

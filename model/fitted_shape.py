@@ -7,10 +7,10 @@ import math
 import numpy as np
 import torch
 
-from model.ccdbsm import as_batch
-from model.fitted import NAME, FittedPress
-from model.outline import Outline
-from model.protocol import Number, ParameterSpec, Parametric, StrokeModel, Values
+from brushloop.model.ccdbsm import as_batch
+from brushloop.model.fitted import NAME, FittedPress
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import Number, ParameterSpec, Parametric, StrokeModel, Values
 
 PARAMETERS = (
     ParameterSpec("height_mm", "mm", 0.01, 200, 15, "H, how far the tip is pressed below the paper"),

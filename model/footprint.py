@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.damped import Equations, descend
-from model.drag import distances
+from brushloop.model.damped import Equations, descend
+from brushloop.model.drag import distances
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -140,7 +140,7 @@ def marks(paths: Sequence[Floats], values: Floats) -> Marks:
 
     `values` are those of one footprint, (28,), or of one for each path, (paths, 28).
     """
-    from model import footprint_kernel  # numba takes a fifth of a second to import
+    from brushloop.model import footprint_kernel  # numba takes a fifth of a second to import
 
     kernel: Any = footprint_kernel
     ends = np.cumsum([0, *(len(path) for path in paths)])
@@ -234,7 +234,7 @@ def ink_equations(
 ) -> Equations:
     """Normal equations of the modelled less the given ink. `slopes` are derivatives of the discs (rows, 3, P);
     `added_mm` (len(y_mm), len(x_mm)) is added to the signed distances."""
-    from model import drag_kernel
+    from brushloop.model import drag_kernel
 
     kernel: Any = drag_kernel
     count = slopes.shape[2]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
-from model.raster.compiled import in_parts
-from model.raster.frame import PX_MM, SIZE_PX, check_raster
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.raster.compiled import in_parts
+from brushloop.model.raster.frame import PX_MM, SIZE_PX, check_raster
 
 Values = float | NDArray[np.floating[Any]]
 
@@ -35,7 +35,7 @@ def press_images(
     bounding box if it is left out; `threads` and `out` as for `coverage_numpy`, float32 only. Raises DomainError for a
     press outside the model's domain, and ValueError for an invalid size, origin or `out`.
     """
-    from model.raster.level import draw, lengths
+    from brushloop.model.raster.level import draw, lengths
 
     check_raster(size_px, px_mm)
     columns = (height_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)

@@ -13,9 +13,9 @@ from typing import Protocol
 
 from torch import Tensor
 
-from model.brush import Brush, DomainError
-from model.ccdbsm import CcdBsm, as_batch, ccdbsm
-from model.outline import Shape
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import CcdBsm, as_batch, ccdbsm
+from brushloop.model.outline import Shape
 
 Number = float | Tensor
 Values = dict[str, Tensor]

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from model.ccdbsm import CcdBsm, as_batch
-from model.plane import Plane, fit_plane
-from model.protocol import Basis, Number, Values
+from brushloop.model.ccdbsm import CcdBsm, as_batch
+from brushloop.model.plane import Plane, fit_plane
+from brushloop.model.protocol import Basis, Number, Values
 
 # The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
 DEPTHS = tuple(height_mm / 48 for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0))

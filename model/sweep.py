@@ -11,8 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from model.brush import DomainError
-from model.outline import Outline, evaluate, safe_sqrt, through
+from brushloop.model.brush import DomainError
+from brushloop.model.outline import Outline, evaluate, safe_sqrt, through
 
 _CAP_ARCS = 3  # arcs in a round end: each spans less than 120 degrees
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sessions.terminal import say
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from sessions.imports.photographs import ImportOptions
+    from brushloop.sessions.imports.photographs import ImportOptions
 
 LOSSY, DAMAGED = 3, 6
 Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap file.")]
@@ -39,7 +39,7 @@ def list_(
     """List the sessions under a folder: closed, imported, or still open."""
     from rich.table import Table
 
-    from sessions.show import summaries
+    from brushloop.sessions.show import summaries
 
     table = Table("session", "state", "source", "strokes", "file")
     for row in summaries(root):
@@ -57,14 +57,14 @@ def show(
     import json
     from dataclasses import asdict
 
-    from sessions.show import details
+    from brushloop.sessions.show import details
 
     found = details(session)
     if as_json:
         say(json.dumps(asdict(found), ensure_ascii=False))
         return
 
-    from sessions.show_text import renderables
+    from brushloop.sessions.show_text import renderables
 
     say(*renderables(found, files=files))
 
@@ -75,8 +75,8 @@ def verify(session: Session) -> None:
 
     Exit code 0: everything is intact. 6: something is damaged, and is named.
     """
-    from sessions.progress import shown
-    from sessions.repair.verify import verify_session
+    from brushloop.sessions.progress import shown
+    from brushloop.sessions.repair.verify import verify_session
 
     with shown() as progress:
         verdict = verify_session(session, progress)
@@ -101,7 +101,7 @@ def repair(session: Session) -> None:
     """
     import time
 
-    from sessions.repair.repair import repair_session
+    from brushloop.sessions.repair.repair import repair_session
 
     report = repair_session(session, time.time_ns)
     for line in report.did:
@@ -121,7 +121,7 @@ def close(session: Annotated[Path, typer.Argument(help="The folder of a session 
     """Write the merged MCAP of a session that was left open, and read it back; collecting into it then ends."""
     import time
 
-    from sessions.store import SessionStore
+    from brushloop.sessions.store import SessionStore
 
     store = SessionStore(session.resolve(), None, time.time_ns)
     try:
@@ -137,7 +137,7 @@ def _import(
     import time
     from importlib.metadata import version
 
-    from sessions.progress import shown
+    from brushloop.sessions.progress import shown
 
     target = out or Path("sessions") / folder.resolve().name
     with shown() as progress:
@@ -161,7 +161,7 @@ def import_(
     simulated: Simulated = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
-    from sessions.imports.photographs import ImportOptions, import_photographs
+    from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
 
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     _import(import_photographs, folder, csv, out, options)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
-from sessions.errors import InputError
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
+from brushloop.sessions.errors import InputError
 
 ABSENT = object()
 """Placeholder for the value of a field that one of the two configurations does not have."""

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sessions.errors import DiskFull, InputError, SessionError, disk_error, in_one_line
+from brushloop.sessions.errors import DiskFull, InputError, SessionError, disk_error, in_one_line
 
 SPARE_BYTES = 16 * 1024 * 1024
 """Space that is always kept free, so that the journal's last lines fit."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import datetime as dt
 from pathlib import Path
 
-from sessions.errors import InputError, SessionError
-from sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from sessions.names import SEGMENT_NAME, check_folder
+from brushloop.sessions.errors import InputError, SessionError
+from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.names import SEGMENT_NAME, check_folder
 
 
 def check_name(folder: Path) -> None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from sessions.errors import SessionDamaged, in_one_line
-from sessions.journal.codec import Line
-from sessions.journal.events import NONSENSE
-from sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.errors import SessionDamaged, in_one_line
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal.events import NONSENSE
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
 
 CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
 LEAST_S = 2.0

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from sessions.disk import MAX_SNAPSHOT_BYTES, fsync_folder, read_bounded, set_aside
-from sessions.errors import SessionDamaged, SessionError, disk_error
-from sessions.journal.journal import Replay
-from sessions.names import SNAPSHOT_NAMES
-from sessions.recording.mcap_file import count_messages, new_mcap
-from sessions.recording.salvage import session_of
-from sessions.recording.schemas import Header
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, fsync_folder, read_bounded, set_aside
+from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
+from brushloop.sessions.journal.journal import Replay
+from brushloop.sessions.names import SNAPSHOT_NAMES
+from brushloop.sessions.recording.mcap_file import count_messages, new_mcap
+from brushloop.sessions.recording.salvage import session_of
+from brushloop.sessions.recording.schemas import Header
 
 REPAIRS_NOTE = "brushloop.repairs"
 """Note in a merged file whose session was repaired: what was rewritten, what is missing, and what was lost."""

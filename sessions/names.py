@@ -11,7 +11,7 @@ import re
 import stat
 from pathlib import Path
 
-from sessions.errors import InputError, in_one_line
+from brushloop.sessions.errors import InputError, in_one_line
 
 SESSION_ID = re.compile(r"[0-9A-Za-z][0-9A-Za-z._-]{0,99}")
 SEGMENT_NAME = re.compile(r"(\d{4,})-([a-z_]+)-([0-9A-Za-z_.-]+?)\.mcap(\.part)?")

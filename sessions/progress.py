@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from sessions.terminal import plain_console, say
+from brushloop.sessions.terminal import plain_console, say
 
 if TYPE_CHECKING:
     from rich.progress import TaskID

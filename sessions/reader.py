@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.folders import check_name, not_a_session
-from sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from sessions.names import check_companions
-from sessions.recording import container
-from sessions.recording.mcap_file import HEADER_METADATA, file_sha256, header_crc
-from sessions.recording.messages import decode_gray, decode_still
-from sessions.recording.schemas import Event, Header, StepEvent, Stroke, Topic
-from sessions.remarks import remarks_of
+from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
+from brushloop.sessions.folders import check_name, not_a_session
+from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.names import check_companions
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.mcap_file import HEADER_METADATA, file_sha256, header_crc
+from brushloop.sessions.recording.messages import decode_gray, decode_still
+from brushloop.sessions.recording.schemas import Event, Header, StepEvent, Stroke, Topic
+from brushloop.sessions.remarks import remarks_of
 
 if TYPE_CHECKING:
     import numpy as np

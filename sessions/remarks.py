@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sessions.errors import SessionDamaged
-from sessions.journal.journal import Journal
-from sessions.journal.lines import read_lines
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.journal.journal import Journal
+from brushloop.sessions.journal.lines import read_lines
 
 REMARKS_NAME = "remarks.jsonl"
 

@@ -14,16 +14,16 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
-from sessions.folders import check_name, recording_of_renamed
-from sessions.journal.codec import Line
-from sessions.journal.events import NONSENSE
-from sessions.journal.journal import JOURNAL_NAME, Replay, is_open, read_header, replay, replay_lines
-from sessions.names import check_folder
-from sessions.reader import Recording
-from sessions.recording import container
-from sessions.recording.schemas import Header, Stroke, Topic
-from sessions.remarks import remarks_of
+from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
+from brushloop.sessions.folders import check_name, recording_of_renamed
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal.events import NONSENSE
+from brushloop.sessions.journal.journal import JOURNAL_NAME, Replay, is_open, read_header, replay, replay_lines
+from brushloop.sessions.names import check_folder
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.schemas import Header, Stroke, Topic
+from brushloop.sessions.remarks import remarks_of
 
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
 

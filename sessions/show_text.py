@@ -8,7 +8,7 @@ from rich.console import RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
-from sessions.show import Details, Sheet
+from brushloop.sessions.show import Details, Sheet
 
 
 def renderables(details: Details, *, files: bool = False) -> Iterator[RenderableType]:

@@ -13,8 +13,8 @@ import sys
 from pathlib import Path
 from unittest import mock
 
-from brushloop import main
-from sessions import progress
+from brushloop.__main__ import main
+from brushloop.sessions import progress
 
 
 def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -9,9 +9,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.paper import Footprint
-from sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
 
 PAPER_GRAY, INK_GRAY = 235, 200
 """Gray of the paper, and how much of it full ink takes away."""

@@ -15,8 +15,8 @@ from bench import footprints, growth, overhead, raster, rpc, table, whole
 from bench.harness import BenchError, Result, interleave, percentile, results_of
 from bench.peak import Used, measure
 from bench.processes import started
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parent.parent

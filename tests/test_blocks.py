@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from collect.protocols.config import load_protocol
-from drivers.sim.brush_file import load_brush
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.drivers.sim.brush_file import load_brush
 from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of
 
 TUTORIAL = ROOT / "docs" / "tutorial.md"

@@ -16,18 +16,18 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
-from calibrate.compare.field import Alignment, Tone
-from calibrate.validate.report.data import load_report
-from calibrate.validate.report.tables import table_1
-from sessions.journal.journal import replay
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.validate.report.data import load_report
+from brushloop.calibrate.validate.report.tables import table_1
+from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
 from tests.waiting import wait_until
 
 SMALL = """
 import sys
 from pathlib import Path
-from collect.chains.demo import Demo, Size
+from brushloop.collect.chains.demo import Demo, Size
 
 size = Size((11.0, 20.0), (0.0, 8.0), again=1, writings=0)
 sys.exit(Demo(Path(sys.argv[1]), size, repeats=1, rate=60.0, seed=1, brush=Path("paper")).run())

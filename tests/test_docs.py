@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import typer
 
-import brushloop
+import brushloop.__main__
 from bench import moving
-from calibrate.path_or_command import PathOrCommand
+from brushloop.calibrate.path_or_command import PathOrCommand
 from tests.blocks import DOCUMENTS, ROOT, blocks_of
 
 LINK = re.compile(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)")
@@ -57,7 +57,7 @@ def commands_in(document: Path) -> list[str]:
 def test_commands_that_a_document_shows_exist_with_their_options(document: Path) -> None:
     """`make soak` runs them as well, in tests/test_blocks.py."""
     for line in commands_in(document):
-        command: Any = typer.main.get_command(brushloop.app)
+        command: Any = typer.main.get_command(brushloop.__main__.app)
         words = shlex.split(line.split(" | ")[0])[1:]
         while words:
             word = words.pop(0)

@@ -12,9 +12,9 @@ from random import Random
 
 import pytest
 
-import brushloop
-from sessions.store import SessionStore
-from sessions.terminal import plain
+import brushloop.__main__
+from brushloop.sessions.store import SessionStore
+from brushloop.sessions.terminal import plain
 from tests.sessions.conftest import Make
 
 HOSTILE = "\x1b]0;owned\x07\x1b]52;c;cm0gLXJm\x07\x1b[2J\x9b31m\u202eltr\r[bold][/x][link=http://a]"
@@ -120,7 +120,7 @@ def test_no_command_lets_what_it_read_act_on_the_terminal(
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["brushloop", *command.split()])
     with pytest.raises(SystemExit) as ended:
-        brushloop.main()
+        brushloop.__main__.main()
     captured = capfd.readouterr()
     assert captured.out + captured.err
     assert not [char for char in ACTED_ON if char in captured.out + captured.err]

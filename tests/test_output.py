@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sessions.store import SessionStore
+from brushloop.sessions.store import SessionStore
 from tests.command import brushloop
 from tests.sessions.conftest import Make
 
@@ -92,6 +92,6 @@ def test_too_little_memory_is_one_line(folder: Path, monkeypatch: pytest.MonkeyP
     def exhausted(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sessions.show.details", exhausted)
+    monkeypatch.setattr("brushloop.sessions.show.details", exhausted)
     ran = brushloop("sessions", "show", "s", cwd=folder)
     assert (ran.returncode, ran.stderr) == (4, "brushloop: not enough memory\n")

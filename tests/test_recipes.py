@@ -16,25 +16,25 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from collect.planning.walk import walk
-from collect.protocols.steps import StepKind
-from collect.quality.measure import Mark
-from collect.rig.config import RigConfig
-from collect.rig.config_quality import QualityConfig
-from drivers.camera import CameraOptions, OpenCvCamera
-from drivers.clock import HostClock
-from drivers.errors import LimitExceeded
-from drivers.protocols import Ink
-from drivers.samples import Stamp
-from drivers.sim.camera import mjpeg_server
-from drivers.sim.config import SimConfig, View
-from drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
-from drivers.sim.rig import LoopbackRig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from model import strokes
-from model.brush import Brush
-from model.raster.exact import coverage_at
-from model.strokes import stroke_models
+from brushloop.collect.planning.walk import walk
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.quality.measure import Mark
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.drivers.camera import CameraOptions, OpenCvCamera
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import LimitExceeded
+from brushloop.drivers.protocols import Ink
+from brushloop.drivers.samples import Stamp
+from brushloop.drivers.sim.camera import mjpeg_server
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
+from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.model import strokes
+from brushloop.model.brush import Brush
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_models
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
 
@@ -67,7 +67,7 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
         )
         assert drop == pytest.approx(0.5 * circle, rel=0.01)
     finally:
-        sys.modules.pop("model.strokes.drop", None)
+        sys.modules.pop("brushloop.model.strokes.drop", None)
 
 
 def test_a_protocol_kind_is_one_class() -> None:

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sessions.errors import SessionDamaged
-from sessions.reader import Recording
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.reader import Recording
 
 STILLS = 8
 """Stills that are compared, each with the next one."""

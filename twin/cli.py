@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrate.compare import MM_PER_PX
-from sessions.terminal import say
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from calibrate.fit.captures import Captures
-    from twin.run import Twin
-    from twin.shape import Found
+    from brushloop.calibrate.fit.captures import Captures
+    from brushloop.twin.run import Twin
+    from brushloop.twin.shape import Found
 
 
 def twin(
@@ -32,15 +32,15 @@ def twin(
     from importlib.metadata import version
     from shlex import quote
 
-    from calibrate.compare.field import Field
-    from calibrate.errors import CalibrationError
-    from calibrate.files import check_target, write_whole
-    from calibrate.fit.captures import read_presses
-    from sessions.progress import shown
-    from sessions.reader import Recording
-    from twin.camera import noise_gray
-    from twin.file import Notes, notes_path, resumed, save_notes, twin_toml
-    from twin.run import fit_twin, workers
+    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import check_target, write_whole
+    from brushloop.calibrate.fit.captures import read_presses
+    from brushloop.sessions.progress import shown
+    from brushloop.sessions.reader import Recording
+    from brushloop.twin.camera import noise_gray
+    from brushloop.twin.file import Notes, notes_path, resumed, save_notes, twin_toml
+    from brushloop.twin.run import fit_twin, workers
 
     recording = Recording(session)
     target = out or recording.path.parent / "twin.toml"
@@ -78,7 +78,7 @@ def twin(
 def _tables(captures: Captures, fitted: Twin, noise: float | None) -> Iterator[object]:
     from rich.table import Table
 
-    from calibrate.report import source_note
+    from brushloop.calibrate.report import source_note
 
     yield f"{source_note(captures.header.source, captures.header.brush)}; twin of {len(captures.strokes)} presses"
     for name, why in captures.refused:

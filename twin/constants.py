@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.brush.spec import ALLOWED, BrushSpec
+from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
 
 Vector = NDArray[np.float64]
 FARTHEST = 6.0

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.brush import Brush, BrushSpec, Descent
-from drivers.sim.brush.paper import Footprint
-from twin.constants import INK, SPREAD, Offset
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Descent
+from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.twin.constants import INK, SPREAD, Offset
 
 Cell = tuple[float, float]
 """(H in mm, alpha in deg)."""

@@ -10,11 +10,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded, write_whole
-from twin.constants import SHAPE
-from twin.run import Twin
-from twin.shape import Found
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.twin.constants import SHAPE
+from brushloop.twin.run import Twin
+from brushloop.twin.shape import Found
 
 Coordinates = Annotated[tuple[float, ...], Field(min_length=len(SHAPE) + 3, max_length=len(SHAPE) + 3)]
 

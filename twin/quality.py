@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.spec import BrushSpec
-from drivers.sim.config import SoundHead
-from twin.constants import Offset
-from twin.drawing import Cell, Images, draw
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.drivers.sim.config import SoundHead
+from brushloop.twin.constants import Offset
+from brushloop.twin.drawing import Cell, Images, draw
 
 PRESSES = 3
 """Presses of each cell."""

@@ -14,9 +14,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from calibrate.compare.ceiling import CEILING
-from calibrate.fit.captures import Grid, Pressed
-from calibrate.fit.heldout import (
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.fit.captures import Grid, Pressed
+from brushloop.calibrate.fit.heldout import (
     BEZIER,
     HeldOut,
     Images,
@@ -25,15 +25,26 @@ from calibrate.fit.heldout import (
     image_of,
     refit_bezier,
 )
-from drivers.sim.brush.spec import BrushSpec
-from drivers.sim.config import SoundHead
-from sessions.progress import Progress, unseen
-from twin.constants import SHAPE, SPREAD, Constant, Vector, brush_at, offset_at, with_values
-from twin.drawing import Cell
-from twin.quality import sound_head
-from twin.score import TWIN, parts_of, predicted
-from twin.shape import COARSE, FINE, Found, Round, Target, choose_individual, covariance, of_parts, search, start
-from twin.spread import FEWEST_REPEATS, Repeats, Spread, fit_spread
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.drivers.sim.config import SoundHead
+from brushloop.sessions.progress import Progress, unseen
+from brushloop.twin.constants import SHAPE, SPREAD, Constant, Vector, brush_at, offset_at, with_values
+from brushloop.twin.drawing import Cell
+from brushloop.twin.quality import sound_head
+from brushloop.twin.score import TWIN, parts_of, predicted
+from brushloop.twin.shape import (
+    COARSE,
+    FINE,
+    Found,
+    Round,
+    Target,
+    choose_individual,
+    covariance,
+    of_parts,
+    search,
+    start,
+)
+from brushloop.twin.spread import FEWEST_REPEATS, Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
 MOST_SD = 0.7

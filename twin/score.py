@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from calibrate.fit.captures import Grid
-from calibrate.fit.heldout import Images
-from drivers.sim.brush.spec import BrushSpec
-from twin.constants import Offset
-from twin.drawing import Cell, draw
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.calibrate.fit.heldout import Images
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.twin.constants import Offset
+from brushloop.twin.drawing import Cell, draw
 
 PARTS = 3
 TWIN = "twin"

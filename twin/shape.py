@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.spec import BrushSpec
-from twin.constants import SHAPE, Vector, brush_at, offset_at, search_bounds
-from twin.drawing import Cell, Images, draw, still
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.twin.constants import SHAPE, Vector, brush_at, offset_at, search_bounds
+from brushloop.twin.drawing import Cell, Images, draw, still
 
 IMAGE_SD = 0.12
 """Standard deviation that the fit assumes for a blurred pixel. It is large because neighbouring pixels deviate

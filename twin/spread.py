@@ -14,12 +14,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.similarity import csim
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.spec import BrushSpec
-from twin.constants import SPREAD, Offset, Vector, with_values
-from twin.drawing import Cell, Images, draw
-from twin.shape import Map, derivatives
+from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.twin.constants import SPREAD, Offset, Vector, with_values
+from brushloop.twin.drawing import Cell, Images, draw
+from brushloop.twin.shape import Map, derivatives
 
 FEWEST_REPEATS = 3
 """Captures of a cell from which their spread is told."""

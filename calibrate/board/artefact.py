@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from calibrate.artefact import Artefact, load_artefact
-from calibrate.board.intrinsics import Fitted
-from calibrate.board.lens import Lens, LensUsed, lens_of
-from calibrate.board.register import Registration
+from brushloop.calibrate.artefact import Artefact, load_artefact
+from brushloop.calibrate.board.intrinsics import Fitted
+from brushloop.calibrate.board.lens import Lens, LensUsed, lens_of
+from brushloop.calibrate.board.register import Registration
 
 
 class LensFile(Artefact):

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.detect import BoardView
-from calibrate.board.lens import Floats, Lens, rms
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.lens import Floats, Lens, rms
+from brushloop.calibrate.errors import CalibrationError
 
 LEAST = 3
 """Least number of views of a camera: fewer are outliers and do not determine a lens."""

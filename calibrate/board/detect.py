@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.edges import on_edges
-from calibrate.board.lens import Floats, Gray
-from calibrate.board.pix2len import apply
-from calibrate.board.spec import Board, BoardSpec, Checkerboard, charuco_board
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.edges import on_edges
+from brushloop.calibrate.board.lens import Floats, Gray
+from brushloop.calibrate.board.pix2len import apply
+from brushloop.calibrate.board.spec import Board, BoardSpec, Checkerboard, charuco_board
+from brushloop.calibrate.errors import CalibrationError
 
 MIN_CORNERS = 8
 WINDOW_SHARE = 0.3

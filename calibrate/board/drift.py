@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.board.lens import Gray, Lens
-from calibrate.board.pix2len import Plane
-from calibrate.board.session import NO_BOARD, board_stills, sheet_of
-from calibrate.board.spec import BoardSpec
-from calibrate.board.view import see_board_and_lens
-from calibrate.errors import CalibrationError
-from calibrate.line import Line, fit_line
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Recording
+from brushloop.calibrate.board.lens import Gray, Lens
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.session import NO_BOARD, board_stills, sheet_of
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.board.view import see_board_and_lens
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.line import Line, fit_line
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Recording
 
 MOVED_PX = 1.0
 """Movement of the board's middle between two views above which the camera or the board must have been touched."""

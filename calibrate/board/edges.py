@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats, Gray
+from brushloop.calibrate.board.lens import Floats, Gray
 
 ALONG_SHARE = 0.45
 """How far an edge is followed to either side, as a share of a square."""

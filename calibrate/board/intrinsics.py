@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.cameras import TwoCameras, solve, two_cameras
-from calibrate.board.detect import BoardView
-from calibrate.board.lens import Floats, Lens, unknown_lens
-from calibrate.board.pix2len import homography
-from calibrate.errors import CalibrationError
-from calibrate.line import student_95
+from brushloop.calibrate.board.cameras import TwoCameras, solve, two_cameras
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.lens import Floats, Lens, unknown_lens
+from brushloop.calibrate.board.pix2len import homography
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.line import student_95
 
 Ways = NDArray[np.int64]
 LEAST_VIEWS = 4

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import Frozen
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.errors import CalibrationError
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.board.spec import Board, Checkerboard, charuco_board, describe, size_mm
-from calibrate.errors import CalibrationError
-from calibrate.files import check_target
+from brushloop.calibrate.board.spec import Board, Checkerboard, charuco_board, describe, size_mm
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import check_target
 
 POINTS_PER_MM = 72.0 / 25.4
 PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "letter": (215.9, 279.4)}

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats, Lens, rms
-from calibrate.errors import CalibrationError
-from calibrate.line import student_95
+from brushloop.calibrate.board.lens import Floats, Lens, rms
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.line import student_95
 
 MOST_OUTLIERS = 0.1
 WORST_RMS_PX = 1.0

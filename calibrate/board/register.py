@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats, rms
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded
-from sessions.cells import number
+from brushloop.calibrate.board.lens import Floats, rms
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded
+from brushloop.sessions.cells import number
 
 Model = Literal["rigid", "similarity", "affine"]
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")

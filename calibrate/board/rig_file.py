@@ -13,9 +13,9 @@ from typing import Any, cast
 
 from pydantic import ValidationError
 
-from calibrate.board.spec import BoardSpec
-from calibrate.errors import CalibrationError, invalid
-from calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import read_bounded, write_whole
 
 TABLE = re.compile(r"\s*\[{1,2}\s*[A-Za-z0-9_\"'-]")
 PAPER = re.compile(r"\s*\[\s*paper\s*\]\s*(#.*)?$")

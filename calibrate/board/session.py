@@ -9,15 +9,15 @@ from typing import Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
-from calibrate.board.artefact import read_lens
-from calibrate.board.lens import Gray, LensUsed
-from calibrate.board.spec import BoardSpec
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded
-from sessions.reader import Recording
-from sessions.recording import container
-from sessions.recording.messages import decode_gray, decode_still
-from sessions.recording.schemas import StepEvent, Topic
+from brushloop.calibrate.board.artefact import read_lens
+from brushloop.calibrate.board.lens import Gray, LensUsed
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.messages import decode_gray, decode_still
+from brushloop.sessions.recording.schemas import StepEvent, Topic
 
 EFFECTIVE = "rig.effective.json"
 """The configuration in effect: rig.toml, with the changes that the environment made."""

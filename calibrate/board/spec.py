@@ -7,8 +7,8 @@ from typing import Annotated
 import cv2
 from pydantic import Field, model_validator
 
-from calibrate.artefact import Frozen
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.errors import CalibrationError
 
 Corners = Annotated[int, Field(ge=3, le=60)]
 Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibrate.board.artefact import LensFile
-from calibrate.board.detect import BoardView, find_board
-from calibrate.board.intrinsics import RMS_LIMIT_PX
-from calibrate.board.lens import Floats, Gray, Lens, unknown_lens
-from calibrate.board.pix2len import Plane, distorted_share, fit_plane
-from calibrate.board.spec import BoardSpec
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.artefact import LensFile
+from brushloop.calibrate.board.detect import BoardView, find_board
+from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX
+from brushloop.calibrate.board.lens import Floats, Gray, Lens, unknown_lens
+from brushloop.calibrate.board.pix2len import Plane, distorted_share, fit_plane
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError
 
 VISIBLE_PX = 0.5
 """A lens that distorts the board by more (root mean square) needs a lens file: one flat view cannot calibrate it."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.stats import Interval, interval_over_groups, summarise
+from brushloop.calibrate.compare.stats import Interval, interval_over_groups, summarise
 
 Floats = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare import MM_PER_PX
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.params import PX_PER_MM
-from calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import Prepared
 
 Image = NDArray[np.float32]
 SIZE_PX = 128
@@ -141,7 +141,7 @@ def to_tone(coverage: Image, tone: Tone) -> Image:
 
 def best_shift(moving: Image, fixed: Image) -> Image:
     """Shift `moving` by at most 6 px each way so that its overlap with `fixed` is largest, and of equals the least."""
-    from calibrate.compare.compiled import shift_to_overlap  # numba takes a fifth of a second to import
+    from brushloop.calibrate.compare.compiled import shift_to_overlap  # numba takes a fifth of a second to import
 
     reach = BEST_SHIFT_PX
     a, b = (np.rint(255.0 * image).astype(np.uint8) for image in (fixed, moving))

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.calibration import Calibration
-from calibrate.compare.field import (
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import (
     KEYS,
     NORMAL_LENGTH_PX,
     SIZE_PX,
@@ -27,18 +27,18 @@ from calibrate.compare.field import (
     crop_at_anchor,
     to_tone,
 )
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import Prepared, prepare
-from calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
-from model.brush import Brush
-from model.loops import Loop
-from sessions.reader import Capture
-from sessions.recording.schemas import Header, Stroke
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import Prepared, prepare
+from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
+from brushloop.model.brush import Brush
+from brushloop.model.loops import Loop
+from brushloop.sessions.reader import Capture
+from brushloop.sessions.recording.schemas import Header, Stroke
 
 if TYPE_CHECKING:
-    from model.outline import Shape
-    from model.strokes import StrokeModel
+    from brushloop.model.outline import Shape
+    from brushloop.model.strokes import StrokeModel
 
 Pixels = NDArray[np.uint8]
 """Ink from 0 to 255."""
@@ -134,7 +134,7 @@ def drawn(loop: Loop, origin_x_mm: float, field: Field) -> dict[Alignment, Image
 
 def draw_loop(loop: Loop, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:
     """Exact coverage of a mark in each view, (mm per pixel, x and y of its origin from the upper left corner, mm)."""
-    from model.raster import kernel  # numba takes a fifth of a second to import
+    from brushloop.model.raster import kernel  # numba takes a fifth of a second to import
 
     maps = np.array([[1 / px, 0.0, x / px, 0.0, -1 / px, y / px] for px, x, y in views])
     points, weights = (np.stack([part] * len(maps)) for part in (loop.points, loop.weights))

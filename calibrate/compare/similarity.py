@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import Alignment, best_shift
+from brushloop.calibrate.compare.field import Alignment, best_shift
 
 Image = NDArray[Any]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.line import student_95
+from brushloop.calibrate.line import student_95
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from calibrate.artefact import FittedValue, Frozen, SessionFit
-from calibrate.drags.captures import COMMANDS, commanded_path
-from calibrate.drags.fit import INK_ABOVE
-from calibrate.drags.residual import RIDGE, Residual, captured_distance
-from model.drag import DragModel, distances, trails
+from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit
+from brushloop.calibrate.drags.captures import COMMANDS, commanded_path
+from brushloop.calibrate.drags.fit import INK_ABOVE
+from brushloop.calibrate.drags.residual import RIDGE, Residual, captured_distance
+from brushloop.model.drag import DragModel, distances, trails
 
 Floats = NDArray[np.float64]
 

@@ -18,17 +18,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.calibration import Calibration
-from calibrate.drags.measure import DEPTH_NAMES, FLAGGED_WEIGHT, LENGTH_NAME, prepare_drag
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.session import calibration_of
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import on_raster, rectify_by, rescale
-from sessions.errors import SessionDamaged
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Capture, Recording
-from sessions.recording.schemas import Header, Stroke
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.drags.measure import DEPTH_NAMES, FLAGGED_WEIGHT, LENGTH_NAME, prepare_drag
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import on_raster, rectify_by, rescale
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording.schemas import Header, Stroke
 
 Floats = NDArray[np.float64]
 MARGIN_MM = 16.0

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model.damped import Damping, Equations, descend
-from model.drag import DragModel, distances, trails
+from brushloop.model.damped import Damping, Equations, descend
+from brushloop.model.drag import DragModel, distances, trails
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -94,7 +94,7 @@ def fit_drags(
     (B, len(y_mm), len(x_mm)) is added to the signed distances: what the model is known to miss.
     Raises ValueError if the sizes of paths, ink and place do not match.
     """
-    from model import drag_kernel
+    from brushloop.model import drag_kernel
 
     kernel: Any = drag_kernel
 
@@ -196,7 +196,7 @@ def _by_image(
     columns: Floats,
     spread_mm: float,
 ) -> tuple[Floats, Floats]:
-    from model import drag_kernel
+    from brushloop.model import drag_kernel
 
     kernel: Any = drag_kernel
     nodes, starts, slopes = _linearised(paths, vector, scale, columns)

@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.errors import CaptureRefused
-from calibrate.line import Line, fit_line
-from calibrate.stroke.components import components, fill_holes
-from calibrate.stroke.measure import Measured, measure, outline
-from calibrate.stroke.params import Gray, Mask, Params
-from calibrate.stroke.preprocess import Prepared, preprocess, touches_edge
-from calibrate.stroke.rectify import on_raster, rescale
-from sessions.errors import SessionDamaged
-from sessions.reader import Capture
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.line import Line, fit_line
+from brushloop.calibrate.stroke.components import components, fill_holes
+from brushloop.calibrate.stroke.measure import Measured, measure, outline
+from brushloop.calibrate.stroke.params import Gray, Mask, Params
+from brushloop.calibrate.stroke.preprocess import Prepared, preprocess, touches_edge
+from brushloop.calibrate.stroke.rectify import on_raster, rescale
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.reader import Capture
 
 THUMB_PX = 160
 DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal", "height_mm")

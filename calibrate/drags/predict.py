@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.similarity import binary_scores
-from calibrate.drags.artefact import DragArtefact, Kept, Stamps
-from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, fit_drags
-from calibrate.drags.residual import Residual, captured_distance, clipped, threshold
-from calibrate.errors import CalibrationError
-from model.drag import DragModel, distances, ink, trails
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.drags.artefact import DragArtefact, Kept, Stamps
+from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, fit_drags
+from brushloop.calibrate.drags.residual import Residual, captured_distance, clipped, threshold
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.model.drag import DragModel, distances, ink, trails
 
 if TYPE_CHECKING:
-    from calibrate.drags.captures import Drawn
+    from brushloop.calibrate.drags.captures import Drawn
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import load_artefact
-from calibrate.compare.ceiling import CEILING, ceiling_values, pair_means
-from calibrate.compare.similarity import binary_scores
-from calibrate.drags.artefact import DragArtefact
-from calibrate.drags.captures import Drawn, read_drags
-from calibrate.drags.predict import Predictor, predictors
-from sessions.progress import Progress, unseen
+from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.compare.ceiling import CEILING, ceiling_values, pair_means
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.drags.artefact import DragArtefact
+from brushloop.calibrate.drags.captures import Drawn, read_drags
+from brushloop.calibrate.drags.predict import Predictor, predictors
+from brushloop.sessions.progress import Progress, unseen
 
 Floats = NDArray[np.float64]
 OURS, LAG, STAMPS = "predicted", "bristle lag alone", "circle stamps"

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from rich.table import Column, Table
 
-from calibrate.compare.ceiling import CEILING
-from calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
-from calibrate.drags.predicted import OURS, Predictions
-from calibrate.report import (
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
+from brushloop.calibrate.drags.predicted import OURS, Predictions
+from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
     csv_text,
@@ -27,7 +27,7 @@ from calibrate.report import (
     source_note,
     write_files,
 )
-from sessions.recording.schemas import Header
+from brushloop.sessions.recording.schemas import Header
 
 MAX_THUMBNAILS = 60
 MAX_WORST = 12

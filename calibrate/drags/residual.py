@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.similarity import binary_scores
-from calibrate.drags.fit import INK_ABOVE, SPREAD_MM
-from model.drag import ink
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM
+from brushloop.model.drag import ink
 
 Floats = NDArray[np.float64]
 

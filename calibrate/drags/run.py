@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.artefact import FittedValue, made_by
-from calibrate.compare.similarity import binary_scores
-from calibrate.drags.artefact import DragArtefact, DragScore
-from calibrate.drags.captures import COMMANDS, Drawn
-from calibrate.drags.fit import DragFit, bootstrap, determined, fit_drags
-from calibrate.drags.predict import Predictor, chosen, coarse, coarse_step, learn, predictors, stamps_of
-from calibrate.errors import CalibrationError
-from calibrate.spread import farthest_first
-from model.drag import DragModel
-from sessions.progress import Progress, counted, unseen
+from brushloop.calibrate.artefact import FittedValue, made_by
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.drags.artefact import DragArtefact, DragScore
+from brushloop.calibrate.drags.captures import COMMANDS, Drawn
+from brushloop.calibrate.drags.fit import DragFit, bootstrap, determined, fit_drags
+from brushloop.calibrate.drags.predict import Predictor, chosen, coarse, coarse_step, learn, predictors, stamps_of
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.spread import farthest_first
+from brushloop.model.drag import DragModel
+from brushloop.sessions.progress import Progress, counted, unseen
 
 FOLDER = "dragfit"
 FOLDS = 5

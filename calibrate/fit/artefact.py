@@ -7,8 +7,8 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from calibrate.artefact import SessionFit
-from model.fitted import MODES, NAMES, TERMS, FittedPress
+from brushloop.calibrate.artefact import SessionFit
+from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress
 
 SCHEMA_VERSION = 1
 FOLDER = "brushfit"

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.calibration import Calibration
-from calibrate.compare.field import SIZE_PX, Field, covered
-from calibrate.compare.images import brush_of, prepare_press
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.session import calibration_of
-from sessions.errors import SessionDamaged
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Recording
-from sessions.recording.schemas import Header
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import SIZE_PX, Field, covered
+from brushloop.calibrate.compare.images import brush_of, prepare_press
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.session import calibration_of
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Header
 
 Floats = NDArray[np.float64]
 

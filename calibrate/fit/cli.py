@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrate.compare import MM_PER_PX
-from sessions.terminal import say
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from calibrate.drags.artefact import DragArtefact
-    from calibrate.drags.captures import Drawn
-    from calibrate.fit.captures import Captures
-    from calibrate.fit.run import Correction, Fitted
+    from brushloop.calibrate.drags.artefact import DragArtefact
+    from brushloop.calibrate.drags.captures import Drawn
+    from brushloop.calibrate.fit.captures import Captures
+    from brushloop.calibrate.fit.run import Correction, Fitted
 
 DRAG_MM_PER_PX = 0.4
 """Scale of the images that drags are fitted to."""
@@ -52,15 +52,15 @@ def fit(
         _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
 
-    from calibrate.artefact import load_artefact, put_to_use
-    from calibrate.compare.field import Field
-    from calibrate.fit.artefact import FOLDER, BrushFit
-    from calibrate.fit.captures import read_presses
-    from calibrate.fit.report import write_fit_page
-    from calibrate.fit.run import correction as corrected
-    from calibrate.fit.run import fit_session
-    from sessions.progress import shown
-    from sessions.reader import Recording
+    from brushloop.calibrate.artefact import load_artefact, put_to_use
+    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
+    from brushloop.calibrate.fit.captures import read_presses
+    from brushloop.calibrate.fit.report import write_fit_page
+    from brushloop.calibrate.fit.run import correction as corrected
+    from brushloop.calibrate.fit.run import fit_session
+    from brushloop.sessions.progress import shown
+    from brushloop.sessions.reader import Recording
 
     before = load_artefact(reference, BrushFit) if reference is not None else None
     view = Field(mm_per_px=mm_per_px or MM_PER_PX)
@@ -77,12 +77,12 @@ def fit(
 def _fit_drags(
     session: Path, mm_per_px: float | None, calibration: Path | None, prior: Path | None, strokes: int | None
 ) -> None:
-    from calibrate.artefact import load_artefact, put_to_use
-    from calibrate.drags.artefact import DragArtefact
-    from calibrate.drags.captures import read_drags
-    from calibrate.drags.run import FOLDER, fit_drawn, refit_drawn
-    from sessions.progress import shown
-    from sessions.reader import Recording
+    from brushloop.calibrate.artefact import load_artefact, put_to_use
+    from brushloop.calibrate.drags.artefact import DragArtefact
+    from brushloop.calibrate.drags.captures import read_drags
+    from brushloop.calibrate.drags.run import FOLDER, fit_drawn, refit_drawn
+    from brushloop.sessions.progress import shown
+    from brushloop.sessions.reader import Recording
 
     before = load_artefact(prior, DragArtefact) if prior is not None else None
     scale = mm_per_px or (before.mm_per_px if before is not None else DRAG_MM_PER_PX)
@@ -99,8 +99,8 @@ def _fit_drags(
 def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
     from rich.table import Table
 
-    from calibrate.drags.report import ends_sentence
-    from calibrate.report import source_label, source_note
+    from brushloop.calibrate.drags.report import ends_sentence
+    from brushloop.calibrate.report import source_label, source_note
 
     label = source_label(drawn.header.source, [drawn.header.brush])
     yield (
@@ -139,8 +139,8 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
 def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
     from rich.table import Table
 
-    from calibrate.fit.sizes import FEWEST_CELLS, middle
-    from calibrate.report import source_label, source_note
+    from brushloop.calibrate.fit.sizes import FEWEST_CELLS, middle
+    from brushloop.calibrate.report import source_label, source_note
 
     yield f"{source_note(captures.header.source, captures.header.brush)}; {len(captures.strokes)} presses fitted"
     for name, why in captures.refused:

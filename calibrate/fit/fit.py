@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
-from calibrate.fit.prior import Prior, about, learned, spreads
-from calibrate.fit.residual import fit_residual
-from model.damped import Damping, Equations, descend
-from model.fitted import NAMES, PARAMETERS, FittedPress, chance_within
+from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed
+from brushloop.calibrate.fit.prior import Prior, about, learned, spreads
+from brushloop.calibrate.fit.residual import fit_residual
+from brushloop.model.damped import Damping, Equations, descend
+from brushloop.model.fitted import NAMES, PARAMETERS, FittedPress, chance_within
 
 Floats = NDArray[np.float64]
 

@@ -10,16 +10,16 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.ceiling import CEILING, Average, average, ceiling_values, pair_means
-from calibrate.compare.field import SIZE_PX
-from calibrate.compare.images import draw_loop, to_pixels
-from calibrate.fit.captures import SPREAD_MM, Grid, Pressed, inked_rows
-from calibrate.fit.fit import fit_presses
-from model.brush import DomainError
-from model.fitted import FittedPress
-from model.loops import BEZIER_PIECES, Loop, bezier_side, closed
-from model.plane import Plane, fit_plane
-from sessions.progress import Progress, counted, unseen
+from brushloop.calibrate.compare.ceiling import CEILING, Average, average, ceiling_values, pair_means
+from brushloop.calibrate.compare.field import SIZE_PX
+from brushloop.calibrate.compare.images import draw_loop, to_pixels
+from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed, inked_rows
+from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.model.brush import DomainError
+from brushloop.model.fitted import FittedPress
+from brushloop.model.loops import BEZIER_PIECES, Loop, bezier_side, closed
+from brushloop.model.plane import Plane, fit_plane
+from brushloop.sessions.progress import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 Cell = tuple[float, float]
@@ -195,7 +195,7 @@ def _levels(image: Images) -> NDArray[np.uint8]:
 
 def _scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
     """(n, 2) CSIM and SSIM; NaN where an image is blank."""
-    from calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
+    from brushloop.calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
 
     out = np.empty((len(predicted), 2))
     compare(captured, np.stack(predicted), 0, out)

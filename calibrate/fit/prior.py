@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from calibrate.artefact import Frozen
-from model.fitted import NAMES, PARAMETERS, published
+from brushloop.calibrate.artefact import Frozen
+from brushloop.model.fitted import NAMES, PARAMETERS, published
 
 Floats = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
-from calibrate.compare.similarity import csim
-from calibrate.files import write_whole
-from calibrate.fit.captures import Captures, Floats, Grid, Pressed
-from calibrate.fit.heldout import FITTED, UNCALIBRATED, Cell, by_cell, predictor
-from calibrate.fit.run import Fitted
-from calibrate.fit.sizes import measure, middle
-from calibrate.report import (
+from brushloop.calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
+from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.fit.captures import Captures, Floats, Grid, Pressed
+from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, Cell, by_cell, predictor
+from brushloop.calibrate.fit.run import Fitted
+from brushloop.calibrate.fit.sizes import measure, middle
+from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
     Point,
@@ -27,9 +27,9 @@ from calibrate.report import (
     source_note,
     source_point,
 )
-from model.brush import DomainError
-from model.fitted import FittedPress
-from model.loops import Loop
+from brushloop.model.brush import DomainError
+from brushloop.model.fitted import FittedPress
+from brushloop.model.loops import Loop
 
 MAX_CELLS = 48
 MARGIN_MM = 1.5

@@ -16,8 +16,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.fit.captures import SPREAD_MM, Grid, Pressed
-from model.fitted import MODES, TERMS, FittedPress, command_terms, modes
+from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed
+from brushloop.model.fitted import MODES, TERMS, FittedPress, command_terms, modes
 
 Floats = NDArray[np.float64]
 

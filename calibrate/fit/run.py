@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.artefact import made_by
-from calibrate.compare.field import Field
-from calibrate.errors import CalibrationError
-from calibrate.fit.artefact import BrushFit
-from calibrate.fit.captures import Captures, Floats
-from calibrate.fit.fit import fit_presses, touch_errors, zero_touches
-from calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
-from calibrate.fit.sizes import FEWEST_CELLS, Estimate, Size, sizes_of
-from calibrate.line import student_95
-from model.fitted import NAMES, FittedPress
-from sessions.progress import Progress, unseen
+from brushloop.calibrate.artefact import made_by
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.captures import Captures, Floats
+from brushloop.calibrate.fit.fit import fit_presses, touch_errors, zero_touches
+from brushloop.calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
+from brushloop.calibrate.fit.sizes import FEWEST_CELLS, Estimate, Size, sizes_of
+from brushloop.calibrate.line import student_95
+from brushloop.model.fitted import NAMES, FittedPress
+from brushloop.sessions.progress import Progress, unseen
 
 PLANE = 3
 """Numbers of a plane in depth and tilt."""

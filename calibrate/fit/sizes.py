@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.fit.captures import Floats, Grid, Pressed
-from calibrate.fit.heldout import by_cell
-from calibrate.line import student_95
-from model.plane import fit_plane
+from brushloop.calibrate.fit.captures import Floats, Grid, Pressed
+from brushloop.calibrate.fit.heldout import by_cell
+from brushloop.calibrate.line import student_95
+from brushloop.model.plane import fit_plane
 
 SIZES = ("reach toward the tip", "reach toward the heel", "width")
 """From the point of touch to either end of the ink, and the greatest width; mm."""

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from calibrate.compare import MM_PER_PX
-from sessions.terminal import say
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.sessions.terminal import say
 
 
 def invert(
@@ -32,18 +32,24 @@ def invert(
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
-    from calibrate.errors import CalibrationError
-    from calibrate.files import check_target
-    from sessions.reader import Recording
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import check_target
+    from brushloop.sessions.reader import Recording
 
     check_target(out, ".csv")
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
 
-    from calibrate.compare.field import Field
-    from calibrate.invert.files import write_inversion
-    from calibrate.invert.invert import NO_MODEL_ERROR, NOT_INFORMATIVE, Settings, invert_recording, off_command
-    from model.inversion.press import Range
-    from sessions.progress import shown
+    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.invert.files import write_inversion
+    from brushloop.calibrate.invert.invert import (
+        NO_MODEL_ERROR,
+        NOT_INFORMATIVE,
+        Settings,
+        invert_recording,
+        off_command,
+    )
+    from brushloop.model.inversion.press import Range
+    from brushloop.sessions.progress import shown
 
     try:
         within = Range(height_range, tilt_range)
@@ -53,10 +59,10 @@ def invert(
         raise CalibrationError("--height-range, --tilt-range", str(error)) from None
     fitted, cells = None, frozenset[tuple[float, float]]()
     if fit is not None:
-        from calibrate.artefact import load_artefact
-        from calibrate.fit.artefact import BrushFit
-        from model.fitted import NAMES
-        from model.fitted_shape import fitted_model
+        from brushloop.calibrate.artefact import load_artefact
+        from brushloop.calibrate.fit.artefact import BrushFit
+        from brushloop.model.fitted import NAMES
+        from brushloop.model.fitted_shape import fitted_model
 
         artefact = load_artefact(fit, BrushFit)
         press, cells = artefact.press(), frozenset(artefact.cells)

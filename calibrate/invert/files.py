@@ -6,10 +6,10 @@ import io
 import json
 from pathlib import Path
 
-from calibrate.errors import CalibrationError
-from calibrate.files import write_whole
-from calibrate.invert.invert import Inversion
-from sessions.cells import CsvWriter
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.invert.invert import Inversion
+from brushloop.sessions.cells import CsvWriter
 
 PROTOCOL = "protocol-replay.toml"
 MAX_ROWS = 10_000

@@ -14,22 +14,22 @@ from typing import TypeVar
 
 import numpy as np
 
-from calibrate.calibration import Calibration
-from calibrate.compare.field import Field, Image, covered
-from calibrate.compare.images import brush_of, prepare_press
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.invert.model_error import NORMAL_95, Cell, model_sd
-from calibrate.session import calibration_of
-from calibrate.stroke.params import PX_PER_MM
-from model.brush import DomainError
-from model.inversion.noise import Noise
-from model.inversion.press import Flag, Inverter, Range
-from model.protocol import Basis, StrokeModel
-from model.strokes import UnknownModelError, stroke_model
-from sessions.errors import SessionDamaged
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Capture, Recording
-from sessions.recording.schemas import Header, Stroke
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import Field, Image, covered
+from brushloop.calibrate.compare.images import brush_of, prepare_press
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.invert.model_error import NORMAL_95, Cell, model_sd
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.model.brush import DomainError
+from brushloop.model.inversion.noise import Noise
+from brushloop.model.inversion.press import Flag, Inverter, Range
+from brushloop.model.protocol import Basis, StrokeModel
+from brushloop.model.strokes import UnknownModelError, stroke_model
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording.schemas import Header, Stroke
 
 _T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"

@@ -18,7 +18,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.line import student_95
+from brushloop.calibrate.line import student_95
 
 Floats = NDArray[np.float64]
 Cell = tuple[float, float]

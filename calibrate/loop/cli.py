@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from calibrate.compare import MM_PER_PX
-from sessions.terminal import say
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.sessions.terminal import say
 
 
 def compare(
@@ -23,11 +23,11 @@ def compare(
     """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
     import sys
 
-    from calibrate.compare.field import Field
-    from calibrate.files import check_folder
-    from calibrate.loop.compare import compare_sessions
-    from calibrate.loop.report import PICTURE, summary, write_loop
-    from sessions.progress import shown
+    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.files import check_folder
+    from brushloop.calibrate.loop.compare import compare_sessions
+    from brushloop.calibrate.loop.report import PICTURE, summary, write_loop
+    from brushloop.sessions.progress import shown
 
     check_folder(out)
     with shown() as progress:

@@ -8,23 +8,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.artefact import load_artefact, made_by
-from calibrate.calibration import Calibration
-from calibrate.compare.field import Field
-from calibrate.compare.images import brush_of, captured_images, prepare_press, simulated
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.fit.artefact import BrushFit
-from calibrate.loop.scores import CapturedPress, Pair, PairScore, Table1Row, Verdict, score_pairs, table_1, verdicts
-from calibrate.session import calibration_of
-from calibrate.stroke.measure import measure
-from model.brush import DomainError
-from sessions.errors import SessionDamaged
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Capture, Recording
-from sessions.recording.schemas import Header, Source
+from brushloop.calibrate.artefact import load_artefact, made_by
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.images import brush_of, captured_images, prepare_press, simulated
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.loop.scores import (
+    CapturedPress,
+    Pair,
+    PairScore,
+    Table1Row,
+    Verdict,
+    score_pairs,
+    table_1,
+    verdicts,
+)
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stroke.measure import measure
+from brushloop.model.brush import DomainError
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording.schemas import Header, Source
 
 if TYPE_CHECKING:
-    from model.protocol import StrokeModel
+    from brushloop.model.protocol import StrokeModel
 
 
 NOT_AGAIN = "was not pressed again"
@@ -185,10 +194,10 @@ def _replayed(header: Header) -> str | None:
 def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     """The model and the digest of the recording that it was fitted to, empty for none."""
     if fit is None:
-        from model.strokes import stroke_model  # torch, which takes seconds to load
+        from brushloop.model.strokes import stroke_model  # torch, which takes seconds to load
 
         return stroke_model("ccd-bsm", brush_of(header)), ""
     artefact = load_artefact(fit, BrushFit)
-    from model.fitted_shape import fitted_model
+    from brushloop.model.fitted_shape import fitted_model
 
     return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256

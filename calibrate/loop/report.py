@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.compare.paper import ROBOT_WRITING, TABLE_1
-from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison
-from calibrate.loop.scores import AGAIN, GOAL_POINTS, LoopRecord, Pair, PairScore, Table1Row
-from calibrate.loop.scores import FILE as NUMBERS
-from calibrate.report import (
+from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1
+from brushloop.calibrate.compare.similarity import SSIM_SETTINGS
+from brushloop.calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison
+from brushloop.calibrate.loop.scores import AGAIN, GOAL_POINTS, LoopRecord, Pair, PairScore, Table1Row
+from brushloop.calibrate.loop.scores import FILE as NUMBERS
+from brushloop.calibrate.report import (
     BLUE,
     Point,
     csv_text,

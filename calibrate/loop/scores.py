@@ -10,14 +10,14 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from calibrate.artefact import Frozen
-from calibrate.compare.field import KEYS, Alignment, Image, Key, Tone
-from calibrate.compare.paper import ROBOT_WRITING, TABLE_1, Triple
-from calibrate.compare.similarity import similarity
-from calibrate.compare.stats import Summary, interval_over_groups, summarise
-from calibrate.report import Sealed, load_sealed
-from calibrate.stroke.measure import Measured
-from sessions.recording.schemas import Source
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.compare.field import KEYS, Alignment, Image, Key, Tone
+from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1, Triple
+from brushloop.calibrate.compare.similarity import similarity
+from brushloop.calibrate.compare.stats import Summary, interval_over_groups, summarise
+from brushloop.calibrate.report import Sealed, load_sealed
+from brushloop.calibrate.stroke.measure import Measured
+from brushloop.sessions.recording.schemas import Source
 
 FILE = "loop.json"
 FORMAT = "brushloop-loop-1"

@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.artefact import load_artefact
-from calibrate.board.detect import find_board
-from calibrate.board.intrinsics import RMS_LIMIT_PX
-from calibrate.board.lens import Floats, Gray, rms
-from calibrate.board.pix2len import local_scale
-from calibrate.board.session import NO_BOARD, sheet_of
-from calibrate.board.spec import BoardSpec, describe
-from calibrate.board.view import LEAST_PX_PER_MM, WORST_INTERVAL, paper_mm
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
-from calibrate.files import write_whole
-from calibrate.report import (
+from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX
+from brushloop.calibrate.board.lens import Floats, Gray, rms
+from brushloop.calibrate.board.pix2len import local_scale
+from brushloop.calibrate.board.session import NO_BOARD, sheet_of
+from brushloop.calibrate.board.spec import BoardSpec, describe
+from brushloop.calibrate.board.view import LEAST_PX_PER_MM, WORST_INTERVAL, paper_mm
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
     Point,
@@ -33,9 +33,9 @@ from calibrate.report import (
     source_note,
     source_point,
 )
-from calibrate.session import FITTED
-from sessions.reader import Recording
-from sessions.recording.messages import decode_gray
+from brushloop.calibrate.session import FITTED
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.messages import decode_gray
 
 ARROW_SHARE = 0.4
 """Length of a typical arrow, as a share of the distance between corners."""

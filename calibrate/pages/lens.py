@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.board.artefact import LensFile
-from calibrate.board.cameras import residuals
-from calibrate.board.detect import BoardView
-from calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted
-from calibrate.board.lens import Gray, Lens, rms
-from calibrate.files import write_whole
-from calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, printable, render
+from brushloop.calibrate.board.artefact import LensFile
+from brushloop.calibrate.board.cameras import residuals
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted
+from brushloop.calibrate.board.lens import Gray, Lens, rms
+from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, printable, render
 
 LABEL = "photographs as given"
 NOTE = "photographs do not say which camera took them, or whether they were simulated"

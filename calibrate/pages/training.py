@@ -9,14 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.similarity import csim
-from calibrate.errors import CalibrationError
-from calibrate.files import write_whole
-from calibrate.report import BLUE, ORANGE, Image, Point, ink_uri, overlay_uri, plot, plot_uri, printable, render
-from model.protocol import ParameterSpec
-from model.train.checkpoint import load_checkpoint, load_weights, sha256
-from model.train.config import TrainConfig
-from model.train.report import load_samples
+from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.report import (
+    BLUE,
+    ORANGE,
+    Image,
+    Point,
+    ink_uri,
+    overlay_uri,
+    plot,
+    plot_uri,
+    printable,
+    render,
+)
+from brushloop.model.protocol import ParameterSpec
+from brushloop.model.train.checkpoint import load_checkpoint, load_weights, sha256
+from brushloop.model.train.config import TrainConfig
+from brushloop.model.train.report import load_samples
 
 PAGE = "training.html"
 SMOOTH_STEPS = 50

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.stroke.params import PX_PER_MM, Mask, Params
+from brushloop.calibrate.stroke.params import PX_PER_MM, Mask, Params
 
 
 @dataclass(frozen=True, slots=True)

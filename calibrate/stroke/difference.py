@@ -8,10 +8,10 @@ from typing import cast
 import cv2
 import numpy as np
 
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.components import parts_near
-from calibrate.stroke.params import Floats, Gray, Mask, Soft
-from calibrate.stroke.preprocess import LIGHT_ROUNDS
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.components import parts_near
+from brushloop.calibrate.stroke.params import Floats, Gray, Mask, Soft
+from brushloop.calibrate.stroke.preprocess import LIGHT_ROUNDS
 
 DARK_SHARE = 0.6
 """A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.stroke.params import PX_PER_MM, Mask
+from brushloop.calibrate.stroke.params import PX_PER_MM, Mask
 
 GAP_MM = 1.5
 """Bare streaks and glare narrower than this lie inside a stroke, not between two."""

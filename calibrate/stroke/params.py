@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from calibrate.calibration import Calibration
+    from brushloop.calibrate.calibration import Calibration
 
 Gray = NDArray[np.uint8]
 Soft = NDArray[np.float32]

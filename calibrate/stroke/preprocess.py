@@ -11,9 +11,9 @@ from typing import cast
 import cv2
 import numpy as np
 
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.components import Chosen, components, fill_holes
-from calibrate.stroke.params import PX_PER_MM, Floats, Gray, Mask, Params, Soft
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.components import Chosen, components, fill_holes
+from brushloop.calibrate.stroke.params import PX_PER_MM, Floats, Gray, Mask, Params, Soft
 
 LIGHT_ROUNDS = 5
 PAPER_ABOVE = 0.85

@@ -7,9 +7,9 @@ from typing import Protocol, cast
 import cv2
 import numpy as np
 
-from calibrate.calibration import Calibration
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.params import PX_PER_MM, Floats, Gray
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.params import PX_PER_MM, Floats, Gray
 
 MAX_RASTER_PX = 8192
 KNOTS = 8

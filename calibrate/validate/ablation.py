@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.compare.images import brush_of, loop_pixels, pack
-from calibrate.validate.heldout import RefitJob, bezier_pixels, fitted_press, refit_job
-from calibrate.validate.jobs import ABSENT, ScoreJob, score_job
-from calibrate.validate.pool import Scheduler
-from calibrate.validate.report.data import Step
-from calibrate.validate.rows import CHUNK
-from calibrate.validate.run import Outcome
-from sessions.progress import Progress
+from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.compare.images import brush_of, loop_pixels, pack
+from brushloop.calibrate.validate.heldout import RefitJob, bezier_pixels, fitted_press, refit_job
+from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, score_job
+from brushloop.calibrate.validate.pool import Scheduler
+from brushloop.calibrate.validate.report.data import Step
+from brushloop.calibrate.validate.rows import CHUNK
+from brushloop.calibrate.validate.run import Outcome
+from brushloop.sessions.progress import Progress
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 DRAWS = 2

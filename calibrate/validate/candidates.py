@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibrate.compare.field import Field
-from calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
-from calibrate.validate.heldout import bezier_pixels, fitted_press
-from calibrate.validate.rows import Cell
-from calibrate.validate.sources import LoadedSession
-from model.brush import Brush, DomainError
-from model.fitted import NAME
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
+from brushloop.calibrate.validate.heldout import bezier_pixels, fitted_press
+from brushloop.calibrate.validate.rows import Cell
+from brushloop.calibrate.validate.sources import LoadedSession
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.fitted import NAME
 
 if TYPE_CHECKING:
-    from model.protocol import StrokeModel
+    from brushloop.model.protocol import StrokeModel
 
 FITTED = NAME
 PUBLISHED = "as published"
@@ -64,8 +64,8 @@ def generator_file(path: Path) -> Generator:
 
 def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> list[Candidate]:
     """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
-    from model.fitted_shape import fitted_model
-    from model.strokes import stroke_model, stroke_models
+    from brushloop.model.fitted_shape import fitted_model
+    from brushloop.model.strokes import stroke_model, stroke_models
 
     brush = brush_of(session.header)
     found = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
@@ -82,7 +82,7 @@ def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> lis
 
 def generators(session: LoadedSession, files: Sequence[Generator], view: Field) -> list[Candidate]:
     """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
-    from model.train.checkpoint import load_generator
+    from brushloop.model.train.checkpoint import load_generator
 
     found: list[Candidate] = []
     for number, file in enumerate(files):
@@ -126,7 +126,7 @@ def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
 
 def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Candidate:
     """A generator tuned on all cells except the one it predicts."""
-    from model.train.checkpoint import load_generator
+    from brushloop.model.train.checkpoint import load_generator
 
     loaded: dict[Path, StrokeModel] = {}
 

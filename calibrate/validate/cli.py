@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibrate.compare import MM_PER_PX
-from calibrate.path_or_command import PathOrCommand
-from sessions.terminal import say
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.calibrate.path_or_command import PathOrCommand
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from calibrate.validate.diff import Difference
+    from brushloop.calibrate.validate.diff import Difference
 
 
 app = typer.Typer(
@@ -56,13 +56,13 @@ def validate(
     """Compare every model with every captured stroke; run the same command again to resume."""
     import sys
 
-    from calibrate.compare.field import Field
-    from calibrate.drags.report import summary as drag_summary
-    from calibrate.validate.extras import ExtrasRequest
-    from calibrate.validate.main import Request, check
-    from calibrate.validate.main import validate as run
-    from calibrate.validate.report.outputs import summary
-    from sessions.progress import shown
+    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.drags.report import summary as drag_summary
+    from brushloop.calibrate.validate.extras import ExtrasRequest
+    from brushloop.calibrate.validate.main import Request, check
+    from brushloop.calibrate.validate.main import validate as run
+    from brushloop.calibrate.validate.report.outputs import summary
+    from brushloop.sessions.progress import shown
 
     request = Request(
         places=tuple(session),
@@ -107,7 +107,7 @@ def diff(
     json: Annotated[bool, typer.Option("--json", help="Print every series as JSON.")] = False,
 ) -> None:
     """Show what got better or worse between two reports, sessions or software versions, by a paired test."""
-    from calibrate.validate.diff import compare
+    from brushloop.calibrate.validate.diff import compare
 
     found = compare(before, after)
     if json:
@@ -132,11 +132,11 @@ def captures(
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Write captured presses in the format that `brushloop train tune` reads."""
-    from calibrate.errors import CalibrationError
-    from calibrate.files import check_target
-    from calibrate.validate.sources import open_session
-    from calibrate.validate.tuning import align_captures, write_captures
-    from sessions.cells import number
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import check_target
+    from brushloop.calibrate.validate.sources import open_session
+    from brushloop.calibrate.validate.tuning import align_captures, write_captures
+    from brushloop.sessions.cells import number
 
     cells: list[tuple[float, float]] = []
     for text in leave_out or ():
@@ -159,7 +159,7 @@ def captures(
 def _print_difference(found: Difference) -> None:
     from rich.table import Table
 
-    from calibrate.validate.diff import sentences
+    from brushloop.calibrate.validate.diff import sentences
 
     say(*sentences(found))
     title = f"after minus before, points of percent ({found.before.label})"

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.compare.stats import Paired, holm, paired
-from calibrate.errors import CalibrationError
-from calibrate.validate.report.data import Report, load_report
-from sessions.cells import as_text
+from brushloop.calibrate.compare.stats import Paired, holm, paired
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate.report.data import Report, load_report
+from brushloop.sessions.cells import as_text
 
 SIGNIFICANT = 0.05
 MEASURES = ("csim", "ssim")

@@ -13,14 +13,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded
-from calibrate.loop.scores import FILE as LOOP_FILE
-from calibrate.loop.scores import LoopRecord, read_loop
-from calibrate.report import png_uri
-from calibrate.validate.sources import LoadedSession, one_source
-from calibrate.writing.scores import FILE as WRITTEN_FILE
-from calibrate.writing.scores import PICTURE, WrittenRecord, read_written
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded
+from brushloop.calibrate.loop.scores import FILE as LOOP_FILE
+from brushloop.calibrate.loop.scores import LoopRecord, read_loop
+from brushloop.calibrate.report import png_uri
+from brushloop.calibrate.validate.sources import LoadedSession, one_source
+from brushloop.calibrate.writing.scores import FILE as WRITTEN_FILE
+from brushloop.calibrate.writing.scores import PICTURE, WrittenRecord, read_written
 
 LOOP_FOLDER, WRITTEN_FOLDER = "loop", "written"
 """Default output folders of those commands: in the session, and next to the folder of sessions."""

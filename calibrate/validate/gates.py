@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from calibrate.compare.field import Alignment, Tone
-from calibrate.errors import CalibrationError
-from calibrate.validate.report.data import Report
-from sessions.cells import number
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate.report.data import Report
+from brushloop.sessions.cells import number
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     ">=": operator.ge,

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.compare.field import Field
-from calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
-from calibrate.fit.captures import Grid, Pressed, grid_of
-from calibrate.fit.heldout import (
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
+from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
+from brushloop.calibrate.fit.heldout import (
     BEZIER_SIZES,
     MAX_FOLDS,
     PER_CELL,
@@ -25,13 +25,13 @@ from calibrate.fit.heldout import (
     refit_bezier,
     without,
 )
-from calibrate.validate.pool import Scheduler
-from calibrate.validate.rows import Cell, Numbers, Rows
-from calibrate.validate.sources import LoadedSession
-from calibrate.validate.store import VERSION, Store
-from model.fitted import MODES, TERMS, FittedPress
-from model.plane import Plane
-from sessions.progress import Progress
+from brushloop.calibrate.validate.pool import Scheduler
+from brushloop.calibrate.validate.rows import Cell, Numbers, Rows
+from brushloop.calibrate.validate.sources import LoadedSession
+from brushloop.calibrate.validate.store import VERSION, Store
+from brushloop.model.fitted import MODES, TERMS, FittedPress
+from brushloop.model.plane import Plane
+from brushloop.sessions.progress import Progress
 
 
 @dataclass(frozen=True, slots=True)

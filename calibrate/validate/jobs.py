@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.calibration import Calibration
-from calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field, covered
-from calibrate.compare.images import captured_images, pack, prepare_press, to_pixels, unpack
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.measure import Measured, measure
-from calibrate.validate.store import VERSION, Store
-from sessions.errors import SessionDamaged
-from sessions.reader import Capture, Place, capture_at
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field, covered
+from brushloop.calibrate.compare.images import captured_images, pack, prepare_press, to_pixels, unpack
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.measure import Measured, measure
+from brushloop.calibrate.validate.store import VERSION, Store
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.reader import Capture, Place, capture_at
 
 if TYPE_CHECKING:
-    from calibrate.validate.pool import Scheduler
-    from calibrate.validate.sources import LoadedSession
-    from sessions.progress import Progress
+    from brushloop.calibrate.validate.pool import Scheduler
+    from brushloop.calibrate.validate.sources import LoadedSession
+    from brushloop.sessions.progress import Progress
 
 ABSENT = b""
 """Placeholder for the images of a model that does not predict this press."""
@@ -103,7 +103,7 @@ def prepare_job(job: PrepareJob) -> Press:
 
 def read_job(job: ReadJob) -> Press | None:
     """Read a capture and prepare it; None if it does not directly follow its stroke, as in a recording of ours."""
-    from calibrate.validate.sources import opened  # not needed by jobs that get their photograph
+    from brushloop.calibrate.validate.sources import opened  # not needed by jobs that get their photograph
 
     try:
         capture = capture_at(opened(job.session, job.sha256), job.place)
@@ -210,7 +210,7 @@ def scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) 
 
     In the size-normalised alignment each prediction first takes its best shift. NaN where an image is blank.
     """
-    from calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
+    from brushloop.calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
 
     out = np.empty((len(predicted), len(KEYS), 2))
     for k, (alignment, _tone) in enumerate(KEYS):

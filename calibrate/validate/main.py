@@ -10,27 +10,27 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from calibrate.compare.field import Field
-from calibrate.drags.measure import validate_drags
-from calibrate.drags.predicted import predict_session
-from calibrate.drags.report import DragValidation, write_drags
-from calibrate.errors import CalibrationError
-from calibrate.files import check_folder
-from calibrate.report import csv_text, write_files
-from calibrate.stroke.params import Params
-from calibrate.validate.ablation import similarity_by_strokes
-from calibrate.validate.candidates import generator_file
-from calibrate.validate.extras import Extras, ExtrasRequest, find_extras
-from calibrate.validate.gates import check_gates, parse_gate
-from calibrate.validate.pool import Dask, Threads
-from calibrate.validate.report.data import Report
-from calibrate.validate.report.figures import read_curve
-from calibrate.validate.report.outputs import summary_csv, table_3_csv, write_csv, write_parquet
-from calibrate.validate.report.page import page_of, pages_beside
-from calibrate.validate.report.summary import report_of
-from calibrate.validate.run import Options, Outcome, validate_presses
-from calibrate.validate.sources import URL, LoadedSession, one_source, open_session
-from sessions.progress import Progress, counted
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.drags.measure import validate_drags
+from brushloop.calibrate.drags.predicted import predict_session
+from brushloop.calibrate.drags.report import DragValidation, write_drags
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import check_folder
+from brushloop.calibrate.report import csv_text, write_files
+from brushloop.calibrate.stroke.params import Params
+from brushloop.calibrate.validate.ablation import similarity_by_strokes
+from brushloop.calibrate.validate.candidates import generator_file
+from brushloop.calibrate.validate.extras import Extras, ExtrasRequest, find_extras
+from brushloop.calibrate.validate.gates import check_gates, parse_gate
+from brushloop.calibrate.validate.pool import Dask, Threads
+from brushloop.calibrate.validate.report.data import Report
+from brushloop.calibrate.validate.report.figures import read_curve
+from brushloop.calibrate.validate.report.outputs import summary_csv, table_3_csv, write_csv, write_parquet
+from brushloop.calibrate.validate.report.page import page_of, pages_beside
+from brushloop.calibrate.validate.report.summary import report_of
+from brushloop.calibrate.validate.run import Options, Outcome, validate_presses
+from brushloop.calibrate.validate.sources import URL, LoadedSession, one_source, open_session
+from brushloop.sessions.progress import Progress, counted
 
 FOLDER = "validation"
 WORK = "work"

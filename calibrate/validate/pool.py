@@ -15,8 +15,8 @@ from importlib.metadata import version
 from types import TracebackType
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from calibrate.errors import one_line
-from calibrate.validate import store
+from brushloop.calibrate.errors import one_line
+from brushloop.calibrate.validate import store
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -133,7 +133,7 @@ class Dask(AbstractContextManager["Dask"]):
 
     def opens(self, session: str, sha256: str) -> bool:
         """Whether every worker has the recording there; if not, photographs are sent and `notes` says why."""
-        from calibrate.validate.sources import opened
+        from brushloop.calibrate.validate.sources import opened
 
         found: dict[str, Any] = self._client.run(opened, session, sha256, on_error="return")
         for worker, answer in found.items():

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import KEYS
-from calibrate.validate.jobs import Press, Values, press_of
-from calibrate.validate.store import Store
+from brushloop.calibrate.compare.field import KEYS
+from brushloop.calibrate.validate.jobs import Press, Values, press_of
+from brushloop.calibrate.validate.store import Store
 
 Cell = tuple[float, float]
 """(H, alpha) as commanded."""

@@ -10,22 +10,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from calibrate.compare.ceiling import others_of
-from calibrate.compare.field import Field
-from calibrate.compare.images import brush_of, pack
-from calibrate.compare.paper import ROBOT_WRITING
-from calibrate.errors import CalibrationError
-from calibrate.validate import candidates as who
-from calibrate.validate.candidates import Candidate, Generator
-from calibrate.validate.heldout import refits_by_cell
-from calibrate.validate.jobs import ABSENT, ScoreJob, key_of, prepared, score_job
-from calibrate.validate.pool import Scheduler
-from calibrate.validate.rows import CHUNK, Entry, Numbers, Rows, Scores
-from calibrate.validate.sources import LoadedSession
-from calibrate.validate.store import Store
-from calibrate.validate.tuning import FOLDS, tuned_by_cell
-from model.brush import DomainError
-from sessions.progress import Progress
+from brushloop.calibrate.compare.ceiling import others_of
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.images import brush_of, pack
+from brushloop.calibrate.compare.paper import ROBOT_WRITING
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate import candidates as who
+from brushloop.calibrate.validate.candidates import Candidate, Generator
+from brushloop.calibrate.validate.heldout import refits_by_cell
+from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, key_of, prepared, score_job
+from brushloop.calibrate.validate.pool import Scheduler
+from brushloop.calibrate.validate.rows import CHUNK, Entry, Numbers, Rows, Scores
+from brushloop.calibrate.validate.sources import LoadedSession
+from brushloop.calibrate.validate.store import Store
+from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
+from brushloop.model.brush import DomainError
+from brushloop.sessions.progress import Progress
 
 ANOTHER = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""

@@ -18,18 +18,18 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from calibrate.artefact import FOLDER, MAX_POINTER_BYTES, POINTER, current, load_artefact, pointed
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError, one_line
-from calibrate.files import replacing
-from calibrate.fit.artefact import FOLDER as FITS
-from calibrate.fit.artefact import BrushFit
-from calibrate.session import calibration_of
-from sessions.errors import SessionDamaged
-from sessions.journal.journal import JOURNAL_NAME, replay
-from sessions.reader import Recording
-from sessions.recording.mcap_file import file_sha256
-from sessions.recording.schemas import Header, Source, Stroke
+from brushloop.calibrate.artefact import FOLDER, MAX_POINTER_BYTES, POINTER, current, load_artefact, pointed
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError, one_line
+from brushloop.calibrate.files import replacing
+from brushloop.calibrate.fit.artefact import FOLDER as FITS
+from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.session import calibration_of
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.mcap_file import file_sha256
+from brushloop.sessions.recording.schemas import Header, Source, Stroke
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3

@@ -18,25 +18,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import FINE, Field, Image
-from calibrate.compare.images import axis_mm, brush_of, prepare_press
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.fit.heldout import folds
-from calibrate.report import source_label
-from calibrate.stroke.params import PX_PER_MM
-from calibrate.stroke.preprocess import Prepared
-from calibrate.validate.candidates import Generator
-from calibrate.validate.heldout import fitted_press
-from calibrate.validate.rows import Cell
-from calibrate.validate.sources import LoadedSession, one_source
-from calibrate.validate.store import VERSION
-from model.brush import DomainError
-from sessions.errors import SessionDamaged
+from brushloop.calibrate.compare.field import FINE, Field, Image
+from brushloop.calibrate.compare.images import axis_mm, brush_of, prepare_press
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.fit.heldout import folds
+from brushloop.calibrate.report import source_label
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.validate.candidates import Generator
+from brushloop.calibrate.validate.heldout import fitted_press
+from brushloop.calibrate.validate.rows import Cell
+from brushloop.calibrate.validate.sources import LoadedSession, one_source
+from brushloop.calibrate.validate.store import VERSION
+from brushloop.model.brush import DomainError
+from brushloop.sessions.errors import SessionDamaged
 
 if TYPE_CHECKING:
-    from model.generator.stroke import GeneratorModel
-    from model.train.loop import Validation
-    from sessions.progress import Progress
+    from brushloop.model.generator.stroke import GeneratorModel
+    from brushloop.model.train.loop import Validation
+    from brushloop.sessions.progress import Progress
 
 MAX_STROKES = 100_000
 FOLDS = 5
@@ -67,7 +67,7 @@ class AlignedStrokes:
 
 def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStrokes:
     """Convert the presses of sessions to the generator's image format. Raises what `load_generator` raises."""
-    from model.train.checkpoint import load_generator
+    from brushloop.model.train.checkpoint import load_generator
 
     target = load_generator(generator).target
     label = source_label(one_source(sessions), (session.header.brush for session in sessions))
@@ -105,7 +105,7 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Cell]
     """
     import torch
 
-    from model.train.data import save_captures
+    from brushloop.model.train.data import save_captures
 
     chosen = [k for k, cell in enumerate(aligned.cells) if cell not in leave_out]
     conditions = len({tuple(aligned.inputs[k].values()) for k in chosen})
@@ -171,9 +171,9 @@ class _TrainingProgress:
 def _tune(
     folder: Path, captures: Path, generator: Generator, source: str, steps: int, progress: _TrainingProgress
 ) -> None:
-    from model.train.checkpoint import load_weights, sha256
-    from model.train.config import checked
-    from model.train.run import Tuning, run_training
+    from brushloop.model.train.checkpoint import load_weights, sha256
+    from brushloop.model.train.config import checked
+    from brushloop.model.train.run import Tuning, run_training
 
     config, _, _ = load_weights(generator.path)
     tuning: dict[str, Any] = {
@@ -201,9 +201,9 @@ def _with_images(
     """Add images of the fitted brush, if the generator's inputs are depth and tilt alone."""
     import torch
 
-    from model.fitted_shape import fitted_model
-    from model.generator.targets import Placement, Target
-    from model.train.checkpoint import load_generator
+    from brushloop.model.fitted_shape import fitted_model
+    from brushloop.model.generator.targets import Placement, Target
+    from brushloop.model.train.checkpoint import load_generator
 
     brush = brush_of(session.header)
     target = load_generator(generator.path, brush).target
@@ -238,7 +238,7 @@ def _placed(
     prepared: Prepared, model: GeneratorModel, values: dict[str, float], height_mm: float, tilt_deg: float
 ) -> Image:
     """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` if the stroke does not fit."""
-    from model.generator.targets import ANCHOR_SHARE, Placement
+    from brushloop.model.generator.targets import ANCHOR_SHARE, Placement
 
     target = model.target
     side_mm = target.size_px * target.px_mm

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sessions.terminal import say
+from brushloop.sessions.terminal import say
 
 
 def plan(
@@ -46,19 +46,19 @@ def plan(
     import math
     from dataclasses import replace
 
-    from calibrate.artefact import load_artefact
-    from calibrate.drags.artefact import DragArtefact
-    from calibrate.errors import CalibrationError
-    from calibrate.files import check_folder
-    from calibrate.writing.footprint import load_footprint
-    from calibrate.writing.plan import Settings
-    from calibrate.writing.plan import plan as planned
-    from calibrate.writing.plan_files import PICTURE, write_plan
-    from calibrate.writing.plan_record import PlannedBy
-    from model.brush import Brush, DomainError
-    from model.characters.brush import Reach
-    from model.characters.plan import Cell
-    from model.strokes import UnknownModelError, stroke_model
+    from brushloop.calibrate.artefact import load_artefact
+    from brushloop.calibrate.drags.artefact import DragArtefact
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import check_folder
+    from brushloop.calibrate.writing.footprint import load_footprint
+    from brushloop.calibrate.writing.plan import Settings
+    from brushloop.calibrate.writing.plan import plan as planned
+    from brushloop.calibrate.writing.plan_files import PICTURE, write_plan
+    from brushloop.calibrate.writing.plan_record import PlannedBy
+    from brushloop.model.brush import Brush, DomainError
+    from brushloop.model.characters.brush import Reach
+    from brushloop.model.characters.plan import Cell
+    from brushloop.model.strokes import UnknownModelError, stroke_model
 
     check_folder(out)
     lagging = load_artefact(drag, DragArtefact) if drag is not None else None
@@ -121,13 +121,13 @@ def compare(
     """Compare written characters with the simulated image and with the reference, in both polarities (Table 3)."""
     import sys
 
-    from calibrate.compare.field import Image
-    from calibrate.errors import CalibrationError
-    from calibrate.files import check_folder
-    from calibrate.writing.compare import compare_written, read_reference
-    from calibrate.writing.plan_record import load_plan
-    from calibrate.writing.report import PICTURE, summary, write_written
-    from sessions.progress import shown
+    from brushloop.calibrate.compare.field import Image
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import check_folder
+    from brushloop.calibrate.writing.compare import compare_written, read_reference
+    from brushloop.calibrate.writing.plan_record import load_plan
+    from brushloop.calibrate.writing.report import PICTURE, summary, write_written
+    from brushloop.sessions.progress import shown
 
     check_folder(out)
     references: dict[str, tuple[str, Image]] = {}
@@ -155,13 +155,13 @@ def learn(
     ] = None,
 ) -> None:
     """Make the next plan from what the ink of this one showed, phase by phase."""
-    from calibrate.files import check_folder
-    from calibrate.writing.compare import compare_written
-    from calibrate.writing.learn import learned
-    from calibrate.writing.plan_files import write_record
-    from calibrate.writing.plan_record import load_plan
-    from calibrate.writing.rounds import lost_in_words
-    from sessions.progress import shown
+    from brushloop.calibrate.files import check_folder
+    from brushloop.calibrate.writing.compare import compare_written
+    from brushloop.calibrate.writing.learn import learned
+    from brushloop.calibrate.writing.plan_files import write_record
+    from brushloop.calibrate.writing.plan_record import load_plan
+    from brushloop.calibrate.writing.rounds import lost_in_words
+    from brushloop.sessions.progress import shown
 
     check_folder(out)
     with shown() as progress:
@@ -189,11 +189,11 @@ def practice(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the strokes.")] = 1,
 ) -> None:
     """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged."""
-    from calibrate.errors import CalibrationError
-    from calibrate.files import check_folder
-    from calibrate.writing.plan_record import PlannedBy
-    from calibrate.writing.practice import TILT_DEG, write_practice
-    from model.characters.brush import Reach
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import check_folder
+    from brushloop.calibrate.writing.plan_record import PlannedBy
+    from brushloop.calibrate.writing.practice import TILT_DEG, write_practice
+    from brushloop.model.characters.brush import Reach
 
     check_folder(out)
     turn_deg_mm = wrist_deg_s / speed_mm_s
@@ -218,8 +218,8 @@ def fit(
     session: Annotated[Path, typer.Argument(help="A calibrated session of a practice sheet, or of any figures.")],
 ) -> None:
     """Fit the footprint of the dragged brush, for `write plan --footprint`."""
-    from calibrate.writing.footprint import fit_session
-    from sessions.progress import shown
+    from brushloop.calibrate.writing.footprint import fit_session
+    from brushloop.sessions.progress import shown
 
     with shown() as progress:
         made, path = fit_session(session, progress)

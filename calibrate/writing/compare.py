@@ -12,20 +12,20 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from calibrate.calibration import Calibration
-from calibrate.compare.field import SIZE_PX, Image, Tone
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.files import read_gray
-from calibrate.session import calibration_of
-from calibrate.stroke.params import Params
-from calibrate.stroke.preprocess import Prepared, prepare
-from calibrate.stroke.rectify import rectify_by
-from calibrate.writing.plan_record import FigureRecord, PlanRecord, points_digest
-from calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
-from sessions.errors import SessionDamaged
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Capture, Recording
-from sessions.recording.schemas import Header
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import SIZE_PX, Image, Tone
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.files import read_gray
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stroke.params import Params
+from brushloop.calibrate.stroke.preprocess import Prepared, prepare
+from brushloop.calibrate.stroke.rectify import rectify_by
+from brushloop.calibrate.writing.plan_record import FigureRecord, PlanRecord, points_digest
+from brushloop.calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording.schemas import Header
 
 SPECK_SHARE = 0.002
 """Lower than for a press: relative to its longest stroke, a character's dot is smaller than a drop is to a press."""

@@ -9,12 +9,12 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from calibrate.artefact import SessionFit, load_artefact, put_to_use
-from calibrate.compare.similarity import binary_scores
-from calibrate.drags.captures import read_drags
-from calibrate.errors import CalibrationError
-from model.footprint import NAMES, Footprint, fit_footprint
-from sessions.progress import Progress, unseen
+from brushloop.calibrate.artefact import SessionFit, load_artefact, put_to_use
+from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.drags.captures import read_drags
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.model.footprint import NAMES, Footprint, fit_footprint
+from brushloop.sessions.progress import Progress, unseen
 
 FOLDER = "footprint"
 MM_PER_PX = 0.5

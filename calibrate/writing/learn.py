@@ -19,18 +19,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import Image
-from calibrate.drags.residual import captured_distance
-from calibrate.errors import CalibrationError
-from calibrate.writing.compare import WritingComparison
-from calibrate.writing.plan_files import as_points, encoded, ways_of
-from calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, Round, arrays
-from calibrate.writing.rounds import round_of
-from model.characters.brush import Reach
-from model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
-from model.characters.phases import Phase, phase_map
-from model.characters.plan import grid, without_tilt
-from model.footprint import NAMES, Footprint, fit_each, fit_footprint
+from brushloop.calibrate.compare.field import Image
+from brushloop.calibrate.drags.residual import captured_distance
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing.compare import WritingComparison
+from brushloop.calibrate.writing.plan_files import as_points, encoded, ways_of
+from brushloop.calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, Round, arrays
+from brushloop.calibrate.writing.rounds import round_of
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
+from brushloop.model.characters.phases import Phase, phase_map
+from brushloop.model.characters.plan import grid, without_tilt
+from brushloop.model.footprint import NAMES, Footprint, fit_each, fit_footprint
 
 Floats = NDArray[np.float64]
 MOST_MM = 1.5

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calibrate.report import picture_grid, save_picture
-from model.characters.phases import Phase, phases_of
+from brushloop.calibrate.report import picture_grid, save_picture
+from brushloop.model.characters.phases import Phase, phases_of
 
 if TYPE_CHECKING:
-    from calibrate.writing.plan import PlannedFigure, Settings
+    from brushloop.calibrate.writing.plan import PlannedFigure, Settings
 
 BLUE = "#2d72ff"
 COLOURS = {

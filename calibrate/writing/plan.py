@@ -11,20 +11,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.similarity import csim, ssim
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded
-from model.characters.brush import Reach
-from model.characters.glyph import MAX_CHARS, Glyph, GlyphError, parse_glyph
-from model.characters.hand import parse_csv, parse_json
-from model.characters.ink import Image, reference, swept, written
-from model.characters.lead import covered, drawn, first_lead, lead
-from model.characters.plan import Cell, paths_of, trajectory
-from model.characters.plan import Path as Way
-from model.characters.refine import refine
-from model.drag import DragModel
-from model.footprint import Footprint
-from model.protocol import StrokeModel
+from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.glyph import MAX_CHARS, Glyph, GlyphError, parse_glyph
+from brushloop.model.characters.hand import parse_csv, parse_json
+from brushloop.model.characters.ink import Image, reference, swept, written
+from brushloop.model.characters.lead import covered, drawn, first_lead, lead
+from brushloop.model.characters.plan import Cell, paths_of, trajectory
+from brushloop.model.characters.plan import Path as Way
+from brushloop.model.characters.refine import refine
+from brushloop.model.drag import DragModel
+from brushloop.model.footprint import Footprint
+from brushloop.model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
@@ -141,7 +141,7 @@ def _hand(path: Path, settings: Settings) -> FigureRequest:
 
 
 def _shipped(name: str) -> Glyph:
-    folder = files("model.characters") / "data"
+    folder = files("brushloop.model.characters") / "data"
     known = sorted(entry.name.removesuffix(".json") for entry in folder.iterdir() if entry.name.endswith(".json"))
     if name not in known:
         raise CalibrationError(

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibrate.compare.field import Image
-from calibrate.report import write_files
-from calibrate.writing.picture import draw
-from calibrate.writing.plan_record import FILE, PROTOCOL, FigureRecord, Floats, PlannedBy, PlanRecord, Points
-from model.characters.plan import Path as Way
-from sessions.recording.messages import encode_png
+from brushloop.calibrate.compare.field import Image
+from brushloop.calibrate.report import write_files
+from brushloop.calibrate.writing.picture import draw
+from brushloop.calibrate.writing.plan_record import FILE, PROTOCOL, FigureRecord, Floats, PlannedBy, PlanRecord, Points
+from brushloop.model.characters.plan import Path as Way
+from brushloop.sessions.recording.messages import encode_png
 
 if TYPE_CHECKING:
-    from calibrate.writing.plan import PlannedFigure, Settings
+    from brushloop.calibrate.writing.plan import PlannedFigure, Settings
 
 PICTURE = "plan.png"
 

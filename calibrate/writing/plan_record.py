@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calibrate.compare.field import SIZE_PX, Image
-from calibrate.errors import CalibrationError, invalid
-from calibrate.files import read_bounded
-from sessions.errors import SessionDamaged
-from sessions.recording.messages import decode_gray
+from brushloop.calibrate.compare.field import SIZE_PX, Image
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import read_bounded
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.recording.messages import decode_gray
 
 FILE, PROTOCOL = "plan.json", "protocol-write.toml"
 """Names of the files of a plan; the protocol is written last."""

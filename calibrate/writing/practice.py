@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.field import SIZE_PX
-from calibrate.writing.plan_files import figure_record, write_record
-from calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord
-from model.characters.brush import Reach
-from model.characters.plan import directions
+from brushloop.calibrate.compare.field import SIZE_PX
+from brushloop.calibrate.writing.plan_files import figure_record, write_record
+from brushloop.calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.plan import directions
 
 Floats = NDArray[np.float64]
 FIGURES, PER_FIGURE = 10, 2

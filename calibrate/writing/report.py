@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from calibrate.compare.field import Alignment, Image, Tone
-from calibrate.compare.similarity import SSIM_SETTINGS, Polarity
-from calibrate.report import (
+from brushloop.calibrate.compare.field import Alignment, Image, Tone
+from brushloop.calibrate.compare.similarity import SSIM_SETTINGS, Polarity
+from brushloop.calibrate.report import (
     csv_text,
     ink_uri,
     overlay,
@@ -24,11 +24,11 @@ from calibrate.report import (
     source_note,
     write_files,
 )
-from calibrate.writing.compare import WritingComparison
-from calibrate.writing.picture import code_points
-from calibrate.writing.rounds import phase_table, round_of
-from calibrate.writing.scores import FILE as NUMBERS
-from calibrate.writing.scores import (
+from brushloop.calibrate.writing.compare import WritingComparison
+from brushloop.calibrate.writing.picture import code_points
+from brushloop.calibrate.writing.rounds import phase_table, round_of
+from brushloop.calibrate.writing.scores import FILE as NUMBERS
+from brushloop.calibrate.writing.scores import (
     HEADLINE,
     PAIRS,
     PICTURE,

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibrate.compare.field import Image, Tone
-from calibrate.writing.compare import as_ink
-from calibrate.writing.plan_files import ways_of
-from calibrate.writing.plan_record import FigureRecord, Round
-from calibrate.writing.scores import HEADLINE, Character, compare_ink
-from model.characters.phases import Phase, phase_map
+from brushloop.calibrate.compare.field import Image, Tone
+from brushloop.calibrate.writing.compare import as_ink
+from brushloop.calibrate.writing.plan_files import ways_of
+from brushloop.calibrate.writing.plan_record import FigureRecord, Round
+from brushloop.calibrate.writing.scores import HEADLINE, Character, compare_ink
+from brushloop.model.characters.phases import Phase, phase_map
 
 
 def round_of(figure: FigureRecord, one: Character, side_mm: float) -> Round:

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, to_tone
-from calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
-from calibrate.compare.similarity import Polarity, similarity
-from calibrate.compare.stats import Summary, summarise
-from calibrate.report import Sealed, load_sealed
-from sessions.recording.schemas import Source
+from brushloop.calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, to_tone
+from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
+from brushloop.calibrate.compare.similarity import Polarity, similarity
+from brushloop.calibrate.compare.stats import Summary, summarise
+from brushloop.calibrate.report import Sealed, load_sealed
+from brushloop.sessions.recording.schemas import Source
 
 FILE, PICTURE = "written.json", "figure-13.png"
 FORMAT = "brushloop-written-1"

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from subprocess import Popen
 
-from calibrate.artefact import artefacts
-from collect.errors import ConfigError
-from collect.headless import stop_signals
-from collect.protocols.config import load_protocol
-from collect.rig.config import load_rig
-from sessions.errors import SessionError
-from sessions.reader import Recording
+from brushloop.calibrate.artefact import artefacts
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.headless import stop_signals
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import load_rig
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.reader import Recording
 
 Say = Callable[[str], None]
 GIVEN_UP = 3

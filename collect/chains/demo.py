@@ -11,19 +11,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.artefact import artefacts
-from calibrate.writing.plan_record import PROTOCOL as WRITE
-from collect.chains.commands import GIVEN_UP, finished_session, run_command
-from collect.chains.demo_rig import DemoRig
-from collect.chains.loop import FITS, LoopRequest, run_loop
-from collect.chains.loop import PAGE as LOOP_PAGE
-from collect.chains.loop import PROTOCOL as REPLAY
-from collect.chains.writing import PAGE as WRITTEN_PAGE
-from collect.chains.writing import Writing, WritingRequest
-from collect.errors import ConfigError
-from model.train import SHIPPED_GENERATOR
-from sessions.folders import open_sessions
-from sessions.terminal import say
+from brushloop.calibrate.artefact import artefacts
+from brushloop.calibrate.writing.plan_record import PROTOCOL as WRITE
+from brushloop.collect.chains.commands import GIVEN_UP, finished_session, run_command
+from brushloop.collect.chains.demo_rig import DemoRig
+from brushloop.collect.chains.loop import FITS, LoopRequest, run_loop
+from brushloop.collect.chains.loop import PAGE as LOOP_PAGE
+from brushloop.collect.chains.loop import PROTOCOL as REPLAY
+from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
+from brushloop.collect.chains.writing import Writing, WritingRequest
+from brushloop.collect.errors import ConfigError
+from brushloop.model.train import SHIPPED_GENERATOR
+from brushloop.sessions.folders import open_sessions
+from brushloop.sessions.terminal import say
 
 CHARACTER = "字"
 

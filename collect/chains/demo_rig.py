@@ -12,9 +12,9 @@ import sys
 import time
 from pathlib import Path
 
-from collect.chains.commands import Say, run_command
-from collect.errors import CollectAborted, ConfigError
-from collect.rig.config import RigConfig, load_rig
+from brushloop.collect.chains.commands import Say, run_command
+from brushloop.collect.errors import CollectAborted, ConfigError
+from brushloop.collect.rig.config import RigConfig, load_rig
 
 START_S = 60.0
 IDLE_EXIT_S = 180.0

@@ -13,15 +13,15 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calibrate.artefact import artefacts, current
-from calibrate.files import read_bounded, write_whole
-from collect.chains.commands import Say, collected_session, run_command
-from collect.engine.open_or_resume import check_fresh_sheet
-from collect.errors import ConfigError
-from collect.rig.config import RigConfig, load_rig
-from collect.rig.config_file import read_text
-from sessions.reader import Recording
-from sessions.recording.schemas import BareName, Header
+from brushloop.calibrate.artefact import artefacts, current
+from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.collect.chains.commands import Say, collected_session, run_command
+from brushloop.collect.engine.open_or_resume import check_fresh_sheet
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.config_file import read_text
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import BareName, Header
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibrate.artefact import current
-from calibrate.writing.plan_record import PROTOCOL, load_plan
-from collect.chains.commands import Say, collected_session, finished_session, run_command
-from collect.engine.open_or_resume import check_fresh_sheet
-from collect.errors import ConfigError
-from collect.protocols.config import load_protocol
-from collect.protocols.write import WriteConfig
-from collect.rig.config import load_rig
+from brushloop.calibrate.artefact import current
+from brushloop.calibrate.writing.plan_record import PROTOCOL, load_plan
+from brushloop.collect.chains.commands import Say, collected_session, finished_session, run_command
+from brushloop.collect.engine.open_or_resume import check_fresh_sheet
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.rig.config import load_rig
 
 PAGE = "written.html"
 FOOTPRINT = "footprint"

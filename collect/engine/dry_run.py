@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from collect.engine.engine import Engine
-from collect.engine.snapshot import Snapshot
-from collect.errors import ConfigError
-from collect.protocols.config import ProtocolConfig
-from collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig
 
 CLEAR_MM = 5.0
 """Least distance of the tip from the paper at the deepest point."""

@@ -17,28 +17,35 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
-from collect.engine.control import FINAL, RunControl, State
-from collect.engine.live import LiveView, watching
-from collect.engine.perform import Performer
-from collect.engine.policy import resume_question
-from collect.engine.progress import Progress
-from collect.engine.run import Run
-from collect.engine.set_up import board_first, listed
-from collect.engine.snapshot import SetUpStep, Snapshot
-from collect.engine.steps.context import RunContext, uninterrupted
-from collect.engine.telemetry import Telemetry, noting_targets, previewing
-from collect.errors import NOT_AT_REST, CollectAborted, ConfigError, brush_may_be_down, describe, rest_is_unknown
-from collect.motion.procedures import Procedures
-from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from collect.planning.walk import layout_of, sheet_of, steps_on
-from collect.protocols.config import ProtocolConfig
-from collect.rig.config import RigConfig
-from collect.rig.devices import Rig, connected
-from drivers.clock import Clock
-from drivers.errors import DeviceError, NotConnected, Stale
-from sessions.errors import SessionError
-from sessions.journal.journal import JOURNAL_NAME, replay
-from sessions.store import SessionStore
+from brushloop.collect.engine.control import FINAL, RunControl, State
+from brushloop.collect.engine.live import LiveView, watching
+from brushloop.collect.engine.perform import Performer
+from brushloop.collect.engine.policy import resume_question
+from brushloop.collect.engine.progress import Progress
+from brushloop.collect.engine.run import Run
+from brushloop.collect.engine.set_up import board_first, listed
+from brushloop.collect.engine.snapshot import SetUpStep, Snapshot
+from brushloop.collect.engine.steps.context import RunContext, uninterrupted
+from brushloop.collect.engine.telemetry import Telemetry, noting_targets, previewing
+from brushloop.collect.errors import (
+    NOT_AT_REST,
+    CollectAborted,
+    ConfigError,
+    brush_may_be_down,
+    describe,
+    rest_is_unknown,
+)
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
+from brushloop.collect.planning.walk import layout_of, sheet_of, steps_on
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import Rig, connected
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceError, NotConnected, Stale
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.store import SessionStore
 
 PARKED_MM = 2.0
 """Distance from the park position, in mm, within which the arm counts as parked."""

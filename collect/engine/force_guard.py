@@ -8,10 +8,10 @@ from collections.abc import Callable, Coroutine, Generator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from collect.errors import ForceTooHigh, describe
-from collect.rig.devices import Rig
-from drivers.errors import DeviceError, MotionFailed
-from drivers.samples import ForceSample
+from brushloop.collect.errors import ForceTooHigh, describe
+from brushloop.collect.rig.devices import Rig
+from brushloop.drivers.errors import DeviceError, MotionFailed
+from brushloop.drivers.samples import ForceSample
 
 CHECK_S = 0.02
 """Time between checks for a silent sensor: silence must not be mistaken for zero force."""

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibrate.compare.field import SIZE_PX, Field, Tone, captured_mm
-from calibrate.compare.similarity import csim
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import rectify
-from collect.quality.verdict import Verdict
-from collect.rig.paper import Cell
-from model.fitted import FittedPress
+from brushloop.calibrate.compare.field import SIZE_PX, Field, Tone, captured_mm
+from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import rectify
+from brushloop.collect.quality.verdict import Verdict
+from brushloop.collect.rig.paper import Cell
+from brushloop.model.fitted import FittedPress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from calibrate.board.pix2len import Plane
-    from calibrate.stroke.params import Gray
+    from brushloop.calibrate.board.pix2len import Plane
+    from brushloop.calibrate.stroke.params import Gray
 
 FIELD = Field()
 FINE = 8

@@ -13,20 +13,20 @@ import time
 from collections.abc import AsyncGenerator, Callable
 from typing import TYPE_CHECKING, Any, cast
 
-from collect.engine.telemetry import FRAME_PERIOD_S, each_frame
-from collect.errors import ConfigError
-from drivers.protocols import Camera
-from drivers.samples import Frame
-from sessions.errors import SessionDamaged
-from sessions.recording.messages import decode_gray, image_message
-from sessions.recording.schemas import Topic
-from sessions.recording.writer import ChannelTable, Outgoing
+from brushloop.collect.engine.telemetry import FRAME_PERIOD_S, each_frame
+from brushloop.collect.errors import ConfigError
+from brushloop.drivers.protocols import Camera
+from brushloop.drivers.samples import Frame
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.recording.messages import decode_gray, image_message
+from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.recording.writer import ChannelTable, Outgoing
 
 if TYPE_CHECKING:
     from foxglove import Channel
 
-    from sessions.recording.mcap_writer import McapWriter
-    from sessions.recording.messages import CompressedImage
+    from brushloop.sessions.recording.mcap_writer import McapWriter
+    from brushloop.sessions.recording.messages import CompressedImage
 
 HOST = "127.0.0.1"
 """Loopback only, and not configurable, because a viewer needs no password."""

@@ -14,21 +14,21 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
-from collect.engine.dry_run import lifted
-from collect.errors import ConfigError
-from collect.protocols.config import ProtocolConfig, load_protocol
-from collect.protocols.steps import StepKind
-from collect.rig.config import RigConfig, load_rig, overrides
-from collect.rig.devices import Rig
-from drivers.clock import Clock
-from drivers.samples import Identity
-from sessions.difference import ABSENT, Difference, differences
-from sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unwritable
-from sessions.errors import SessionError
-from sessions.folders import next_session_id, open_sessions
-from sessions.journal.journal import JOURNAL_NAME, replay
-from sessions.recording.schemas import Header, Source
-from sessions.store import SessionStore, Snapshots
+from brushloop.collect.engine.dry_run import lifted
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.rig.config import RigConfig, load_rig, overrides
+from brushloop.collect.rig.devices import Rig
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.samples import Identity
+from brushloop.sessions.difference import ABSENT, Difference, differences
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unwritable
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.folders import next_session_id, open_sessions
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.store import SessionStore, Snapshots
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
 COMPARED = (RIG_EFFECTIVE, PROTOCOL_EFFECTIVE)

@@ -6,18 +6,18 @@ import asyncio
 import contextlib
 from typing import Any
 
-from collect.engine.force_guard import ForceGuard
-from collect.engine.live import LiveView
-from collect.engine.recorder import Recorder
-from collect.engine.steps import capture, dip, press, retake, touch
-from collect.engine.steps.context import RunContext, StepContext, uninterrupted
-from collect.engine.telemetry import Telemetry
-from collect.errors import PosesLate, describe
-from collect.operator import OperatorRequest
-from collect.protocols.steps import MARKING, Result, Step, StepKind
-from collect.touch.selfcheck import partners
-from drivers.errors import ArmMoved
-from sessions.recording.schemas import StepEvent
+from brushloop.collect.engine.force_guard import ForceGuard
+from brushloop.collect.engine.live import LiveView
+from brushloop.collect.engine.recorder import Recorder
+from brushloop.collect.engine.steps import capture, dip, press, retake, touch
+from brushloop.collect.engine.steps.context import RunContext, StepContext, uninterrupted
+from brushloop.collect.engine.telemetry import Telemetry
+from brushloop.collect.errors import PosesLate, describe
+from brushloop.collect.operator import OperatorRequest
+from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.touch.selfcheck import partners
+from brushloop.drivers.errors import ArmMoved
+from brushloop.sessions.recording.schemas import StepEvent
 
 HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
 """Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""

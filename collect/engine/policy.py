@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from collect.errors import BadPicture, ForceTooHigh, JogGivenUp, NeedsOperator, SheetFull, StepError, StepVoid, describe
-from collect.operator import Choice, Prompt
-from collect.protocols.steps import Step, StepKind
-from drivers.errors import (
+from brushloop.collect.errors import (
+    BadPicture,
+    ForceTooHigh,
+    JogGivenUp,
+    NeedsOperator,
+    SheetFull,
+    StepError,
+    StepVoid,
+    describe,
+)
+from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.drivers.errors import (
     ArmMoved,
     DeviceError,
     DeviceTimeout,
@@ -18,7 +27,7 @@ from drivers.errors import (
     SettingsChanged,
     Stuck,
 )
-from drivers.ink.port import InkRefused
+from brushloop.drivers.ink.port import InkRefused
 
 MAX_FAILURES = 3
 """Failures of one step after which a person decides: so many are no coincidence."""

@@ -9,17 +9,17 @@ from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 
-from collect.engine.control import State
-from collect.engine.last_capture import LastCapture
-from collect.engine.snapshot import CellCount, Snapshot, in_set_up
-from collect.engine.tally import Place, Tally
-from collect.operator import Prompt
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.plan import AGAIN, Planned, with_review
-from collect.protocols.steps import MARKING, Result, Step, StepKind
-from collect.rig.paper import Layout, Sheet
-from drivers.clock import Clock
-from sessions.store import SessionStore
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.last_capture import LastCapture
+from brushloop.collect.engine.snapshot import CellCount, Snapshot, in_set_up
+from brushloop.collect.engine.tally import Place, Tally
+from brushloop.collect.operator import Prompt
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.protocols.plan import AGAIN, Planned, with_review
+from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.rig.paper import Layout, Sheet
+from brushloop.drivers.clock import Clock
+from brushloop.sessions.store import SessionStore
 
 LOG_LINES = 200
 

@@ -8,10 +8,10 @@ from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING
 
-from drivers.clock import Clock
-from drivers.samples import ForceSample, Frame, PoseSample, Stamp
-from sessions.errors import SessionError
-from sessions.recording.messages import (
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.samples import ForceSample, Frame, PoseSample, Stamp
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.recording.messages import (
     Transform,
     calibration_message,
     encode_png,
@@ -21,7 +21,7 @@ from sessions.recording.messages import (
     pose_message,
     transforms_message,
 )
-from sessions.recording.schemas import (
+from brushloop.sessions.recording.schemas import (
     Cadence,
     Event,
     InkState,
@@ -32,12 +32,12 @@ from sessions.recording.schemas import (
     Topic,
     Wrench,
 )
-from sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-    from calibrate.board.lens import LensUsed
+    from brushloop.calibrate.board.lens import LensUsed
 
 POSE_HZ = 100.0
 """Rate at which the driver asks the arm for its pose."""

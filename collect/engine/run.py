@@ -7,20 +7,20 @@ import itertools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from collect.engine.control import RunControl, State
-from collect.engine.perform import Performer
-from collect.engine.policy import GO_ON, STOP, Action, decide, question
-from collect.engine.set_up import again
-from collect.engine.set_up import question as set_up_question
-from collect.engine.snapshot import in_set_up
-from collect.engine.steps.context import RunContext
-from collect.engine.steps.retake import marked_bad
-from collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
-from collect.operator import Choice, OperatorRequest, Prompt
-from collect.protocols.plan import takes
-from collect.protocols.steps import Protocol, Result, Step, StepKind
-from drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
-from sessions.errors import SessionError
+from brushloop.collect.engine.control import RunControl, State
+from brushloop.collect.engine.perform import Performer
+from brushloop.collect.engine.policy import GO_ON, STOP, Action, decide, question
+from brushloop.collect.engine.set_up import again
+from brushloop.collect.engine.set_up import question as set_up_question
+from brushloop.collect.engine.snapshot import in_set_up
+from brushloop.collect.engine.steps.context import RunContext
+from brushloop.collect.engine.steps.retake import marked_bad
+from brushloop.collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
+from brushloop.collect.operator import Choice, OperatorRequest, Prompt
+from brushloop.collect.protocols.plan import takes
+from brushloop.collect.protocols.steps import Protocol, Result, Step, StepKind
+from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
+from brushloop.sessions.errors import SessionError
 
 KEEP_SHEET = Choice("o", "keep the old sheet")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from calibrate.board.pix2len import WORST_RMS_PX
-from collect.engine.policy import GO_ON, KEEP, STOP
-from collect.engine.snapshot import SET_UP, TITLES, Fact, SetUpStep, Standing
-from collect.operator import Choice, Prompt
-from collect.protocols.steps import Protocol, Result, Step, StepKind
-from collect.rig.config import RigConfig
+from brushloop.calibrate.board.pix2len import WORST_RMS_PX
+from brushloop.collect.engine.policy import GO_ON, KEEP, STOP
+from brushloop.collect.engine.snapshot import SET_UP, TITLES, Fact, SetUpStep, Standing
+from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.protocols.steps import Protocol, Result, Step, StepKind
+from brushloop.collect.rig.config import RigConfig
 
 AGAIN = Choice("a", "measure again")
 BY_JOG, BY_FORCE = Choice("b", "measure by jog"), Choice("f", "measure by force")

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
-from collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import Step, StepKind
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from collect.engine.control import State
-    from collect.engine.last_capture import LastCapture
-    from collect.operator import OperatorRequest, Prompt
+    from brushloop.collect.engine.control import State
+    from brushloop.collect.engine.last_capture import LastCapture
+    from brushloop.collect.operator import OperatorRequest, Prompt
 
 
 @dataclass(frozen=True, slots=True)

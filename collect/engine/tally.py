@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from collect.engine.snapshot import Mark, SheetMap
-from collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.engine.snapshot import Mark, SheetMap
+from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
 
 if TYPE_CHECKING:
-    from sessions.journal.journal import Replay
+    from brushloop.sessions.journal.journal import Replay
 
 Place = tuple[int, int]
 """Sheet and paper cell, both from 0."""

@@ -14,13 +14,13 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from calibrate.stroke.params import Gray
-from collect.engine.snapshot import Picture
-from collect.quality.measure import blur_px
-from collect.rig.optics import gray
-from drivers.errors import DeviceError
-from drivers.protocols import Camera, Robot
-from drivers.samples import ForceSample, Frame, Pose, QueuedLine, Stamp
+from brushloop.calibrate.stroke.params import Gray
+from brushloop.collect.engine.snapshot import Picture
+from brushloop.collect.quality.measure import blur_px
+from brushloop.collect.rig.optics import gray
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.protocols import Camera, Robot
+from brushloop.drivers.samples import ForceSample, Frame, Pose, QueuedLine, Stamp
 
 SLOT_NS = 100_000_000
 """Time that one value of the trace covers. The value is the peak force, so that a short peak is seen."""

@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from collect.protocols.plan import TrajectoryPoint
-from collect.rig.config import RigConfig, WashConfig
-from collect.rig.paper import Cell, PaperPlane, to_base
-from drivers.geometry import brush_pose, interpolate, lean
-from drivers.samples import Pose
+from brushloop.collect.protocols.plan import TrajectoryPoint
+from brushloop.collect.rig.config import RigConfig, WashConfig
+from brushloop.collect.rig.paper import Cell, PaperPlane, to_base
+from brushloop.drivers.geometry import brush_pose, interpolate, lean
+from brushloop.drivers.samples import Pose
 
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""

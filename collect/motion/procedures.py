@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from collect.errors import StepVoid
-from collect.motion.moves import (
+from brushloop.collect.errors import StepVoid
+from brushloop.collect.motion.moves import (
     Move,
     commanded,
     inking_moves,
@@ -17,14 +17,14 @@ from collect.motion.moves import (
     stroke_moves,
     zero_touch_moves,
 )
-from collect.photograph.photographer import ArmTrips, Photographer
-from collect.protocols.plan import Drawn, TrajectoryPoint
-from collect.rig.config import RigConfig
-from collect.rig.devices import Rig, limits_of
-from collect.rig.paper import Cell, PaperPlane, to_paper
-from drivers.limits import Limits
-from drivers.protocols import Robot
-from drivers.samples import Frame, QueuedLine
+from brushloop.collect.photograph.photographer import ArmTrips, Photographer
+from brushloop.collect.protocols.plan import Drawn, TrajectoryPoint
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import Rig, limits_of
+from brushloop.collect.rig.paper import Cell, PaperPlane, to_paper
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.protocols import Robot
+from brushloop.drivers.samples import Frame, QueuedLine
 
 DEPTH_TOLERANCE_MM = 0.1
 """How far the depth at the end of the dwell may be from the requested one."""

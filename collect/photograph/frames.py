@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.photograph.delay import FrameChange
-from collect.rig.optics import gray
-from drivers.protocols import Camera
-from drivers.samples import Frame, Stamp
+from brushloop.collect.photograph.delay import FrameChange
+from brushloop.collect.rig.optics import gray
+from brushloop.drivers.protocols import Camera
+from brushloop.drivers.samples import Frame, Stamp
 
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160

@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats
-from calibrate.board.pix2len import apply, local_scale
-from calibrate.board.view import see_board
-from calibrate.errors import CalibrationError
-from calibrate.stroke.params import PX_PER_MM
-from calibrate.stroke.rectify import rectify
-from collect.errors import StepError
-from collect.rig.config import RigConfig
-from collect.rig.optics import Gray, undistorted
-from drivers.samples import Frame
+from brushloop.calibrate.board.lens import Floats
+from brushloop.calibrate.board.pix2len import apply, local_scale
+from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.stroke.rectify import rectify
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.optics import Gray, undistorted
+from brushloop.drivers.samples import Frame
 
 DARK_SHARE = 0.5
 """Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""

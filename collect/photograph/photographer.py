@@ -13,14 +13,14 @@ import math
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
-from collect.errors import ArmInPicture, CameraLate
-from collect.photograph.delay import ArmPlace, CameraDelay, Look, look
-from collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
-from collect.rig.config_devices import CameraConfig
-from drivers.clock import Clock
-from drivers.errors import DeviceError
-from drivers.protocols import Camera, Robot
-from drivers.samples import Frame
+from brushloop.collect.errors import ArmInPicture, CameraLate
+from brushloop.collect.photograph.delay import ArmPlace, CameraDelay, Look, look
+from brushloop.collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
+from brushloop.collect.rig.config_devices import CameraConfig
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.protocols import Camera, Robot
+from brushloop.drivers.samples import Frame
 
 FEWEST_LOOKS, MOST_LOOKS, MOST_EXACT_LOOKS = 2, 6, 8
 ATTEMPTS = 4

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from collect.motion.moves import Move, Room, Way
-from collect.planning.walk import StepMoves
-from collect.rig.config import BrushConfig, RigConfig
-from collect.rig.config_devices import ModbusPumpConfig
-from collect.rig.devices import limits_of
-from drivers.limits import Limits
-from drivers.samples import Pose
+from brushloop.collect.motion.moves import Move, Room, Way
+from brushloop.collect.planning.walk import StepMoves
+from brushloop.collect.rig.config import BrushConfig, RigConfig
+from brushloop.collect.rig.config_devices import ModbusPumpConfig
+from brushloop.collect.rig.devices import limits_of
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import Pose
 
 SETTLE_S = 0.12
 """Time from the end of a ramp to the next command: the controller's lag in reporting rest, half a poll, the calls.

@@ -9,25 +9,25 @@ import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from collect.errors import ConfigError, StepError
-from collect.motion.moves import park_moves
-from collect.planning.walk import moves_of, sheet_of, steps_on
-from collect.protocols.calibration import CalibrationConfig
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.presses import GridConfig
-from collect.protocols.steps import MARKING, Result, Step, StepKind
-from collect.protocols.write import WriteConfig
-from collect.rig.config import RigConfig
-from collect.rig.devices import limits_of
-from collect.rig.paper import Cell, PaperPlane, Sheet
-from collect.touch.selfcheck import triangle_in
-from drivers.arcs.controller import Controller, six
-from drivers.arcs.robot import AUBOPE_PORT
-from drivers.arcs.rpc import RpcConnection, open_arcs
-from drivers.errors import LimitExceeded, ProtocolViolation
-from drivers.geometry import from_wire, to_wire
-from drivers.rotation import inverse, product, turned
-from drivers.samples import Pose
+from brushloop.collect.errors import ConfigError, StepError
+from brushloop.collect.motion.moves import park_moves
+from brushloop.collect.planning.walk import moves_of, sheet_of, steps_on
+from brushloop.collect.protocols.calibration import CalibrationConfig
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import limits_of
+from brushloop.collect.rig.paper import Cell, PaperPlane, Sheet
+from brushloop.collect.touch.selfcheck import triangle_in
+from brushloop.drivers.arcs.controller import Controller, six
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.arcs.rpc import RpcConnection, open_arcs
+from brushloop.drivers.errors import LimitExceeded, ProtocolViolation
+from brushloop.drivers.geometry import from_wire, to_wire
+from brushloop.drivers.rotation import inverse, product, turned
+from brushloop.drivers.samples import Pose
 
 TOUCH_CLEAR_MM = 5.0
 MARKED = {"sheet": 0, "cell": 0}

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from collect.planning.summary import PlacedStroke, Plan
-from collect.planning.walk import sheet_of
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.plan import Drawn
-from collect.rig.config import RigConfig
-from collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
-from collect.rig.paper import Sheet, to_paper
-from collect.touch.selfcheck import partners
+from brushloop.collect.planning.summary import PlacedStroke, Plan
+from brushloop.collect.planning.walk import sheet_of
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.protocols.plan import Drawn
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
+from brushloop.collect.rig.paper import Sheet, to_paper
+from brushloop.collect.touch.selfcheck import partners
 
 MOST_SHEETS = 11
 """Most sheets drawn: with the view of the whole table, twelve panels."""

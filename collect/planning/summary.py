@@ -10,18 +10,18 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from collect.errors import StepError
-from collect.motion.moves import park_moves
-from collect.planning.estimate import OMITTED, InkNeed, ink_need, reach_of, step_s
-from collect.planning.walk import StepMoves, Walked, sheet_of, walk
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.presses import ReplayConfig
-from collect.protocols.steps import MARKING, StepKind
-from collect.protocols.write import WriteConfig
-from collect.rig.config import RigConfig
-from collect.rig.paper import Cell, Sheet
-from collect.touch.selfcheck import triangle_in
-from drivers.samples import Pose
+from brushloop.collect.errors import StepError
+from brushloop.collect.motion.moves import park_moves
+from brushloop.collect.planning.estimate import OMITTED, InkNeed, ink_need, reach_of, step_s
+from brushloop.collect.planning.walk import StepMoves, Walked, sheet_of, walk
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.protocols.presses import ReplayConfig
+from brushloop.collect.protocols.steps import MARKING, StepKind
+from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.paper import Cell, Sheet
+from brushloop.collect.touch.selfcheck import triangle_in
+from brushloop.drivers.samples import Pose
 
 STROKES = frozenset({StepKind.PRESS, StepKind.DRAW})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from collect.motion.moves import (
+from brushloop.collect.motion.moves import (
     Part,
     Room,
     commanded,
@@ -18,16 +18,16 @@ from collect.motion.moves import (
     visit_moves,
     zero_touch_moves,
 )
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.plan import Drawn
-from collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
-from collect.rig.config import RigConfig
-from collect.rig.config_touch import TouchConfig
-from collect.rig.paper import Cell, Layout, PaperPlane, Sheet
-from collect.touch.heights import lowest_z_mm
-from collect.touch.places import patch_spots, touch_rects
-from collect.touch.selfcheck import partners, triangle_on
-from drivers.samples import Pose
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.protocols.plan import Drawn
+from brushloop.collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.paper import Cell, Layout, PaperPlane, Sheet
+from brushloop.collect.touch.heights import lowest_z_mm
+from brushloop.collect.touch.places import patch_spots, touch_rects
+from brushloop.collect.touch.selfcheck import partners, triangle_on
+from brushloop.drivers.samples import Pose
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, BaseModel, Field
 
-from collect.protocols.plan import Planned, stroke_steps
-from collect.protocols.steps import Protocol
-from collect.rig.config_file import Config
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.plan import Planned, stroke_steps
+from brushloop.collect.protocols.steps import Protocol
+from brushloop.collect.rig.config_file import Config
+from brushloop.collect.rig.paper import Layout
 
 MAX_STROKES = 10_000
 """Most strokes of one protocol, repeats included: a month of pressing."""

@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from collect.protocols.base import ProtocolBase, check_count
-from collect.protocols.steps import Protocol, Step, StepKind
-from collect.rig.config_file import Finite
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.base import ProtocolBase, check_count
+from brushloop.collect.protocols.steps import Protocol, Step, StepKind
+from brushloop.collect.rig.config_file import Finite
+from brushloop.collect.rig.paper import Layout
 
 
 class CalibrationConfig(ProtocolBase):

@@ -15,13 +15,13 @@ from typing import Annotated, Any, TypeVar, get_args
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from collect.errors import ConfigError
-from collect.protocols.base import MAX_STROKES, ProtocolBase
-from collect.protocols.calibration import CalibrationConfig
-from collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
-from collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
-from collect.rig.config_file import read_text, read_toml, refusal
-from sessions.cells import as_text, number
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.base import MAX_STROKES, ProtocolBase
+from brushloop.collect.protocols.calibration import CalibrationConfig
+from brushloop.collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
+from brushloop.collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
+from brushloop.collect.rig.config_file import read_text, read_toml, refusal
+from brushloop.sessions.cells import as_text, number
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
 MAX_EFFECTIVE_BYTES = 64 * 1024 * 1024

@@ -17,8 +17,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from collect.protocols.steps import Params, Protocol, Result, Step, StepKind
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.steps import Params, Protocol, Result, Step, StepKind
+from brushloop.collect.rig.paper import Layout
 
 InCellMm = Annotated[float, Field(ge=0.0, le=500.0)]
 PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from calibrate.spread import spread_out
-from collect.protocols.base import (
+from brushloop.calibrate.spread import spread_out
+from brushloop.collect.protocols.base import (
     MAX_STROKES,
     DeepMm,
     DwellS,
@@ -22,9 +22,9 @@ from collect.protocols.base import (
     check_distinct,
     stroke_id_problem,
 )
-from collect.protocols.plan import Planned, TiltDeg, numbered, shuffled
-from collect.rig.config_file import Config
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.plan import Planned, TiltDeg, numbered, shuffled
+from brushloop.collect.rig.config_file import Config
+from brushloop.collect.rig.paper import Layout
 
 
 class GridConfig(ProtocolBase):

@@ -7,10 +7,27 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from collect.protocols.base import FileName, ProtocolBase, Repeats, Seed, check_count, check_distinct, stroke_id_problem
-from collect.protocols.plan import Drawn, HeadingDeg, InCellMm, PathDepthMm, Planned, TiltDeg, TrajectoryPoint, shuffled
-from collect.rig.config_file import Config
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.base import (
+    FileName,
+    ProtocolBase,
+    Repeats,
+    Seed,
+    check_count,
+    check_distinct,
+    stroke_id_problem,
+)
+from brushloop.collect.protocols.plan import (
+    Drawn,
+    HeadingDeg,
+    InCellMm,
+    PathDepthMm,
+    Planned,
+    TiltDeg,
+    TrajectoryPoint,
+    shuffled,
+)
+from brushloop.collect.rig.config_file import Config
+from brushloop.collect.rig.paper import Layout
 
 MAX_POINTS = 10_000
 """Most points in all trajectories of one protocol together."""

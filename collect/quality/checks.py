@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.board.pix2len import Plane
-from calibrate.stroke.params import PX_PER_MM, Gray, Params
-from calibrate.stroke.rectify import rectify
-from collect.quality import measure
-from collect.quality.ink import Ink, Point, Rect, around, mm2, on_sheet, take, tell_apart
-from collect.quality.measure import Mark, measure_mark
-from collect.quality.verdict import Check, Failure, Verdict
-from collect.rig.config_quality import QualityConfig
-from collect.rig.paper import Cell
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
+from brushloop.calibrate.stroke.rectify import rectify
+from brushloop.collect.quality import measure
+from brushloop.collect.quality.ink import Ink, Point, Rect, around, mm2, on_sheet, take, tell_apart
+from brushloop.collect.quality.measure import Mark, measure_mark
+from brushloop.collect.quality.verdict import Check, Failure, Verdict
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.paper import Cell
 
 MARGIN_MM = 4.0
 """Margin around the cell in which a stroke that leaves it is looked for."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibrate.board.lens import Floats
-from calibrate.board.pix2len import apply
-from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
-from calibrate.stroke.preprocess import flatten
-from calibrate.stroke.rectify import rectify
+from brushloop.calibrate.board.lens import Floats
+from brushloop.calibrate.board.pix2len import apply
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
+from brushloop.calibrate.stroke.preprocess import flatten
+from brushloop.calibrate.stroke.rectify import rectify
 
 Rect = tuple[float, float, float, float]
 """x, y, width, height in the paper frame, mm."""

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.lens import Floats
-from calibrate.board.pix2len import Plane, apply
-from calibrate.stroke.params import PX_PER_MM, Gray, Mask, Soft
-from collect.quality.ink import Ink, Point
+from brushloop.calibrate.board.lens import Floats
+from brushloop.calibrate.board.pix2len import Plane, apply
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Soft
+from brushloop.collect.quality.ink import Ink, Point
 
 FINE_PX, WIDE_PX = 1.0, 2.0
 """Two blurs that are added; the ratio of an edge's slopes after each gives the edge's own blur."""

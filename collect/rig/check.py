@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 from rich.text import Text
 
-from calibrate.board.spec import size_mm
-from collect.rig import plausible
-from collect.rig.config import RigConfig
-from collect.rig.config_devices import CameraConfig
-from collect.rig.devices import limits_of
-from collect.rig.paper import Sheet, to_paper
-from collect.rig.places import places_of
-from collect.rig.plausible import Check, unmeasured, within
+from brushloop.calibrate.board.spec import size_mm
+from brushloop.collect.rig import plausible
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_devices import CameraConfig
+from brushloop.collect.rig.devices import limits_of
+from brushloop.collect.rig.paper import Sheet, to_paper
+from brushloop.collect.rig.places import places_of
+from brushloop.collect.rig.plausible import Check, unmeasured, within
 
 COLOURS = {"plausible": "green", "contradicts": "red", "not measured": "yellow"}
 

@@ -18,13 +18,23 @@ from pydantic_settings import (
     SettingsError,
 )
 
-from calibrate.board.spec import BoardSpec
-from collect.errors import ConfigError
-from collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
-from collect.rig.config_file import Config, Finite, PaperSide, models_at, nearest, paths, place, read_toml, refusal
-from collect.rig.config_quality import QualityConfig
-from collect.rig.config_touch import SelfCheckConfig, TouchConfig
-from collect.rig.optics import with_optics
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
+from brushloop.collect.rig.config_file import (
+    Config,
+    Finite,
+    PaperSide,
+    models_at,
+    nearest,
+    paths,
+    place,
+    read_toml,
+    refusal,
+)
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import SelfCheckConfig, TouchConfig
+from brushloop.collect.rig.optics import with_optics
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
 

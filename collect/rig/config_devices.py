@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from calibrate.board.lens import LensUsed
-from collect.rig.config_file import Config, Finite, Positive, Range
-from drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.calibrate.board.lens import LensUsed
+from brushloop.collect.rig.config_file import Config, Finite, Positive, Range
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
 MOST_STALE_MS = 100.0

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from collect.errors import ConfigError
-from sessions.disk import read_bounded
-from sessions.errors import InputError
+from brushloop.collect.errors import ConfigError
+from brushloop.sessions.disk import read_bounded
+from brushloop.sessions.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from collect.rig.config_file import Config, Finite, Positive
+from brushloop.collect.rig.config_file import Config, Finite, Positive
 
 Method = Literal["taught", "force", "camera", "jog"]
 Step = Annotated[float, Field(ge=0.01, le=5.0)]

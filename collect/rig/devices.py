@@ -8,20 +8,20 @@ import socket
 from collections.abc import AsyncGenerator, Callable, Generator
 from dataclasses import dataclass
 
-from collect.errors import ConfigError
-from collect.rig.config import RigConfig
-from collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
-from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.camera import CameraOptions, Locked, OpenCvCamera
-from drivers.clock import Clock
-from drivers.errors import noting_lateness
-from drivers.exclusive import Claimed, claimed
-from drivers.force.sri_m8123 import SriM8123, SriOptions
-from drivers.ink.pump import ModbusPump, PumpOptions
-from drivers.ink.station import InkStation, StationOptions
-from drivers.limits import Limits
-from drivers.protocols import Camera, ForceSensor, Ink, Robot
-from drivers.samples import Identity
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
+from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import noting_lateness
+from brushloop.drivers.exclusive import Claimed, claimed
+from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.ink.pump import ModbusPump, PumpOptions
+from brushloop.drivers.ink.station import InkStation, StationOptions
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.protocols import Camera, ForceSensor, Ink, Robot
+from brushloop.drivers.samples import Identity
 
 FORCE_CONNECT_S = 10.0
 """Time to open the bus, even through a gateway, and get a first round."""

@@ -13,16 +13,16 @@ from typing import Any, TypeVar
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.board.view import see_board
-from calibrate.errors import CalibrationError
-from collect.rig.config import RigConfig
-from collect.rig.config_devices import ForceConfig, InkDeviceConfig
-from collect.rig.devices import make_camera, make_force, make_ink, make_robot
-from collect.rig.optics import lens_of
-from drivers.arcs.codes import MOVING_ALLOWED, RobotMode
-from drivers.clock import Clock
-from drivers.errors import DeviceError
-from drivers.samples import Identity, Stamp
+from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig
+from brushloop.collect.rig.devices import make_camera, make_force, make_ink, make_robot
+from brushloop.collect.rig.optics import lens_of
+from brushloop.drivers.arcs.codes import MOVING_ALLOWED, RobotMode
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.samples import Identity, Stamp
 
 T = TypeVar("T")
 CALLS = 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from collect.errors import ConfigError
+from brushloop.collect.errors import ConfigError
 
 Axes = Any
 """Axes of matplotlib, whose types are incomplete."""

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.artefact import read_lens
-from calibrate.board.lens import Lens
-from calibrate.errors import CalibrationError
-from collect.errors import ConfigError, StepError
-from collect.rig.config_devices import CameraConfig
+from brushloop.calibrate.board.artefact import read_lens
+from brushloop.calibrate.board.lens import Lens
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.errors import ConfigError, StepError
+from brushloop.collect.rig.config_devices import CameraConfig
 
 Gray = NDArray[np.uint8]
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.errors import SheetFull, StepError
-from collect.rig.config import PaperConfig
-from drivers.geometry import brush_pose
-from drivers.rotation import Quaternion, of_angles, product, turned, unit
-from drivers.samples import Pose
+from brushloop.collect.errors import SheetFull, StepError
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.rotation import Quaternion, of_angles, product, turned, unit
+from brushloop.drivers.samples import Pose
 
 
 @dataclass(frozen=True, slots=True)

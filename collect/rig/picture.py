@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from collect.rig.config import RigConfig
-from collect.rig.devices import limits_of
-from collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
-from collect.rig.paper import to_base
-from collect.rig.places import Kind, Place, places_of
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import limits_of
+from brushloop.collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
+from brushloop.collect.rig.paper import to_base
+from brushloop.collect.rig.places import Kind, Place, places_of
 
 MARKS: dict[Kind, tuple[str, str, str]] = {
     "well": ("o", BLUE, "well"),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from collect.rig.config import RigConfig
-from collect.rig.paper import to_base, to_paper
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.paper import to_base, to_paper
 
 Kind = Literal["sheet", "touch", "well", "rim", "pot", "park"]
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from collect.rig.places import Place
+from brushloop.collect.rig.places import Place
 
 Span = tuple[float, float]
 Box = tuple[Span, Span, Span]

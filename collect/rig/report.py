@@ -20,13 +20,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from collect.errors import ConfigError
-from collect.rig.check import check_rig
-from collect.rig.config import RigConfig
-from collect.rig.doctor import Finding
-from collect.rig.scrub import Scrubber, numbers_only, scrubber_of
-from drivers.arcs.rpc import Framing
-from drivers.arcs.survey import Exchange, rtde_answers, survey
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.check import check_rig
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.doctor import Finding
+from brushloop.collect.rig.scrub import Scrubber, numbers_only, scrubber_of
+from brushloop.drivers.arcs.rpc import Framing
+from brushloop.drivers.arcs.survey import Exchange, rtde_answers, survey
 
 FORMAT = 1
 ENDING = ".zip"

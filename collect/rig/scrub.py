@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from collect.rig.config import PREFIX, RigConfig
+from brushloop.collect.rig.config import PREFIX, RigConfig
 
 SHORTEST = 3
 """A shorter name would be found within ordinary words."""

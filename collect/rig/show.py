@@ -7,9 +7,9 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
-from collect.rig.config import RigConfig
-from collect.rig.devices import limits_of
-from collect.rig.places import places_of
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import limits_of
+from brushloop.collect.rig.places import places_of
 
 
 def rig_table(config: RigConfig) -> Group:

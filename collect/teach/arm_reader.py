@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
-from drivers.arcs.controller import six
-from drivers.arcs.framing import numbers
-from drivers.arcs.robot import AUBOPE_PORT
-from drivers.arcs.rpc import DEVICE, Framing, RpcConnection, open_arcs
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
-from drivers.geometry import distance, from_wire
-from drivers.samples import Pose
+from brushloop.drivers.arcs.codes import LOOPBACK_CONTROL_BOX
+from brushloop.drivers.arcs.controller import six
+from brushloop.drivers.arcs.framing import numbers
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.arcs.rpc import DEVICE, Framing, RpcConnection, open_arcs
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
+from brushloop.drivers.geometry import distance, from_wire
+from brushloop.drivers.samples import Pose
 
 READ_ONLY = frozenset(
     {

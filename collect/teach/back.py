@@ -6,9 +6,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from collect.operator import Choice
-from collect.teach.guide import Brought, Guide, JogStep, JogView, Shown, StepState, Target
-from collect.teach.store import Notebook
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.guide import Brought, Guide, JogStep, JogView, Shown, StepState, Target
+from brushloop.collect.teach.store import Notebook
 
 Answer = str | float | Brought
 AnyAnswer = TypeVar("AnyAnswer", str, float, Brought)

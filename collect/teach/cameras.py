@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.rig.config_devices import LockedConfig
-from collect.rig.optics import gray
-from collect.teach.store import Notebook
-from drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
-from drivers.clock import Clock
-from drivers.samples import Stamp
+from brushloop.collect.rig.config_devices import LockedConfig
+from brushloop.collect.rig.optics import gray
+from brushloop.collect.teach.store import Notebook
+from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.samples import Stamp
 
 Gray = NDArray[np.uint8]
 LATE_MS = 2500.0

@@ -7,13 +7,13 @@ from collections.abc import AsyncGenerator, Generator
 from pathlib import Path
 from typing import Protocol
 
-from collect.errors import CannotTeach, StepError
-from collect.operator import Choice
-from collect.teach.arm_reader import Address, ArmReader, reading
-from collect.teach.back import BackGuide
-from collect.teach.guide import Guide, Picture, Shown, Tone
-from collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc
-from drivers.clock import Clock
+from brushloop.collect.errors import CannotTeach, StepError
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.arm_reader import Address, ArmReader, reading
+from brushloop.collect.teach.back import BackGuide
+from brushloop.collect.teach.guide import Guide, Picture, Shown, Tone
+from brushloop.collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc
+from brushloop.drivers.clock import Clock
 
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")

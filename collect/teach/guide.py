@@ -9,8 +9,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.operator import Choice
-from sessions.cells import number
+from brushloop.collect.operator import Choice
+from brushloop.sessions.cells import number
 
 Picture = NDArray[np.uint8]
 """(h, w) gray or (h, w, 3) BGR."""

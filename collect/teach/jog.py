@@ -9,20 +9,20 @@ from dataclasses import replace
 
 from scipy.spatial.transform import Rotation
 
-from collect.errors import CannotTeach
-from collect.rig.devices import sole_driver
-from collect.teach.arm_reader import ArmReader
-from collect.teach.day import Day
-from collect.teach.guide import Brought, JogStep, JogView, Target, TargetKind, WentBack
-from collect.teach.maths.box import hull
-from collect.teach.maths.tip import tip_of
-from collect.teach.store import Notebook, touch_of
-from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.errors import LimitExceeded
-from drivers.geometry import lean
-from drivers.limits import Limits
-from drivers.protocols import Robot
-from drivers.samples import Pose
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.rig.devices import sole_driver
+from brushloop.collect.teach.arm_reader import ArmReader
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, Target, TargetKind, WentBack
+from brushloop.collect.teach.maths.box import hull
+from brushloop.collect.teach.maths.tip import tip_of
+from brushloop.collect.teach.store import Notebook, touch_of
+from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.errors import LimitExceeded
+from brushloop.drivers.geometry import lean
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.protocols import Robot
+from brushloop.drivers.samples import Pose
 
 STEPS_MM = (0.1, 0.5, 2.0, 5.0)
 SPEED_MM_S, ACC_MM_S2 = 20.0, 200.0

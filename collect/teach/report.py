@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from collect.rig.doctor import Finding
-from collect.rig.report import about_this_machine, transcript, write_archive
-from collect.rig.scrub import Scrubber, numbers_only
-from collect.teach.arm_reader import Address
-from collect.teach.store import Notebook
+from brushloop.collect.rig.doctor import Finding
+from brushloop.collect.rig.report import about_this_machine, transcript, write_archive
+from brushloop.collect.rig.scrub import Scrubber, numbers_only
+from brushloop.collect.teach.arm_reader import Address
+from brushloop.collect.teach.store import Notebook
 
 NAMES = {
     "robot.host": "<host>",

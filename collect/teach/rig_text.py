@@ -9,12 +9,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from calibrate.board.rig_file import free_name
-from calibrate.files import write_whole
-from collect.rig.config import RigConfig
-from collect.rig.config_file import refusal
-from collect.rig.optics import with_optics
-from collect.teach.store import Notebook, Taught, Value
+from brushloop.calibrate.board.rig_file import free_name
+from brushloop.calibrate.files import write_whole
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_file import refusal
+from brushloop.collect.rig.optics import with_optics
+from brushloop.collect.teach.store import Notebook, Taught, Value
 
 ASIDE = "aside."
 HEAD = "# Made by `brushloop rig new`. Each value: how it was obtained, how well it is known, when."

@@ -13,12 +13,12 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, ValidationError
 
-from collect.errors import ConfigError
-from collect.rig.config_file import Config, Finite, read_text, refusal
-from collect.rig.plausible import Check, unmeasured
-from drivers.arcs.rpc import Framing
-from drivers.samples import Pose
-from sessions.disk import fsync_folder, sync
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
+from brushloop.collect.rig.plausible import Check, unmeasured
+from brushloop.drivers.arcs.rpc import Framing
+from brushloop.drivers.samples import Pose
+from brushloop.sessions.disk import fsync_folder, sync
 
 MAX_BYTES = 1024 * 1024
 ENDING = ".taught.json"

@@ -6,13 +6,13 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Awaitable, Callable
 
-from collect.rig.optics import gray
-from collect.teach.cameras import taught_camera
-from collect.teach.day import Day
-from collect.teach.guide import Picture
-from collect.teach.maths.tip import tip_of
-from drivers.errors import DeviceError
-from drivers.samples import Pose, Stamp
+from brushloop.collect.rig.optics import gray
+from brushloop.collect.teach.cameras import taught_camera
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Picture
+from brushloop.collect.teach.maths.tip import tip_of
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.samples import Pose, Stamp
 
 POSE_S = 0.3
 """Time between two poses."""

@@ -6,15 +6,15 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from calibrate.errors import CalibrationError
-from collect.errors import CannotTeach, CollectAborted, ConfigError, StepError
-from collect.operator import Choice
-from collect.teach.day import Day, Step
-from collect.teach.guide import LeftOff, StepState, WentBack
-from collect.teach.rig_text import write_rig
-from collect.teach.steps import all_steps
-from collect.teach.store import Notebook, StepName, Value
-from drivers.errors import DeviceError
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.errors import CannotTeach, CollectAborted, ConfigError, StepError
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import LeftOff, StepState, WentBack
+from brushloop.collect.teach.rig_text import write_rig
+from brushloop.collect.teach.steps import all_steps
+from brushloop.collect.teach.store import Notebook, StepName, Value
+from brushloop.drivers.errors import DeviceError
 
 AGAIN, LEAVE = Choice("a", "try this step again, where it was"), Choice("q", "stop here; what was taught is kept")
 AFRESH, EARLIER = Choice("f", "teach this step from its beginning"), Choice("b", "teach the step before it again")

@@ -9,14 +9,14 @@ import statistics
 from collections.abc import AsyncGenerator, Sequence
 from typing import Protocol
 
-from collect.errors import StepError, arm_at_fault
-from collect.motion import moves
-from collect.motion.moves import Move
-from collect.rig.config_touch import ForceTouchConfig
-from collect.rig.devices import Rig
-from collect.touch.force import Reading
-from drivers.clock import Clock
-from drivers.samples import ForceSample, Frame, QueuedLine
+from brushloop.collect.errors import StepError, arm_at_fault
+from brushloop.collect.motion import moves
+from brushloop.collect.motion.moves import Move
+from brushloop.collect.rig.config_touch import ForceTouchConfig
+from brushloop.collect.rig.devices import Rig
+from brushloop.collect.touch.force import Reading
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.samples import ForceSample, Frame, QueuedLine
 
 
 class Effector(Protocol):

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.errors import StepError
-from collect.photograph.new_ink import before_and_after, ink_at
-from collect.rig.config_touch import TouchConfig
-from collect.rig.devices import Rig
-from collect.rig.paper import PaperPlane, fit_plane
-from collect.touch.arm import Effector, TouchArm
-from collect.touch.force import Floats
-from collect.touch.heights import KnownHeights, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
-from collect.touch.places import Patch, coarse_count, fine_count
-from drivers.samples import Frame
+from brushloop.collect.errors import StepError
+from brushloop.collect.photograph.new_ink import before_and_after, ink_at
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.devices import Rig
+from brushloop.collect.rig.paper import PaperPlane, fit_plane
+from brushloop.collect.touch.arm import Effector, TouchArm
+from brushloop.collect.touch.force import Floats
+from brushloop.collect.touch.heights import KnownHeights, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
+from brushloop.collect.touch.places import Patch, coarse_count, fine_count
+from brushloop.drivers.samples import Frame
 
 
 @dataclass(frozen=True, slots=True)

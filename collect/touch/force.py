@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.errors import StepError
-from collect.rig.config_touch import ForceTouchConfig
-from collect.touch.heights import Reach
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config_touch import ForceTouchConfig
+from brushloop.collect.touch.heights import Reach
 
 Floats = NDArray[np.float64]
 

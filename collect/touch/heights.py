@@ -7,10 +7,10 @@ import statistics
 from dataclasses import dataclass
 from typing import Literal
 
-from collect.errors import StepError
-from collect.rig.config import PaperConfig
-from collect.rig.config_touch import Method, TouchConfig
-from collect.rig.paper import PaperPlane, fit_plane
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.config_touch import Method, TouchConfig
+from brushloop.collect.rig.paper import PaperPlane, fit_plane
 
 SPAN_SIGMAS = 5.0
 """Three touches at one height span more than this many of their standard errors only once in a thousand times."""

@@ -6,15 +6,15 @@ import functools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from collect.errors import JogGivenUp, StepError
-from collect.operator import Asker, Choice, Prompt
-from collect.rig.config_touch import JogTouchConfig, TouchConfig
-from collect.rig.devices import Rig
-from collect.rig.paper import PaperPlane
-from collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchEffector
-from collect.touch.camera import FirstInkTouch
-from collect.touch.force import Spring, touch_by_force
-from collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Reach, Touch, at_one_point, through
+from brushloop.collect.errors import JogGivenUp, StepError
+from brushloop.collect.operator import Asker, Choice, Prompt
+from brushloop.collect.rig.config_touch import JogTouchConfig, TouchConfig
+from brushloop.collect.rig.devices import Rig
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.touch.arm import ForceTap, RigProbe, TouchArm, TouchEffector
+from brushloop.collect.touch.camera import FirstInkTouch
+from brushloop.collect.touch.force import Spring, touch_by_force
+from brushloop.collect.touch.heights import KnownHeights, PlaneResult, PointTouches, Reach, Touch, at_one_point, through
 
 
 async def measure_plane(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from collect.errors import StepError
-from collect.rig.config import PaperConfig
-from collect.rig.config_touch import CameraTouchConfig, TouchConfig
-from collect.rig.paper import Sheet
-from collect.touch.heights import KnownHeights, Reach
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.config_touch import CameraTouchConfig, TouchConfig
+from brushloop.collect.rig.paper import Sheet
+from brushloop.collect.touch.heights import KnownHeights, Reach
 
 SLACK_STEPS = 2
 """Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.errors import StepError
-from collect.motion.moves import CHECK_SPEED_MM_S, mark_moves
-from collect.photograph.new_ink import before_and_after, new_marks
-from collect.rig.config_touch import SelfCheckConfig
-from collect.rig.devices import Rig
-from collect.rig.paper import Cell, PaperPlane, Sheet
-from collect.touch.arm import Effector, TouchArm
-from drivers.samples import Frame
+from brushloop.collect.errors import StepError
+from brushloop.collect.motion.moves import CHECK_SPEED_MM_S, mark_moves
+from brushloop.collect.photograph.new_ink import before_and_after, new_marks
+from brushloop.collect.rig.config_touch import SelfCheckConfig
+from brushloop.collect.rig.devices import Rig
+from brushloop.collect.rig.paper import Cell, PaperPlane, Sheet
+from brushloop.collect.touch.arm import Effector, TouchArm
+from brushloop.drivers.samples import Frame
 
 Floats = NDArray[np.float64]
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]

@@ -12,20 +12,20 @@ from pathlib import Path
 
 from textual import work
 
-from collect.engine.control import FINAL, State
-from collect.engine.snapshot import Snapshot
-from collect.errors import NOT_AT_REST, ConfigError
-from collect.headless import REFRESH_S, RunnableEngine
-from collect.operator import OperatorRequest
-from collect.tui.browser import SessionBrowser
-from collect.tui.pictures import Pictures
-from collect.tui.question_screens import AT_WORK, NOT_PARKED, UNSEEN, AskScreen, Confirm
-from collect.tui.run_app import RunApp
-from collect.tui.run_screen import RunScreen
-from collect.tui.set_up_screen import SetUpScreen
-from collect.tui.start_screen import StartScreen
-from collect.tui.text import plain
-from sessions.errors import SessionError
+from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.errors import NOT_AT_REST, ConfigError
+from brushloop.collect.headless import REFRESH_S, RunnableEngine
+from brushloop.collect.operator import OperatorRequest
+from brushloop.collect.tui.browser import SessionBrowser
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.question_screens import AT_WORK, NOT_PARKED, UNSEEN, AskScreen, Confirm
+from brushloop.collect.tui.run_app import RunApp
+from brushloop.collect.tui.run_screen import RunScreen
+from brushloop.collect.tui.set_up_screen import SetUpScreen
+from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.collect.tui.text import plain
+from brushloop.sessions.errors import SessionError
 
 BOUNCE_S = 0.7
 """Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
@@ -208,7 +208,7 @@ class OperatorApp(RunApp):
     def _show_end(self, now: Snapshot) -> None:
         """Show the card of a finished session, unless the operator is looking at something else."""
         if now.folder and self.screen is self._main and not self._leave_when_over:
-            from collect.tui.end_screen import EndScreen
+            from brushloop.collect.tui.end_screen import EndScreen
 
             self.push_screen(EndScreen(now, self._pictures), self._end_answered)
 
@@ -216,7 +216,7 @@ class OperatorApp(RunApp):
         if answer == "review":
             self.call_after_refresh(self.action_review)
         elif answer == "finish" and self._now is not None:
-            from collect.tui.finish_screen import FinishScreen
+            from brushloop.collect.tui.finish_screen import FinishScreen
 
             self.push_screen(FinishScreen(Path(self._now.folder), is_open=False))
 

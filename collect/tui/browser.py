@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collect.engine.open_or_resume import Opening
-    from collect.headless import RunnableEngine
-    from collect.rig.doctor import Finding
-    from sessions.show import Details, Summary
+    from brushloop.collect.engine.open_or_resume import Opening
+    from brushloop.collect.headless import RunnableEngine
+    from brushloop.collect.rig.doctor import Finding
+    from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
 CHOSEN_FILES = ".files"
@@ -61,7 +61,7 @@ class SessionBrowser:
 
     def recent(self) -> list[Summary]:
         """The newest sessions first; empty if there is no folder yet."""
-        from sessions.show import summaries
+        from brushloop.sessions.show import summaries
 
         if not self.paths.root.is_dir():
             return []
@@ -69,7 +69,7 @@ class SessionBrowser:
 
     def standing(self, session_id: str) -> Details:
         """What of a session is finished, what is void and what comes next. Raises `SessionError`."""
-        from sessions.show import details
+        from brushloop.sessions.show import details
 
         return details(self.paths.root / session_id)
 
@@ -77,17 +77,17 @@ class SessionBrowser:
         """What every device answers; takes seconds, powers nothing. Raises `ConfigError`."""
         import asyncio
 
-        from collect.rig.config import load_rig
-        from collect.rig.doctor import examine
-        from drivers.clock import HostClock
+        from brushloop.collect.rig.config import load_rig
+        from brushloop.collect.rig.doctor import examine
+        from brushloop.drivers.clock import HostClock
 
         return asyncio.run(examine(load_rig(self.paths.config), HostClock()))
 
     def planned(self) -> str:
         """What the protocol would do, in one line. Raises `ConfigError`."""
-        from collect.planning.summary import make_plan
-        from collect.protocols.config import load_protocol
-        from collect.rig.config import load_rig
+        from brushloop.collect.planning.summary import make_plan
+        from brushloop.collect.protocols.config import load_protocol
+        from brushloop.collect.rig.config import load_rig
 
         plan = make_plan(load_rig(self.paths.config).settled(armed=False), load_protocol(self.paths.protocol))
         sheets = "1 sheet" if plan.sheets == 1 else f"{plan.sheets} sheets"
@@ -98,7 +98,7 @@ class SessionBrowser:
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
-        from collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
+        from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
 
         root, config, protocol = self.paths.root, self.paths.config, self.paths.protocol
         if session_id is None:

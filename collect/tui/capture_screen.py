@@ -11,10 +11,10 @@ from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
 
-from collect.tui.large import BOTH, CAPTURED, PREDICTED, LargeCapture, limit_text, number_text
-from collect.tui.pictures import Pictures
-from collect.tui.text import one_line, plain
-from collect.tui.widgets import KeyBar, Line, app_of
+from brushloop.collect.tui.large import BOTH, CAPTURED, PREDICTED, LargeCapture, limit_text, number_text
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.text import one_line, plain
+from brushloop.collect.tui.widgets import KeyBar, Line, app_of
 
 KEYS = (("escape", "back"), ("→", "next picture"), ("1-4", "picture"))
 KEYS_AT_WORK = (("s", "STOP"), *KEYS)

@@ -8,34 +8,34 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calibrate.artefact import current, load_artefact
-from calibrate.board.pix2len import Plane
-from calibrate.board.session import board_of
-from calibrate.board.spec import BoardSpec
-from calibrate.board.view import see_board
-from calibrate.compare.similarity import csim
-from calibrate.errors import CalibrationError
-from calibrate.fit.artefact import FOLDER as FITS
-from calibrate.fit.artefact import BrushFit
-from calibrate.session import lens_in_use
-from collect.engine.last_capture import likeness, mark_of, pictures_of
-from collect.rig.paper import Cell
-from collect.tui.large import LargeCapture, title_of
-from sessions.errors import InputError, SessionDamaged
-from sessions.history import unlike, waits_of
-from sessions.journal.codec import Line
-from sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from sessions.names import check_folder
-from sessions.recording import container
-from sessions.recording.messages import decode_gray, decode_still
-from sessions.recording.schemas import Check, Quality, Stroke, Topic
-from sessions.remarks import Remark, remarks_of
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.session import board_of
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.artefact import FOLDER as FITS
+from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.session import lens_in_use
+from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
+from brushloop.collect.rig.paper import Cell
+from brushloop.collect.tui.large import LargeCapture, title_of
+from brushloop.sessions.errors import InputError, SessionDamaged
+from brushloop.sessions.history import unlike, waits_of
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.names import check_folder
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.messages import decode_gray, decode_still
+from brushloop.sessions.recording.schemas import Check, Quality, Stroke, Topic
+from brushloop.sessions.remarks import Remark, remarks_of
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from calibrate.board.lens import Lens
+    from brushloop.calibrate.board.lens import Lens
 
 NO_FIT = "no fit yet: run `brushloop fit`"
 

@@ -13,7 +13,7 @@ from rich.style import Style
 from textual.geometry import Size
 from textual.strip import Strip
 
-from collect.tui.levels import RGB, Coloured, fitted, grays, runs, sampled
+from brushloop.collect.tui.levels import RGB, Coloured, fitted, grays, runs, sampled
 
 if TYPE_CHECKING:
     import numpy as np

@@ -14,12 +14,12 @@ from textual.containers import Vertical
 from textual.content import Content
 from textual.screen import ModalScreen
 
-from collect.engine.snapshot import Snapshot
-from collect.headless import minutes_text
-from collect.tui.pictures import Pictures, binary_picture
-from collect.tui.text import one_line, plain
-from collect.tui.widgets import Line
-from sessions.errors import SessionError
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.headless import minutes_text
+from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.text import one_line, plain
+from brushloop.collect.tui.widgets import Line
+from brushloop.sessions.errors import SessionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -78,7 +78,7 @@ class EndScreen(ModalScreen[str]):
 
     @work(exclusive=True, group="measure")
     async def _measure(self) -> None:
-        from collect.tui.captures import Review
+        from brushloop.collect.tui.captures import Review
 
         try:
             review = await asyncio.to_thread(Review, Path(self._now.folder))

@@ -11,9 +11,9 @@ from typing import TypeGuard
 from textual import events
 from textual.binding import Binding
 
-from collect.engine.control import FINAL, State
-from collect.tui.text import SOFTWARE_STOP
-from collect.tui.widgets import Key
+from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.tui.text import SOFTWARE_STOP
+from brushloop.collect.tui.widgets import Key
 
 STOP_KEYS = frozenset({"s", "ctrl+c"})
 

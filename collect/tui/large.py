@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from collect.tui.levels import Coloured, grays
-from collect.tui.pictures import binary_picture
+from brushloop.collect.tui.levels import Coloured, grays
+from brushloop.collect.tui.pictures import binary_picture
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from collect.engine.last_capture import LastCapture
+    from brushloop.collect.engine.last_capture import LastCapture
 
 WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
 """Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""

@@ -12,18 +12,18 @@ from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widget import Widget
 
-from collect.engine.control import FINAL
-from collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
-from collect.headless import eta_text, minutes_text, no_pose_text
-from collect.quality.verdict import Check
-from collect.tui.force_text import scale_n, spark
-from collect.tui.large import limit_sign, number_text
-from collect.tui.pictures import Pictures, binary_picture
-from collect.tui.text import age_text, bar_text, one_line, tip_text
-from collect.tui.widgets import Line, entitle
+from brushloop.collect.engine.control import FINAL
+from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
+from brushloop.collect.headless import eta_text, minutes_text, no_pose_text
+from brushloop.collect.quality.verdict import Check
+from brushloop.collect.tui.force_text import scale_n, spark
+from brushloop.collect.tui.large import limit_sign, number_text
+from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.text import age_text, bar_text, one_line, tip_text
+from brushloop.collect.tui.widgets import Line, entitle
 
 if TYPE_CHECKING:
-    from collect.engine.last_capture import LastCapture
+    from brushloop.collect.engine.last_capture import LastCapture
 
 LABEL, LONGEST_TRACE = 9, 60
 """Columns of a figure's name, and the most columns of the force trace."""

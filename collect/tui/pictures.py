@@ -12,8 +12,8 @@ from textual.geometry import Region, Size
 from textual.strip import Strip
 from textual.widget import Widget
 
-from collect.tui.dots import Cells
-from collect.tui.levels import Coloured
+from brushloop.collect.tui.dots import Cells
+from brushloop.collect.tui.levels import Coloured
 
 if TYPE_CHECKING:
     import numpy as np

@@ -15,11 +15,11 @@ from textual.content import Content
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from collect.engine.snapshot import EngineView
-from collect.errors import NOT_AT_REST
-from collect.operator import Prompt
-from collect.tui.pictures import Pictures
-from collect.tui.text import plain
+from brushloop.collect.engine.snapshot import EngineView
+from brushloop.collect.errors import NOT_AT_REST
+from brushloop.collect.operator import Prompt
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.text import plain
 
 LEAVE_LINE = "q  leave: park the arm, answer nothing"
 STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"

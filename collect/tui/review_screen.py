@@ -16,15 +16,15 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
-from collect.tui.capture_screen import CaptureScreen
-from collect.tui.captures import CapturePictures, Review, ReviewCapture
-from collect.tui.finish_screen import FinishScreen
-from collect.tui.keys import LABELS
-from collect.tui.pictures import Pictures, binary_picture
-from collect.tui.text import SOFTWARE_STOP, one_line, plain
-from collect.tui.widgets import KeyBar, Line, Rows, app_of
-from sessions.errors import SessionError
-from sessions.remarks import Remark, add_remark
+from brushloop.collect.tui.capture_screen import CaptureScreen
+from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
+from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.collect.tui.keys import LABELS
+from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain
+from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.remarks import Remark, add_remark
 
 KEYS = (
     ("escape", "back"),

@@ -13,18 +13,18 @@ from textual.app import SystemCommand
 from textual.binding import BindingType
 from textual.screen import Screen
 
-from collect.engine.control import FINAL
-from collect.engine.snapshot import Snapshot
-from collect.headless import RunnableEngine
-from collect.tui.keys import CAN_GO_ON, CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
-from collect.tui.pictures import Pictures
-from collect.tui.run_screen import RunScreen
-from collect.tui.set_up_screen import SetUpScreen
-from collect.tui.terminal import PlainApp
-from collect.tui.text import plain
-from collect.tui.widgets import HelpScreen
-from sessions.errors import SessionError
-from sessions.remarks import mark_bad_or_good
+from brushloop.collect.engine.control import FINAL
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.headless import RunnableEngine
+from brushloop.collect.tui.keys import CAN_GO_ON, CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.run_screen import RunScreen
+from brushloop.collect.tui.set_up_screen import SetUpScreen
+from brushloop.collect.tui.terminal import PlainApp
+from brushloop.collect.tui.text import plain
+from brushloop.collect.tui.widgets import HelpScreen
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.remarks import mark_bad_or_good
 
 
 class RunApp(PlainApp):
@@ -123,14 +123,14 @@ class RunApp(PlainApp):
     def action_enlarge(self) -> None:
         """Show the last capture large."""
         if self._now is not None and self._now.last is not None and self.screen is self._main:
-            from collect.tui.capture_screen import CaptureScreen
-            from collect.tui.large import of_last
+            from brushloop.collect.tui.capture_screen import CaptureScreen
+            from brushloop.collect.tui.large import of_last
 
             self.push_screen(CaptureScreen(of_last(self._now.last), self._pictures, at_work=self.at_work))
 
     def _review(self, folder: Path) -> None:
-        from collect.tui.captures import Review
-        from collect.tui.review_screen import ReviewScreen
+        from brushloop.collect.tui.captures import Review
+        from brushloop.collect.tui.review_screen import ReviewScreen
 
         try:
             review = Review(folder)

@@ -13,16 +13,16 @@ from textual.containers import Horizontal, ScrollableContainer, Vertical, Vertic
 from textual.content import Content
 from textual.screen import Screen
 
-from collect.engine.control import FINAL, State
-from collect.engine.snapshot import Snapshot
-from collect.headless import no_pose_text
-from collect.tui.force_text import plot, plot_title
-from collect.tui.keys import RUN_BAR, keys_in
-from collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
-from collect.tui.pictures import Pictures
-from collect.tui.steps_screen import NARROW_COLUMNS
-from collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
-from collect.tui.widgets import KeyBar, Line, entitle
+from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.headless import no_pose_text
+from brushloop.collect.tui.force_text import plot, plot_title
+from brushloop.collect.tui.keys import RUN_BAR, keys_in
+from brushloop.collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.steps_screen import NARROW_COLUMNS
+from brushloop.collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
+from brushloop.collect.tui.widgets import KeyBar, Line, entitle
 
 OVER = "Over: q leaves"
 GOES_ON = "Press enter to resume, or run the same command later."

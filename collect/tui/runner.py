@@ -6,12 +6,12 @@ import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from collect.errors import CollectAborted
-from collect.headless import RunnableEngine, obey, stop_signals
-from collect.tui.app import OperatorApp
-from collect.tui.browser import SessionBrowser
-from collect.tui.pictures import Pictures, Preview
-from collect.tui.themes import chosen_file
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.headless import RunnableEngine, obey, stop_signals
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.browser import SessionBrowser
+from brushloop.collect.tui.pictures import Pictures, Preview
+from brushloop.collect.tui.themes import chosen_file
 
 
 class ScreenCrashed(Exception):

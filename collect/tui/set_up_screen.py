@@ -5,17 +5,17 @@ from __future__ import annotations
 from textual import events
 from textual.content import Content
 
-from collect.engine.snapshot import EngineView, Fact, SetUpStep, Snapshot, Standing
-from collect.headless import no_pose_text
-from collect.operator import Prompt
-from collect.protocols.steps import StepKind
-from collect.tui.force_text import LEAST_SCALE_N, force_bar, spark
-from collect.tui.keys import SET_UP_BAR, keys_in
-from collect.tui.panes import target_text
-from collect.tui.pictures import Pictures
-from collect.tui.question_screens import answer_by_key, choices_content
-from collect.tui.steps_screen import StepsScreen
-from collect.tui.text import SOFTWARE_STOP, one_line, plain, tip_text
+from brushloop.collect.engine.snapshot import EngineView, Fact, SetUpStep, Snapshot, Standing
+from brushloop.collect.headless import no_pose_text
+from brushloop.collect.operator import Prompt
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.tui.force_text import LEAST_SCALE_N, force_bar, spark
+from brushloop.collect.tui.keys import SET_UP_BAR, keys_in
+from brushloop.collect.tui.panes import target_text
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.question_screens import answer_by_key, choices_content
+from brushloop.collect.tui.steps_screen import StepsScreen
+from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain, tip_text
 
 SIGNS = {
     Standing.TO_COME: ("·", "dim"),

@@ -15,16 +15,16 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Input, OptionList
 
-from collect.errors import ConfigError
-from collect.tui.browser import Paths, SessionBrowser
-from collect.tui.question_screens import Confirm
-from collect.tui.text import age_text, one_line, plain
-from collect.tui.widgets import KeyBar, Line, Rows, app_of
-from sessions.errors import SessionError
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.text import age_text, one_line, plain
+from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
+from brushloop.sessions.errors import SessionError
 
 if TYPE_CHECKING:
-    from collect.rig.doctor import Finding
-    from sessions.show import Details, Summary
+    from brushloop.collect.rig.doctor import Finding
+    from brushloop.sessions.show import Details, Summary
 
 KEYS = (
     ("enter", "resume or look"),

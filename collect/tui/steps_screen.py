@@ -13,8 +13,8 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widget import Widget
 
-from collect.tui.pictures import AnyPicture
-from collect.tui.widgets import Key, KeyBar, Line
+from brushloop.collect.tui.pictures import AnyPicture
+from brushloop.collect.tui.widgets import Key, KeyBar, Line
 
 NARROW_COLUMNS = 110
 """Width from which a picture has room beside the text."""

@@ -9,17 +9,17 @@ from typing import Any, ClassVar
 from textual import events
 from textual.binding import Binding, BindingType
 
-from collect.errors import CollectAborted, describe
-from collect.headless import REFRESH_S, stop_signals
-from collect.tui.keys import is_stop_key
-from collect.tui.pictures import Pictures
-from collect.tui.question_screens import Confirm
-from collect.tui.teach_guide import ScreenGuide, Teaching
-from collect.tui.teach_screen import GO_ON, LEAVE, TeachScreen
-from collect.tui.terminal import PlainApp
-from collect.tui.text import SOFTWARE_STOP
-from collect.tui.themes import chosen_file
-from collect.tui.widgets import HelpScreen
+from brushloop.collect.errors import CollectAborted, describe
+from brushloop.collect.headless import REFRESH_S, stop_signals
+from brushloop.collect.tui.keys import is_stop_key
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.teach_guide import ScreenGuide, Teaching
+from brushloop.collect.tui.teach_screen import GO_ON, LEAVE, TeachScreen
+from brushloop.collect.tui.terminal import PlainApp
+from brushloop.collect.tui.text import SOFTWARE_STOP
+from brushloop.collect.tui.themes import chosen_file
+from brushloop.collect.tui.widgets import HelpScreen
 
 Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
 AT_WORK = ("A step is running: stop it and leave?", "y  stop and leave      n  go on      s  stop now")

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from collect.errors import CollectAborted
-from collect.operator import Choice
-from collect.teach.guide import (
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.guide import (
     Brought,
     JogStep,
     JogView,
@@ -24,7 +24,7 @@ from collect.teach.guide import (
     Target,
     WentBack,
 )
-from drivers.samples import Pose
+from brushloop.drivers.samples import Pose
 
 Kind = Literal["choose", "number", "text", "bring", "jog"]
 Answer = str | float | Brought | JogStep

@@ -10,13 +10,13 @@ from textual.content import Content
 from textual.widget import Widget
 from textual.widgets import Input
 
-from collect.rig.optics import gray
-from collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState, number_in
-from collect.tui.pictures import Pictures
-from collect.tui.steps_screen import StepsScreen
-from collect.tui.teach_guide import Question, ScreenGuide, TeachView
-from collect.tui.text import SHORT_STOP, one_line, plain, tip_text
-from collect.tui.widgets import Key
+from brushloop.collect.rig.optics import gray
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState, number_in
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.steps_screen import StepsScreen
+from brushloop.collect.tui.teach_guide import Question, ScreenGuide, TeachView
+from brushloop.collect.tui.text import SHORT_STOP, one_line, plain, tip_text
+from brushloop.collect.tui.widgets import Key
 
 SIGNS = {"open": ("·", "dim"), "current": ("▶", "bold reverse"), "taught": ("✓", "bold $text-success")}
 TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}

@@ -20,8 +20,8 @@ from textual.drivers.linux_driver import LinuxDriver
 from textual.filter import LineFilter
 from textual.screen import Screen
 
-from collect.tui.themes import THEMES, TITLES, chosen, keep
-from sessions.terminal import inert
+from brushloop.collect.tui.themes import THEMES, TITLES, chosen, keep
+from brushloop.sessions.terminal import inert
 
 
 class TerminalDriver(LinuxDriver):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collect.tui.force_text import EMPTY, FULL
-from sessions import terminal
+from brushloop.collect.tui.force_text import EMPTY, FULL
+from brushloop.sessions import terminal
 
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
 SHORT_STOP = "s: software stop; red button: emergency stop"

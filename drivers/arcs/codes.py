@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from enum import IntEnum, StrEnum
 
-from drivers.errors import MotionError, MotionFailed, MotionRefused
+from brushloop.drivers.errors import MotionError, MotionFailed, MotionRefused
 
 LOOPBACK_CONTROL_BOX = "brushloop-loopback"
 """What the loopback controller answers to `getControlBoxType`; no maker uses that name."""

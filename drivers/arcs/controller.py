@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.codes import (
+from brushloop.drivers.arcs.codes import (
     CONDITION_AND_REMEDY,
     MOVING_ALLOWED,
     UNKNOWN_CONDITION,
@@ -19,11 +19,11 @@ from drivers.arcs.codes import (
     SafetyMode,
     refusal,
 )
-from drivers.arcs.framing import numbers
-from drivers.arcs.rpc import DEVICE, RpcConnection
-from drivers.errors import DeviceError, MotionRefused, NotPowered, ProtocolViolation, RobotNotSafe
-from drivers.geometry import from_wire, to_wire
-from drivers.samples import Pose
+from brushloop.drivers.arcs.framing import numbers
+from brushloop.drivers.arcs.rpc import DEVICE, RpcConnection
+from brushloop.drivers.errors import DeviceError, MotionRefused, NotPowered, ProtocolViolation, RobotNotSafe
+from brushloop.drivers.geometry import from_wire, to_wire
+from brushloop.drivers.samples import Pose
 
 NOT_RUNNING = -1
 """Return code of a motion in any robot mode but Running."""

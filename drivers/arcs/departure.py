@@ -9,14 +9,14 @@ import asyncio
 import itertools
 from collections.abc import Sequence
 
-from drivers.arcs.codes import RobotMode
-from drivers.arcs.controller import Controller
-from drivers.arcs.rpc import DEVICE
-from drivers.arcs.settings import Settings, read_back, require_same
-from drivers.errors import ArmMoved, NotConnected, NotPowered
-from drivers.geometry import distance
-from drivers.limits import Limits
-from drivers.samples import Pose
+from brushloop.drivers.arcs.codes import RobotMode
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.rpc import DEVICE
+from brushloop.drivers.arcs.settings import Settings, read_back, require_same
+from brushloop.drivers.errors import ArmMoved, NotConnected, NotPowered
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import Pose
 
 MOVED_MM, MOVED_DEG = 0.5, 0.5
 """Limits beyond which another client or a person moved the arm: larger than the tolerance of any settled move."""

@@ -20,7 +20,7 @@ import math
 import re
 import struct
 
-from drivers.errors import ProtocolViolation
+from brushloop.drivers.errors import ProtocolViolation
 
 MAGIC = b"SOF"
 FLAG_LONG = 0x01

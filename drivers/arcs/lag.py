@@ -11,8 +11,8 @@ from collections import deque
 
 import numpy as np
 
-from drivers.clock import Clock
-from drivers.samples import Pose, PoseSample
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.samples import Pose, PoseSample
 
 QUICK_S = 0.05
 """An answer that took longer, as on a busy computer, does not say well enough when the arm was there."""

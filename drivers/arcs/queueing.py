@@ -17,11 +17,11 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.arcs.codes import QueueFull
-from drivers.arcs.controller import Controller
-from drivers.arcs.rpc import DEVICE
-from drivers.arcs.waiting import RESTS_ELSEWHERE_S, STUCK_S, Tolerance, planned_s
-from drivers.errors import (
+from brushloop.drivers.arcs.codes import QueueFull
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.rpc import DEVICE
+from brushloop.drivers.arcs.waiting import RESTS_ELSEWHERE_S, STUCK_S, Tolerance, planned_s
+from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
@@ -30,9 +30,9 @@ from drivers.errors import (
     PathDisturbed,
     ProtocolViolation,
 )
-from drivers.geometry import distance, from_line
-from drivers.limits import Limits
-from drivers.samples import Pose, QueuedLine
+from brushloop.drivers.geometry import distance, from_line
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import Pose, QueuedLine
 
 MOST_QUEUED = 16
 """Lines that the controller holds at a time. The queue of a real cabinet is not documented; see `QueueFull` below."""

@@ -6,20 +6,20 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, TypeVar
 
-from drivers.arcs.codes import LOOPBACK_CONTROL_BOX
-from drivers.arcs.controller import Condition, Controller
-from drivers.arcs.departure import Departure
-from drivers.arcs.queueing import OwnPath, capped, feed, legs_of, queue_all
-from drivers.arcs.rpc import DEVICE, RpcConnection, open_arcs
-from drivers.arcs.settings import ArcsOptions, make_ready, power_on
-from drivers.arcs.stopping import Stopper, Watchdog
-from drivers.arcs.telemetry import Telemetry
-from drivers.arcs.waiting import Look, Messages, Tolerance, planned_s, until_settled
-from drivers.cancellation import finished
-from drivers.clock import Clock
-from drivers.errors import DeviceError, MotionFailed, NotConnected
-from drivers.limits import Limits
-from drivers.samples import Identity, Pose, PoseSample, QueuedLine
+from brushloop.drivers.arcs.codes import LOOPBACK_CONTROL_BOX
+from brushloop.drivers.arcs.controller import Condition, Controller
+from brushloop.drivers.arcs.departure import Departure
+from brushloop.drivers.arcs.queueing import OwnPath, capped, feed, legs_of, queue_all
+from brushloop.drivers.arcs.rpc import DEVICE, RpcConnection, open_arcs
+from brushloop.drivers.arcs.settings import ArcsOptions, make_ready, power_on
+from brushloop.drivers.arcs.stopping import Stopper, Watchdog
+from brushloop.drivers.arcs.telemetry import Telemetry
+from brushloop.drivers.arcs.waiting import Look, Messages, Tolerance, planned_s, until_settled
+from brushloop.drivers.cancellation import finished
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceError, MotionFailed, NotConnected
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import Identity, Pose, PoseSample, QueuedLine
 
 __all__ = ["ArcsOptions", "AuboArcs", "Condition"]
 

@@ -13,8 +13,8 @@ import secrets
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
-from drivers.errors import (
+from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode
+from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,

@@ -18,8 +18,8 @@ from typing import Any, NoReturn
 
 import cbor2
 
-from drivers.arcs.framing import FrameDecoder, encode_short
-from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.arcs.framing import FrameDecoder, encode_short
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation
 
 SET_RECIPE = 100
 PING = b"__ping__\0"

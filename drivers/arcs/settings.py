@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.codes import RobotMode, WrongOperationalMode
-from drivers.arcs.controller import Controller, accepted
-from drivers.arcs.framing import numbers
-from drivers.arcs.rpc import DEVICE, Framing
-from drivers.arcs.waiting import until_mode
-from drivers.errors import ProtocolViolation, RpcError, SettingsChanged
-from drivers.geometry import distance, from_wire
-from drivers.samples import Pose
+from brushloop.drivers.arcs.codes import RobotMode, WrongOperationalMode
+from brushloop.drivers.arcs.controller import Controller, accepted
+from brushloop.drivers.arcs.framing import numbers
+from brushloop.drivers.arcs.rpc import DEVICE, Framing
+from brushloop.drivers.arcs.waiting import until_mode
+from brushloop.drivers.errors import ProtocolViolation, RpcError, SettingsChanged
+from brushloop.drivers.geometry import distance, from_wire
+from brushloop.drivers.samples import Pose
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,11 +14,11 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 
-from drivers.arcs.codes import ReturnCode
-from drivers.arcs.controller import Controller
-from drivers.arcs.rpc import DEVICE, RpcConnection
-from drivers.errors import DeviceError, MotionFailed, RpcError
-from drivers.geometry import distance
+from brushloop.drivers.arcs.codes import ReturnCode
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.rpc import DEVICE, RpcConnection
+from brushloop.drivers.errors import DeviceError, MotionFailed, RpcError
+from brushloop.drivers.geometry import distance
 
 HEDGE_S = 0.15
 """A stop that is not acknowledged within this time is sent over the next connection too."""

@@ -7,11 +7,11 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.robot import AUBOPE_PORT
-from drivers.arcs.rpc import Framing, RpcConnection, open_arcs
-from drivers.arcs.rtde import RtdeStream
-from drivers.arcs.telemetry import JOINTS_SEGMENT, POSE_SEGMENT
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, RpcError
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.arcs.rpc import Framing, RpcConnection, open_arcs
+from brushloop.drivers.arcs.rtde import RtdeStream
+from brushloop.drivers.arcs.telemetry import JOINTS_SEGMENT, POSE_SEGMENT
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, RpcError
 
 OF_THE_CONTROLLER = (
     "SystemInfo.getControlSoftwareVersionCode",

@@ -6,17 +6,17 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Generator
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.framing import numbers
-from drivers.arcs.lag import LagMeter
-from drivers.arcs.rpc import DEVICE
-from drivers.arcs.rtde import RtdeStream
-from drivers.arcs.settings import ArcsOptions
-from drivers.arcs.waiting import Tolerance
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
-from drivers.geometry import from_wire
-from drivers.samples import Pose, PoseSample, Stamp
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.framing import numbers
+from brushloop.drivers.arcs.lag import LagMeter
+from brushloop.drivers.arcs.rpc import DEVICE
+from brushloop.drivers.arcs.rtde import RtdeStream
+from brushloop.drivers.arcs.settings import ArcsOptions
+from brushloop.drivers.arcs.waiting import Tolerance
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
+from brushloop.drivers.geometry import from_wire
+from brushloop.drivers.samples import Pose, PoseSample, Stamp
 
 POSE_SEGMENT = "R1_actual_TCP_pose"
 JOINTS_SEGMENT = "R1_actual_q"

@@ -9,12 +9,12 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.codes import OutOfReach, RobotMode
-from drivers.arcs.controller import Controller
-from drivers.arcs.rpc import DEVICE
-from drivers.errors import DeviceError, DeviceTimeout, MotionFailed
-from drivers.geometry import distance
-from drivers.samples import Pose
+from brushloop.drivers.arcs.codes import OutOfReach, RobotMode
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.rpc import DEVICE
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, MotionFailed
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.samples import Pose
 
 RESTS_ELSEWHERE_S = 1.0
 """How long the arm may rest away from its target: an accepted move may start late, but not later than this."""

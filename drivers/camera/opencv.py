@@ -12,11 +12,11 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
-from drivers.camera.health import FrameHealth
-from drivers.camera.source import DEVICE, CameraOptions, Source, open_source
-from drivers.clock import Clock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
-from drivers.samples import Frame, Identity, Stamp
+from brushloop.drivers.camera.health import FrameHealth
+from brushloop.drivers.camera.source import DEVICE, CameraOptions, Source, open_source
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
+from brushloop.drivers.samples import Frame, Identity, Stamp
 
 if TYPE_CHECKING:
     import numpy as np

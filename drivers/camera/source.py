@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 from urllib.parse import urlsplit
 
-from drivers.errors import ConnectionLost, DeviceError
+from brushloop.drivers.errors import ConnectionLost, DeviceError
 
 if TYPE_CHECKING:
     import numpy as np

@@ -12,8 +12,8 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.clock import Clock
-from drivers.errors import (
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
@@ -23,9 +23,9 @@ from drivers.errors import (
     Stuck,
     too_busy,
 )
-from drivers.force.rounds import BITRATE, RoundAssembler, Wrench
-from drivers.force.stream import BusSettings, ForceHealth, RoundStream
-from drivers.samples import ForceSample, Identity, Stamp
+from brushloop.drivers.force.rounds import BITRATE, RoundAssembler, Wrench
+from brushloop.drivers.force.stream import BusSettings, ForceHealth, RoundStream
+from brushloop.drivers.samples import ForceSample, Identity, Stamp
 
 DEVICE = "force"
 AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")

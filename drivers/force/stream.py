@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from drivers.clock import Clock
-from drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
-from drivers.samples import Stamp
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
+from brushloop.drivers.samples import Stamp
 
 if TYPE_CHECKING:
     import can

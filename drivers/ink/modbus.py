@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import struct
 
-from drivers.errors import ProtocolViolation
-from drivers.ink.port import crc16
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.ink.port import crc16
 
 DEVICE = "pump"
 WRITE_REGISTER = 0x06

@@ -17,7 +17,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeVar, cast
 
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, ProtocolViolation
+from brushloop.drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    LimitExceeded,
+    NotConnected,
+    ProtocolViolation,
+)
 
 
 class InkRefused(DeviceError):

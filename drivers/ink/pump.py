@@ -12,12 +12,12 @@ import time
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.cancellation import finished
-from drivers.clock import Clock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
-from drivers.ink.modbus import DEVICE, EXCEPTIONS, find_reply, write_register
-from drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings
-from drivers.samples import Identity
+from brushloop.drivers.cancellation import finished
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.ink.modbus import DEVICE, EXCEPTIONS, find_reply, write_register
+from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings
+from brushloop.drivers.samples import Identity
 
 SPEED_REGISTER = 1
 RUN_REGISTER = 4

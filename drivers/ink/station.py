@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
-from drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings, crc16
-from drivers.samples import Identity
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
+from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings, crc16
+from brushloop.drivers.samples import Identity
 
 DEVICE = "ink"
 MAX_LINE_BYTES = 96

@@ -20,9 +20,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from drivers.sim.brush.spec import BrushSpec
-from drivers.sim.config import SoundHead
-from drivers.sim.described import load_described
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.drivers.sim.config import SoundHead
+from brushloop.drivers.sim.described import load_described
 
 MAX_NOISE_GRAY = 30.0
 LOOPBACK = "loopback"

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from drivers.sim.brush.brush import BrushSpec
-from drivers.sim.brush.spec import within
+from brushloop.drivers.sim.brush.brush import BrushSpec
+from brushloop.drivers.sim.brush.spec import within
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,11 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from drivers.sim.described import SimFileError
-from drivers.sim.faults.board import Hung
-from drivers.sim.faults.kinds import fault_of
-from drivers.sim.rig import Faults
-from drivers.sim.server import LoopbackServer
+from brushloop.drivers.sim.described import SimFileError
+from brushloop.drivers.sim.faults.board import Hung
+from brushloop.drivers.sim.faults.kinds import fault_of
+from brushloop.drivers.sim.rig import Faults
+from brushloop.drivers.sim.server import LoopbackServer
 
 Person = Callable[[Mapping[str, object]], Awaitable[dict[str, Any]]]
 """Carries out a `hand` request. Raises ValueError, with a one-line message, for an invalid request."""

@@ -7,23 +7,23 @@ import functools
 import math
 from typing import Any, Literal
 
-from drivers.arcs.codes import SafetyMode
-from drivers.force.rounds import Wrench
-from drivers.rotation import columns, inverse, of_angles, product
-from drivers.sim.arcs.power import EMERGENCY_STOPS
-from drivers.sim.arcs.rtde_server import RtdeServer
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.camera.mjpeg_server import MjpegServer
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig
-from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import KINDS, Device, Fault, ForceFault, InkFault
-from drivers.sim.faults.phases import Truth
-from drivers.sim.instruments.force_board import ForceBoard, SocketcandServer
-from drivers.sim.instruments.ink_station import Instrument, PtyLine, StationFirmware
-from drivers.sim.instruments.modbus_pump import PumpFirmware
-from drivers.sim.rig_toml import PUMP_ML, Addresses, rig_toml
-from drivers.sim.world import World
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.rotation import columns, inverse, of_angles, product
+from brushloop.drivers.sim.arcs.power import EMERGENCY_STOPS
+from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.faults.board import FaultBoard
+from brushloop.drivers.sim.faults.kinds import KINDS, Device, Fault, ForceFault, InkFault
+from brushloop.drivers.sim.faults.phases import Truth
+from brushloop.drivers.sim.instruments.force_board import ForceBoard, SocketcandServer
+from brushloop.drivers.sim.instruments.ink_station import Instrument, PtyLine, StationFirmware
+from brushloop.drivers.sim.instruments.modbus_pump import PumpFirmware
+from brushloop.drivers.sim.rig_toml import PUMP_ML, Addresses, rig_toml
+from brushloop.drivers.sim.world import World
 
 HOST = "127.0.0.1"
 """Not configurable: no other machine may drive or watch a simulated arm by mistake."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.force.rounds import LOOPBACK_CHANNEL
-from drivers.sim.config import SimConfig
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.sim.config import SimConfig
 
 LOOPBACK_HEAD = "# The loopback rig"
 TAUGHT_TOUCH_ERROR_MM = 0.03

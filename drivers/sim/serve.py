@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from drivers.sim.config import SimConfig
-from drivers.sim.control import live_control
-from drivers.sim.described import SimFileError
-from drivers.sim.rig import LoopbackRig
-from drivers.sim.rig_toml import LOOPBACK_HEAD
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.control import live_control
+from brushloop.drivers.sim.described import SimFileError
+from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.rig_toml import LOOPBACK_HEAD
 
 if TYPE_CHECKING:
-    from drivers.sim.lab.traps import Trap
+    from brushloop.drivers.sim.lab.traps import Trap
 
 
 def serve(
@@ -65,7 +65,7 @@ def serve_unknown(
 
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
     """
-    from drivers.sim.lab.traps import Trap
+    from brushloop.drivers.sim.lab.traps import Trap
 
     if trap is not None and trap not in [*Trap]:
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
@@ -83,8 +83,8 @@ async def _serve_unknown(
     truth: Path | None,
     control: Path | None,
 ) -> None:
-    from drivers.sim.lab.lab import UnknownLab
-    from drivers.sim.lab.seen import truth_text
+    from brushloop.drivers.sim.lab.lab import UnknownLab
+    from brushloop.drivers.sim.lab.seen import truth_text
 
     over, lab = _signalled(), UnknownLab(seed, trap, rate=rate)
 

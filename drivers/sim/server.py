@@ -8,7 +8,7 @@ import contextlib
 import ipaddress
 from typing import ClassVar
 
-from drivers.errors import ProtocolViolation
+from brushloop.drivers.errors import ProtocolViolation
 
 TURNS_TO_BEGIN = 3
 """Turns of the event loop from accepting a connection to the first step of its task."""

@@ -10,17 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.force.rounds import Wrench
-from drivers.geometry import brush_pose, from_wire, lean
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import Matrix, matrix_of
-from drivers.sim.arm.queue import ArmQueue
-from drivers.sim.brush.brush import MAX_TILT_DEG, Brush
-from drivers.sim.brush.contact import Contact, ContactWatch, Reaction, bent_toward, leaning_with
-from drivers.sim.brush.drag import Waypoint, ink_left
-from drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
-from drivers.sim.brush.paper import Paper
-from drivers.sim.config import SimConfig
+from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.geometry import brush_pose, from_wire, lean
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import Matrix, matrix_of
+from brushloop.drivers.sim.arm.queue import ArmQueue
+from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush
+from brushloop.drivers.sim.brush.contact import Contact, ContactWatch, Reaction, bent_toward, leaning_with
+from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
+from brushloop.drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
+from brushloop.drivers.sim.brush.paper import Paper
+from brushloop.drivers.sim.config import SimConfig
 
 
 class SimClock:

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import asyncio
 
-from drivers.clock import Clock
-from drivers.errors import DeviceTimeout, NotConnected, ProtocolViolation
-from drivers.ink.port import DoseBudget
-from drivers.samples import Identity
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.errors import DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.ink.port import DoseBudget
+from brushloop.drivers.samples import Identity
 
 
 class SyringePump:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from drivers.sim.camera.mjpeg_server import SPOILED
-from drivers.sim.faults.kinds import KINDS, Device
+from brushloop.drivers.sim.camera.mjpeg_server import SPOILED
+from brushloop.drivers.sim.faults.kinds import KINDS, Device
 
 
 def upside_down(jpeg: bytes) -> bytes:

@@ -10,9 +10,9 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from collect.protocols.base import DeepMm, ProtocolBase, Repeats, check_count
-from collect.protocols.plan import Planned
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.base import DeepMm, ProtocolBase, Repeats, check_count
+from brushloop.collect.protocols.plan import Planned
+from brushloop.collect.rig.paper import Layout
 
 
 class StairsConfig(ProtocolBase):

@@ -7,9 +7,9 @@ in `QualityConfig` (`collect/rig/config_quality.py`), so that a rig can set it. 
 
 from __future__ import annotations
 
-from collect.quality.measure import Mark
-from collect.quality.verdict import Check, Failure
-from collect.rig.config_quality import QualityConfig
+from brushloop.collect.quality.measure import Mark
+from brushloop.collect.quality.verdict import Check, Failure
+from brushloop.collect.rig.config_quality import QualityConfig
 
 DARKEST_TONE = 0.97
 

@@ -6,8 +6,8 @@ Put such a file into `model/strokes/`; being there is enough. `brushloop validat
 
 from __future__ import annotations
 
-from model import baselines
-from model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
+from brushloop.model import baselines
+from brushloop.model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
 
 PARAMETERS = (
     ParameterSpec("centre_mm", "mm", -200, 200, -10, "x of the centre, on the stroke axis"),

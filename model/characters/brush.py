@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model.drag import DragModel
-from model.protocol import StrokeModel
+from brushloop.model.drag import DragModel
+from brushloop.model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
 _TABLE = 64

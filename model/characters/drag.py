@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from model.drag import DragModel
+from brushloop.model.drag import DragModel
 
 LEAST_TRAVEL_MM = 0.5
 """A stroke that travels less than this is a press."""

@@ -14,8 +14,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from model.characters.glyph import GlyphError, json_of
-from model.characters.plan import Cell, Path, resampled
+from brushloop.model.characters.glyph import GlyphError, json_of
+from brushloop.model.characters.plan import Cell, Path, resampled
 
 MAX_CHARS = 4 * 1024 * 1024
 MAX_STROKES, MAX_POINTS = 100, 10_000

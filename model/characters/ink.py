@@ -15,15 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.characters.drag import dragged, is_dragged
-from model.characters.glyph import Glyph
-from model.characters.plan import Cell, Path, grid
-from model.drag import DragModel
-from model.outline import Outline
-from model.protocol import StrokeModel
-from model.raster.compiled import coverage_numpy
-from model.raster.exact import coverage_at
-from model.raster.frame import SIZE_PX
+from brushloop.model.characters.drag import dragged, is_dragged
+from brushloop.model.characters.glyph import Glyph
+from brushloop.model.characters.plan import Cell, Path, grid
+from brushloop.model.drag import DragModel
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import StrokeModel
+from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import SIZE_PX
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]

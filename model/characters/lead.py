@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.characters.brush import Reach
-from model.characters.ink import Image
-from model.characters.plan import Path, directions, grid, tangents, without_tilt
-from model.damped import Equations, descend
-from model.drag import distances, ink
-from model.footprint import Footprint, Marks, ink_equations, inked, marks, sampled, sampling
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.ink import Image
+from brushloop.model.characters.plan import Path, directions, grid, tangents, without_tilt
+from brushloop.model.damped import Equations, descend
+from brushloop.model.drag import distances, ink
+from brushloop.model.footprint import Footprint, Marks, ink_equations, inked, marks, sampled, sampling
 
 Floats = NDArray[np.float64]
 UNITS = np.array([0.3, 0.3, 0.5, 10.0])

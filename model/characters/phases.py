@@ -15,7 +15,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from model.characters.plan import Path, grid, tangents
+from brushloop.model.characters.plan import Path, grid, tangents
 
 Floats = NDArray[np.float64]
 TURN_DEG, FOLD_DEG = 35.0, 90.0

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.characters.brush import Reach, behind_of, depth_of, dragged_depth_of
-from model.characters.glyph import FOOT_UNITS, SIDE_UNITS, Glyph
-from model.drag import DragModel
-from model.protocol import StrokeModel
+from brushloop.model.characters.brush import Reach, behind_of, depth_of, dragged_depth_of
+from brushloop.model.characters.glyph import FOOT_UNITS, SIDE_UNITS, Glyph
+from brushloop.model.drag import DragModel
+from brushloop.model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.characters.brush import Reach
-from model.characters.drag import dragged, is_dragged
-from model.characters.ink import Image, dense, stamped
-from model.drag import DragModel
-from model.protocol import StrokeModel
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.drag import dragged, is_dragged
+from brushloop.model.characters.ink import Image, dense, stamped
+from brushloop.model.drag import DragModel
+from brushloop.model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
 _RATE = (0.12, 0.12, 0.12, 0.1, 1.5)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from model.protocol import ParameterSpec
+from brushloop.model.protocol import ParameterSpec
 
 
 class Inputs(nn.Module):

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.brush import DomainError
-from model.ccdbsm import as_batch
-from model.generator.network import Generator
-from model.generator.targets import Placement, Target
-from model.outline import Outline
-from model.protocol import Number, ParameterSpec, Values
+from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import as_batch
+from brushloop.model.generator.network import Generator
+from brushloop.model.generator.targets import Placement, Target
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import Number, ParameterSpec, Values
 
 
 @dataclass(frozen=True, slots=True, eq=False)

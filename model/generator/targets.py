@@ -10,13 +10,13 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-from model.brush import Brush, DomainError
-from model.generator.network import Layers
-from model.outline import Shape
-from model.press_images import press_images
-from model.protocol import ParameterSpec, StrokeModel
-from model.raster.compiled import coverage_numpy
-from model.raster.frame import SIZE_PX, centred_origin
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.generator.network import Layers
+from brushloop.model.outline import Shape
+from brushloop.model.press_images import press_images
+from brushloop.model.protocol import ParameterSpec, StrokeModel
+from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster.frame import SIZE_PX, centred_origin
 
 ANCHOR_SHARE = (0.76, 0.5)
 """Position of the zero-touch point in the image, from the left and the top, as in the validation's mm field."""

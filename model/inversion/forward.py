@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from model.inversion.jets import Jets
+from brushloop.model.inversion.jets import Jets
 
 Floats = NDArray[np.float64]
 Images = NDArray[np.float32]
@@ -82,7 +82,7 @@ class Outlines:
 
     def normal(self, values: Floats, target: Images, row: Rows) -> Normal:
         """See `Forward`."""
-        from model.inversion.kernel import normal_equations
+        from brushloop.model.inversion.kernel import normal_equations
 
         points, weights, velocities, rates = self._placed(values, derivatives=True)
         count, free = len(values), len(self.names)
@@ -96,7 +96,7 @@ class Outlines:
         return sums
 
     def _draw(self, points: Floats, weights: Floats) -> Images:
-        from model.raster.kernel import rasterise
+        from brushloop.model.raster.kernel import rasterise
 
         out = np.empty((len(points), self.size_px, self.size_px), np.float32)
         same = np.zeros((len(points), 6))

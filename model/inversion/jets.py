@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from model.outline import Outline
-from model.protocol import StrokeModel
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import StrokeModel
 
 Floats = NDArray[np.float64]
 

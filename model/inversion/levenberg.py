@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.inversion.forward import Forward, Images, Normal
+from brushloop.model.inversion.forward import Forward, Images, Normal
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -19,8 +19,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from model.inversion.forward import BLOCK_PX, Forward
-from model.inversion.levenberg import Fit, Limits
+from brushloop.model.inversion.forward import BLOCK_PX, Forward
+from brushloop.model.inversion.levenberg import Fit, Limits
 
 Floats = NDArray[np.float64]
 LEAST_NOISE = 1e-6

@@ -9,13 +9,13 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from model.inversion.forward import PARAMETERS, Forward, Images, Outlines
-from model.inversion.jets import Jets, analytic, of_model
-from model.inversion.levenberg import Limits, fit
-from model.inversion.noise import Noise, covariance
-from model.inversion.start import MIN_INK_MM2, Table, moments_of
-from model.protocol import Basis, StrokeModel
-from model.raster.frame import PX_MM, SIZE_PX
+from brushloop.model.inversion.forward import PARAMETERS, Forward, Images, Outlines
+from brushloop.model.inversion.jets import Jets, analytic, of_model
+from brushloop.model.inversion.levenberg import Limits, fit
+from brushloop.model.inversion.noise import Noise, covariance
+from brushloop.model.inversion.start import MIN_INK_MM2, Table, moments_of
+from brushloop.model.protocol import Basis, StrokeModel
+from brushloop.model.raster.frame import PX_MM, SIZE_PX
 
 Floats = NDArray[np.float64]
 EDGE_INK = 0.3

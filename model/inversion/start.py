@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.inversion.forward import Forward, Images
+from brushloop.model.inversion.forward import Forward, Images
 
 Floats = NDArray[np.float64]
 MIN_INK_MM2 = 0.5
@@ -49,7 +49,7 @@ class Moments:
 
 def moments_of(images: Images, px_mm: float) -> Moments:
     """The moments of (B, N, N) images; blank ones have area 0 and a centroid in the corner."""
-    from model.inversion.kernel import moments
+    from brushloop.model.inversion.kernel import moments
 
     sums = np.empty((len(images), 10))
     moments(images, sums)

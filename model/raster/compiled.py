@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model.outline import Shape
-from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
+from brushloop.model.outline import Shape
+from brushloop.model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
 
 _PER_THREAD = 64  # images; fewer are not worth a thread
 Images = NDArray[np.floating[Any]]
@@ -39,7 +39,7 @@ def coverage_numpy(
     returned. `threads` defaults to the number of cores for large batches and 1 for small ones. The error stays below
     1e-6. Raises ValueError for an invalid size, shape or `out`, and for a shape that is not finite.
     """
-    from model.raster.kernel import rasterise  # numba takes a fifth of a second to import
+    from brushloop.model.raster.kernel import rasterise  # numba takes a fifth of a second to import
 
     check_raster(size_px, px_mm)
     outline = shape.outline()

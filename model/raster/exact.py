@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from model.outline import Outline, Shape, evaluate
-from model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
+from brushloop.model.outline import Outline, Shape, evaluate
+from brushloop.model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
 
 _CHUNK = 16  # images at a time: about 2,500 pieces each, a dozen numbers per piece
 _LEAST_CUTS = 24  # parabolas per arc of an ellipse: the error is below 1e-6 of a pixel for any radius

@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from model.outline import Shape
+from brushloop.model.outline import Shape
 
 SIZE_PX = 128
 PX_MM = 0.2

@@ -16,7 +16,7 @@ import math
 import numba
 import numpy as np
 
-from model.raster.kernel import FURTHEST, OPTIONS, compiled, inline
+from brushloop.model.raster.kernel import FURTHEST, OPTIONS, compiled, inline
 
 CENTRED = 1e-9  # px; an axis this close to a row edge or to the middle of a row has a mirror image on the grid
 

@@ -9,8 +9,8 @@ import importlib
 import math
 import pkgutil
 
-from model.brush import Brush
-from model.protocol import Basis, ParameterSpec, StrokeModel
+from brushloop.model.brush import Brush
+from brushloop.model.protocol import Basis, ParameterSpec, StrokeModel
 
 __all__ = ["Basis", "ParameterSpec", "StrokeModel", "UnknownModelError", "stroke_model", "stroke_models"]
 

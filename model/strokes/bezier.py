@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from model.ccdbsm import CcdBsm
-from model.loops import BEZIER_PIECES, bezier_side
-from model.outline import Outline, through
-from model.protocol import Basis, ParameterSpec, Parametric, StrokeModel, Values
-from model.regression import regressed
+from brushloop.model.ccdbsm import CcdBsm
+from brushloop.model.loops import BEZIER_PIECES, bezier_side
+from brushloop.model.outline import Outline, through
+from brushloop.model.protocol import Basis, ParameterSpec, Parametric, StrokeModel, Values
+from brushloop.model.regression import regressed
 
 PARAMETERS = (
     ParameterSpec("tip_mm", "mm", 0.001, 400, 17, "from the origin to the end of the tip"),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from model.brush import Brush
-from model.ccdbsm import as_batch, ccdbsm
-from model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import as_batch, ccdbsm
+from brushloop.model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
 
 PARAMETERS = (
     ParameterSpec("height_mm", "mm", 0.01, 200, 15, "H, how far the tip is pressed below the paper"),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from model import baselines
-from model.ccdbsm import CcdBsm
-from model.outline import Outline
-from model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
-from model.regression import regressed, solve
-from model.sweep import swept
+from brushloop.model import baselines
+from brushloop.model.ccdbsm import CcdBsm
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import Basis, Number, ParameterSpec, Parametric, StrokeModel, Values
+from brushloop.model.regression import regressed, solve
+from brushloop.model.sweep import swept
 
 CAPSULE = (
     ParameterSpec("centre_mm", "mm", -200, 200, -10, "x of the middle, on the stroke axis"),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from model.ccdbsm import CcdBsm
-from model.outline import Outline
-from model.protocol import Basis, ParameterSpec, Parametric, StrokeModel, Values
-from model.regression import regressed, solve
-from model.sweep import swept
+from brushloop.model.ccdbsm import CcdBsm
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import Basis, ParameterSpec, Parametric, StrokeModel, Values
+from brushloop.model.regression import regressed, solve
+from brushloop.model.sweep import swept
 
 NODES = (("x0_mm", -17), ("y0_mm", 0), ("x1_mm", -10), ("y1_mm", 0), ("x2_mm", -4), ("y2_mm", 0))
 PARAMETERS = (

@@ -19,11 +19,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from model.brush import Brush
-from model.generator.network import Generator
-from model.generator.stroke import GeneratorModel, generator_model
-from model.train.config import MAX_BYTES, MAX_WEIGHTS, TrainConfig, checked
-from model.train.errors import TrainError
+from brushloop.model.brush import Brush
+from brushloop.model.generator.network import Generator
+from brushloop.model.generator.stroke import GeneratorModel, generator_model
+from brushloop.model.train.config import MAX_BYTES, MAX_WEIGHTS, TrainConfig, checked
+from brushloop.model.train.errors import TrainError
 
 CHECKPOINT, GENERATOR = "brushloop-checkpoint-1", "brushloop-generator-1"
 MAX_HEADER_BYTES = 4 * 1024 * 1024

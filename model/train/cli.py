@@ -1,6 +1,6 @@
 """`brushloop train`: train and tune the generator. Heavy imports wait until a command runs.
 
-A command that trains returns the folder of the training, of which `brushloop.py` has the page written.
+A command that trains returns the folder of the training, of which the front door has the page written.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def train(
     """Train on exact images of a stroke model (Algorithm 1), in one process on one device."""
     if context.invoked_subcommand is not None:
         return None
-    from model.train import config as configs
-    from model.train.run import train_with_bar
+    from brushloop.model.train import config as configs
+    from brushloop.model.train.run import train_with_bar
 
     changes = {"steps": steps, "seed": seed, "threads": threads, "workers": workers, "device": device}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -53,10 +53,10 @@ def tune(
     seed: Annotated[int, typer.Option(min=0, help="Which conditions are held out, and the order of the rest.")] = 0,
 ) -> Path:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""
-    from model.train.checkpoint import load_weights, sha256
-    from model.train.config import checked
-    from model.train.data import load_captures
-    from model.train.run import Tuning, train_with_bar
+    from brushloop.model.train.checkpoint import load_weights, sha256
+    from brushloop.model.train.config import checked
+    from brushloop.model.train.data import load_captures
+    from brushloop.model.train.run import Tuning, train_with_bar
 
     before = load_weights(generator)[0]
     _, source = load_captures(captures, before)

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from model.brush import Brush, DomainError
-from model.generator.network import Generator, Layers
-from model.generator.targets import PRESETS, Placement, Target
-from model.strokes import UnknownModelError, stroke_model
-from model.train.errors import TrainError
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.generator.network import Generator, Layers
+from brushloop.model.generator.targets import PRESETS, Placement, Target
+from brushloop.model.strokes import UnknownModelError, stroke_model
+from brushloop.model.train.errors import TrainError
 
 MAX_BYTES = 64 * 1024
 MAX_WEIGHTS = 50_000_000

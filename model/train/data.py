@@ -22,10 +22,10 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from model.generator.targets import Target
-from model.train.checkpoint import read_tensors, write_whole
-from model.train.config import TrainConfig
-from model.train.errors import TrainError
+from brushloop.model.generator.targets import Target
+from brushloop.model.train.checkpoint import read_tensors, write_whole
+from brushloop.model.train.config import TrainConfig
+from brushloop.model.train.errors import TrainError
 
 _TRAINING, _VALIDATION, _ORDER, _SPLIT = range(4)
 FORMAT = "brushloop-captures-1"

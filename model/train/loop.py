@@ -11,11 +11,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from model.generator.network import Generator, squared_error
-from model.train.checkpoint import State, put_weights
-from model.train.config import TrainConfig
-from model.train.data import Images, batches
-from model.train.errors import BlankOutput, Diverged, TrainingStopped
+from brushloop.model.generator.network import Generator, squared_error
+from brushloop.model.train.checkpoint import State, put_weights
+from brushloop.model.train.config import TrainConfig
+from brushloop.model.train.data import Images, batches
+from brushloop.model.train.errors import BlankOutput, Diverged, TrainingStopped
 
 BLANK_SHARE = 0.05
 """Output is blank if its ink, or its paper, is less than this share of the targets' ink or paper."""

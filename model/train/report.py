@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from model.protocol import ParameterSpec
-from model.train.checkpoint import COLUMNS, State, read_tensors, sha256, write_whole
-from model.train.config import TrainConfig
-from model.train.errors import TrainError
+from brushloop.model.protocol import ParameterSpec
+from brushloop.model.train.checkpoint import COLUMNS, State, read_tensors, sha256, write_whole
+from brushloop.model.train.config import TrainConfig
+from brushloop.model.train.errors import TrainError
 
 
 def write_curves(folder: Path, state: State, title: str) -> None:

@@ -20,9 +20,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as ProgressBar
 from torch import Tensor
 
-from model.generator.metrics import SSIM_SETTINGS, quality
-from model.generator.network import Generator
-from model.train.checkpoint import (
+from brushloop.model.generator.metrics import SSIM_SETTINGS, quality
+from brushloop.model.generator.network import Generator
+from brushloop.model.train.checkpoint import (
     State,
     load_checkpoint,
     load_weights,
@@ -31,11 +31,11 @@ from model.train.checkpoint import (
     save_generator,
     sha256,
 )
-from model.train.config import TrainConfig, differences
-from model.train.data import Images, exact_sets, load_captures, split
-from model.train.errors import TrainError
-from model.train.loop import Progress, Validation, converged, new_state, train
-from model.train.report import MOST_SAMPLES, Samples, save_samples, write_card, write_curves, write_pictures
+from brushloop.model.train.config import TrainConfig, differences
+from brushloop.model.train.data import Images, exact_sets, load_captures, split
+from brushloop.model.train.errors import TrainError
+from brushloop.model.train.loop import Progress, Validation, converged, new_state, train
+from brushloop.model.train.report import MOST_SAMPLES, Samples, save_samples, write_card, write_curves, write_pictures
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,15 +10,15 @@ import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from sessions.cells import CsvWriter
-from sessions.disk import check_room, staged_folder, sync, write_durably
-from sessions.errors import InputError, disk_error
-from sessions.export.npz import SAMPLE_COLUMNS, write_npz
-from sessions.export.parquet import write_parquet
-from sessions.export.rows import Cropper, Export, ForceRow, PoseRow, Row
-from sessions.progress import Progress, unseen
-from sessions.reader import Recording
-from sessions.spool import Spool
+from brushloop.sessions.cells import CsvWriter
+from brushloop.sessions.disk import check_room, staged_folder, sync, write_durably
+from brushloop.sessions.errors import InputError, disk_error
+from brushloop.sessions.export.npz import SAMPLE_COLUMNS, write_npz
+from brushloop.sessions.export.parquet import write_parquet
+from brushloop.sessions.export.rows import Cropper, Export, ForceRow, PoseRow, Row
+from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.spool import Spool
 
 POSE_COLUMNS = (*SAMPLE_COLUMNS, "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 FORCE_COLUMNS = (*SAMPLE_COLUMNS, "fx_n", "fy_n", "fz_n", "mx_nm", "my_nm", "mz_nm")

@@ -21,10 +21,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sessions.disk import write_durably
-from sessions.errors import InputError
-from sessions.export.rows import Export, ForceRow, PoseRow, Row
-from sessions.terminal import plain
+from brushloop.sessions.disk import write_durably
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.export.rows import Export, ForceRow, PoseRow, Row
+from brushloop.sessions.terminal import plain
 
 ROWS_PER_GROUP = 32
 """Photographs held in memory at a time; viewers want small groups for rows with images."""

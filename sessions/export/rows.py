@@ -12,13 +12,13 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from sessions.errors import SessionDamaged
-from sessions.history import WAIT, unlike
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Capture, Recording
-from sessions.recording import container
-from sessions.recording.messages import PNG_START
-from sessions.recording.schemas import Quality, StepEvent, Stroke, Topic, Wrench
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.history import WAIT, unlike
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.messages import PNG_START
+from brushloop.sessions.recording.schemas import Quality, StepEvent, Stroke, Topic, Wrench
 
 TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
 CROP_TEXT_COLUMNS = ("mask_file", "flags")

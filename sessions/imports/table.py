@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sessions.cells import as_text, number
-from sessions.disk import read_bounded
-from sessions.errors import InputError
-from sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
-from sessions.spool import Spool
+from brushloop.sessions.cells import as_text, number
+from brushloop.sessions.disk import read_bounded
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
+from brushloop.sessions.spool import Spool
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
 MAX_ROWS = 100_000

@@ -7,8 +7,8 @@ import re
 from collections.abc import Callable
 from typing import Any, cast
 
-from sessions.journal.codec import Line
-from sessions.names import bare_name
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.names import bare_name
 
 NONSENSE = (KeyError, TypeError, ValueError, OverflowError, AttributeError)
 """Exceptions that a malformed line may cause."""

@@ -15,13 +15,13 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sessions.disk import fsync_folder
-from sessions.errors import SessionDamaged, disk_error, in_one_line
-from sessions.journal.codec import Chain, Line, digest, encode_line
-from sessions.journal.events import NONSENSE, check_event, serial_of
-from sessions.journal.lines import Fault, Reading, read, read_journal
-from sessions.names import check_file
-from sessions.recording.schemas import Header, Topic, TornTail
+from brushloop.sessions.disk import fsync_folder
+from brushloop.sessions.errors import SessionDamaged, disk_error, in_one_line
+from brushloop.sessions.journal.codec import Chain, Line, digest, encode_line
+from brushloop.sessions.journal.events import NONSENSE, check_event, serial_of
+from brushloop.sessions.journal.lines import Fault, Reading, read, read_journal
+from brushloop.sessions.names import check_file
+from brushloop.sessions.recording.schemas import Header, Topic, TornTail
 
 JOURNAL_NAME = "journal.jsonl"
 

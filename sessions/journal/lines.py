@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sessions.disk import read_bounded
-from sessions.errors import InputError, SessionDamaged, SessionError
-from sessions.journal.codec import BadLine, Entry, Line, decode_line, digest, has_crc, lines_within
-from sessions.names import check_file
+from brushloop.sessions.disk import read_bounded
+from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
+from brushloop.sessions.journal.codec import BadLine, Entry, Line, decode_line, digest, has_crc, lines_within
+from brushloop.sessions.names import check_file
 
 MAX_JOURNAL_BYTES = 256 * 1024 * 1024
 """Several times the journal of 20,000 strokes."""

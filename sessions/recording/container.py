@@ -15,9 +15,9 @@ from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from sessions.errors import InputError, SessionDamaged, in_one_line
-from sessions.recording.chunk import Contents
-from sessions.recording.index import UNREADABLE, BoundedFile, Index, chunk_at, indexed, opened, record_at
+from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
+from brushloop.sessions.recording.chunk import Contents
+from brushloop.sessions.recording.index import UNREADABLE, BoundedFile, Index, chunk_at, indexed, opened, record_at
 
 Record = tuple[Schema | None, Channel, Message]
 _T = TypeVar("_T")

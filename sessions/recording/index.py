@@ -24,8 +24,8 @@ from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, MetadataIn
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
-from sessions.errors import InputError, in_one_line
-from sessions.recording.chunk import RECORD_START, Contents, unpacked
+from brushloop.sessions.errors import InputError, in_one_line
+from brushloop.sessions.recording.chunk import RECORD_START, Contents, unpacked
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 """Largest record that is read: a chunk is 512 KiB plus one message, the largest image allowed, with room to spare."""

@@ -16,11 +16,11 @@ from typing import IO, Any, cast
 
 from mcap.records import Channel, Message, Schema
 
-from sessions.disk import sync
-from sessions.errors import SessionDamaged, in_one_line
-from sessions.recording import container
-from sessions.recording.mcap_writer import McapWriter
-from sessions.recording.schemas import Header, Topic
+from brushloop.sessions.disk import sync
+from brushloop.sessions.errors import SessionDamaged, in_one_line
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.mcap_writer import McapWriter
+from brushloop.sessions.recording.schemas import Header, Topic
 
 HEADER_METADATA = "brushloop.header"
 BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"

@@ -34,7 +34,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from sessions.recording.chunk import MESSAGE_START, RECORD_START, Contents
+from brushloop.sessions.recording.chunk import MESSAGE_START, RECORD_START, Contents
 
 CHUNK_BYTES = 256 * 1024
 _CHUNK_START = struct.Struct("<BQQQQII4sQ")

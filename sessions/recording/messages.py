@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
-from sessions.errors import SessionDamaged
+from brushloop.sessions.errors import SessionDamaged
 
 if TYPE_CHECKING:
     import numpy as np

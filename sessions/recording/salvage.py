@@ -24,10 +24,10 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from sessions.errors import in_one_line
-from sessions.recording.chunk import RECORD_START
-from sessions.recording.container import Record
-from sessions.recording.index import (
+from brushloop.sessions.errors import in_one_line
+from brushloop.sessions.recording.chunk import RECORD_START
+from brushloop.sessions.recording.container import Record
+from brushloop.sessions.recording.index import (
     MAX_RECORD_BYTES,
     UNREADABLE,
     BoundedFile,
@@ -37,8 +37,8 @@ from sessions.recording.index import (
     indexed,
     opened,
 )
-from sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
-from sessions.recording.parts import Part, Parts
+from brushloop.sessions.recording.mcap_file import HEADER_METADATA, header_crc, read_note
+from brushloop.sessions.recording.parts import Part, Parts
 
 _STROKE_NAME = re.compile(rb'"stroke_id":"([^"\\]{1,100})","kind"')
 """Beginning of a stroke's message."""

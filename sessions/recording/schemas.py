@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from sessions.names import bare_name
+from brushloop.sessions.names import bare_name
 
 SCHEMA_VERSION = 1
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sessions.disk import fsync_folder, sync
-from sessions.errors import SessionError, disk_error
-from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, file_sha256, note, start_mcap
-from sessions.recording.mcap_writer import McapWriter
-from sessions.recording.schemas import Event, Header, Recorded, Topic
+from brushloop.sessions.disk import fsync_folder, sync
+from brushloop.sessions.errors import SessionError, disk_error
+from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, file_sha256, note, start_mcap
+from brushloop.sessions.recording.mcap_writer import McapWriter
+from brushloop.sessions.recording.schemas import Event, Header, Recorded, Topic
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message

@@ -14,18 +14,18 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
-from sessions.errors import SessionDamaged, SessionError
-from sessions.journal.codec import Line, encode_line, without_time
-from sessions.journal.events import NONSENSE, serial_of
-from sessions.journal.journal import JOURNAL_NAME, Account, DoneTwice, Replay, account, fold
-from sessions.journal.lines import Fault, accounts_for, read_journal
-from sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
-from sessions.reader import parse_header
-from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, count_messages, file_sha256
-from sessions.recording.salvage import Scan, recorded_in, scan, session_of
-from sessions.recording.schemas import Header, Recorded, Topic
-from sessions.store import closed_line, done_line, open_line
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
+from brushloop.sessions.errors import SessionDamaged, SessionError
+from brushloop.sessions.journal.codec import Line, encode_line, without_time
+from brushloop.sessions.journal.events import NONSENSE, serial_of
+from brushloop.sessions.journal.journal import JOURNAL_NAME, Account, DoneTwice, Replay, account, fold
+from brushloop.sessions.journal.lines import Fault, accounts_for, read_journal
+from brushloop.sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
+from brushloop.sessions.reader import parse_header
+from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, count_messages, file_sha256
+from brushloop.sessions.recording.salvage import Scan, recorded_in, scan, session_of
+from brushloop.sessions.recording.schemas import Header, Recorded, Topic
+from brushloop.sessions.store import closed_line, done_line, open_line
 
 
 @dataclass(slots=True)

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sessions.disk import fsync_folder, set_aside, sync
-from sessions.journal.codec import encode_line, without_time
-from sessions.journal.journal import JOURNAL_NAME, Journal, next_chain
-from sessions.repair.evidence import Evidence
-from sessions.show import step_words
+from brushloop.sessions.disk import fsync_folder, set_aside, sync
+from brushloop.sessions.journal.codec import encode_line, without_time
+from brushloop.sessions.journal.journal import JOURNAL_NAME, Journal, next_chain
+from brushloop.sessions.repair.evidence import Evidence
+from brushloop.sessions.show import step_words
 
 
 @dataclass(slots=True)

@@ -13,24 +13,24 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from sessions.disk import fsync_folder, holds, set_aside
-from sessions.errors import SessionDamaged, SessionError, disk_error
-from sessions.folders import check_name, not_a_session
-from sessions.journal.codec import Line, without_time
-from sessions.journal.journal import JOURNAL_NAME, Replay, fold, read_header, replay
-from sessions.merge import REPAIRS_NOTE, merge_session
-from sessions.names import SEGMENT_NAME
-from sessions.recording.container import Record
-from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, check_digest, count_messages, file_sha256
-from sessions.recording.salvage import Scan, recorded_in, scan
-from sessions.recording.schemas import Topic
-from sessions.repair.evidence import gather
-from sessions.repair.journal import Report, kept_words, repaired_journal, write_anew
-from sessions.repair.rewrite import lost_words, repair_file, replace_damaged, with_their_stills
-from sessions.repair.union import Source, identity_of, united
-from sessions.repair.verify import file_problems
-from sessions.show import step_words
-from sessions.store import closed_line, lock
+from brushloop.sessions.disk import fsync_folder, holds, set_aside
+from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
+from brushloop.sessions.folders import check_name, not_a_session
+from brushloop.sessions.journal.codec import Line, without_time
+from brushloop.sessions.journal.journal import JOURNAL_NAME, Replay, fold, read_header, replay
+from brushloop.sessions.merge import REPAIRS_NOTE, merge_session
+from brushloop.sessions.names import SEGMENT_NAME
+from brushloop.sessions.recording.container import Record
+from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, check_digest, count_messages, file_sha256
+from brushloop.sessions.recording.salvage import Scan, recorded_in, scan
+from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.repair.evidence import gather
+from brushloop.sessions.repair.journal import Report, kept_words, repaired_journal, write_anew
+from brushloop.sessions.repair.rewrite import lost_words, repair_file, replace_damaged, with_their_stills
+from brushloop.sessions.repair.union import Source, identity_of, united
+from brushloop.sessions.repair.verify import file_problems
+from brushloop.sessions.show import step_words
+from brushloop.sessions.store import closed_line, lock
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 """Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""

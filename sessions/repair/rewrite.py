@@ -10,18 +10,18 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from mcap.records import Message
 
-from sessions.disk import fsync_folder, set_aside
-from sessions.errors import SessionDamaged, disk_error
-from sessions.journal.codec import Line
-from sessions.reader import parse_header
-from sessions.recording.container import Record
-from sessions.recording.mcap_file import HEADER_METADATA, count_messages, header_crc, new_mcap
-from sessions.recording.messages import decode_still
-from sessions.recording.salvage import Scan, glimpsed, salvaged, scan
-from sessions.recording.schemas import Header, Stroke, Topic
-from sessions.repair.journal import Report, kept_words
-from sessions.repair.union import parsed
-from sessions.repair.verify import verify_session
+from brushloop.sessions.disk import fsync_folder, set_aside
+from brushloop.sessions.errors import SessionDamaged, disk_error
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.reader import parse_header
+from brushloop.sessions.recording.container import Record
+from brushloop.sessions.recording.mcap_file import HEADER_METADATA, count_messages, header_crc, new_mcap
+from brushloop.sessions.recording.messages import decode_still
+from brushloop.sessions.recording.salvage import Scan, glimpsed, salvaged, scan
+from brushloop.sessions.recording.schemas import Header, Stroke, Topic
+from brushloop.sessions.repair.journal import Report, kept_words
+from brushloop.sessions.repair.union import parsed
+from brushloop.sessions.repair.verify import verify_session
 
 
 def replace_damaged(

@@ -15,12 +15,12 @@ from typing import TypeVar
 from mcap.records import Message
 from pydantic import ValidationError
 
-from sessions.journal.codec import Line
-from sessions.recording.container import Record
-from sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE
-from sessions.recording.parts import Part
-from sessions.recording.salvage import Scan, read_part, salvaged
-from sessions.recording.schemas import StepEvent, Stroke, Topic
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.recording.container import Record
+from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE
+from brushloop.sessions.recording.parts import Part
+from brushloop.sessions.recording.salvage import Scan, read_part, salvaged
+from brushloop.sessions.recording.schemas import StepEvent, Stroke, Topic
 
 Place = tuple[str, int]
 """Topic, and number within the step."""

@@ -9,20 +9,20 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from sessions.disk import holds
-from sessions.errors import InputError, SessionDamaged, SessionError
-from sessions.folders import check_name, not_a_session
-from sessions.journal.codec import Line
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.names import SEGMENT_NAME
-from sessions.progress import Progress, counted, unseen
-from sessions.reader import Recording
-from sessions.recording.mcap_file import HEADER_METADATA, check_digest
-from sessions.recording.messages import decode_gray, decode_still
-from sessions.recording.salvage import Scan, recorded_in, salvaged, scan
-from sessions.recording.schemas import Stroke, Topic
-from sessions.repair.evidence import Evidence, gather
-from sessions.show import details, step_words
+from brushloop.sessions.disk import holds
+from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
+from brushloop.sessions.folders import check_name, not_a_session
+from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.names import SEGMENT_NAME
+from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.mcap_file import HEADER_METADATA, check_digest
+from brushloop.sessions.recording.messages import decode_gray, decode_still
+from brushloop.sessions.recording.salvage import Scan, recorded_in, salvaged, scan
+from brushloop.sessions.recording.schemas import Stroke, Topic
+from brushloop.sessions.repair.evidence import Evidence, gather
+from brushloop.sessions.show import details, step_words
 
 IMAGES = (Topic.STILL, Topic.PREVIEW)
 

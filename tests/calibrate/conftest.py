@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibrate.board.lens import LensUsed
-from calibrate.board.spec import BoardSpec
-from sessions.recording.messages import encode_png, image_message
-from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
-from sessions.recording.writer import Outgoing
-from sessions.store import SessionStore
+from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.sessions.recording.messages import encode_png, image_message
+from brushloop.sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
+from brushloop.sessions.recording.writer import Outgoing
+from brushloop.sessions.store import SessionStore
 
 T0_NS = 1_700_000_000_000_000_000
 MINUTE_NS = 60_000_000_000

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from calibrate.calibration import Calibration
-from calibrate.writing.plan_record import PlannedBy
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.writing.plan_record import PlannedBy
 
 CALIBRATION = Calibration(
     session_id="test",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-from calibrate.compare.field import KEYS
-from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
-from calibrate.writing.scores import KEYS as WRITTEN_KEYS
-from calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
-from sessions.recording.schemas import Source
+from brushloop.calibrate.compare.field import KEYS
+from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
+from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS
+from brushloop.calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
+from brushloop.sessions.recording.schemas import Source
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 

@@ -13,17 +13,17 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from bench.preprocess_rigs import board_of
-from brushloop import app
-from calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
-from calibrate.session import calibrate_session, calibration_of
-from drivers.geometry import brush_pose
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.world import World
-from sessions.reader import Recording
-from sessions.recording.schemas import Stroke
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.session import calibrate_session, calibration_of
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.world import World
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.artefact import current, load_artefact, put_to_use
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.artefact import current, load_artefact, put_to_use
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
 
 MADE = Calibration(
     session_id="2026-01-02-grid-01",

@@ -12,15 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 from bench.preprocess_rigs import board_of
-from brushloop import app
-from calibrate.artefact import current, load_artefact
-from calibrate.board.spec import BoardSpec
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
-from drivers.geometry import brush_pose
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.world import World
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.world import World
 from tests.command import brushloop
 
 if TYPE_CHECKING:

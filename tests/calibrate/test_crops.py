@@ -15,10 +15,10 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from bench.preprocess_rigs import Shot, sheet, true_mask
-from brushloop import app
-from calibrate.compare.field import Field
-from calibrate.session import calibrate_session
-from sessions.recording.schemas import Stroke
+from brushloop.__main__ import app
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.session import calibrate_session
+from brushloop.sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

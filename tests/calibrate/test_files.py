@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.errors import CalibrationError
-from calibrate.files import check_target
+from brushloop.__main__ import app
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import check_target
 
 
 def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_where_it_is_to_be_written_is_looked_at_before_any_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").write_text("a file")
     with monkeypatch.context() as patch:
-        patch.setattr("calibrate.writing.plan.plan", None)  # not called: it takes minutes
+        patch.setattr("brushloop.calibrate.writing.plan.plan", None)  # not called: it takes minutes
         ran = CliRunner().invoke(app, [*words])
     assert isinstance(ran.exception, CalibrationError)
     assert str(ran.exception) == f"{tmp_path / 'taken'}: is a file; a folder is needed"

@@ -12,26 +12,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.board.artefact import lens_file
-from calibrate.board.detect import BoardView
-from calibrate.board.intrinsics import fit_lens
-from calibrate.board.lens import Gray, lens_of
-from calibrate.board.spec import BoardSpec, charuco_board
-from calibrate.compare.field import KEYS, Field, Tone
-from calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison, Pairs
-from calibrate.loop.report import write_loop
-from calibrate.loop.scores import CapturedPress, Pair, score_pairs, table_1, verdicts
-from calibrate.pages.lens import thumbnail, write_lens_page
-from calibrate.stroke.measure import Measured
-from calibrate.validate.report.page import pages_beside
-from calibrate.writing.compare import WritingComparison
-from calibrate.writing.plan_files import figure_record
-from calibrate.writing.plan_record import PlanRecord
-from calibrate.writing.report import write_written
-from calibrate.writing.scores import Character, score_character, table_3
-from drivers.sim.brush.brush import Brush, BrushSpec
-from sessions.recording.schemas import Header, Source
+from brushloop.__main__ import app
+from brushloop.calibrate.board.artefact import lens_file
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.intrinsics import fit_lens
+from brushloop.calibrate.board.lens import Gray, lens_of
+from brushloop.calibrate.board.spec import BoardSpec, charuco_board
+from brushloop.calibrate.compare.field import KEYS, Field, Tone
+from brushloop.calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison, Pairs
+from brushloop.calibrate.loop.report import write_loop
+from brushloop.calibrate.loop.scores import CapturedPress, Pair, score_pairs, table_1, verdicts
+from brushloop.calibrate.pages.lens import thumbnail, write_lens_page
+from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.validate.report.page import pages_beside
+from brushloop.calibrate.writing.compare import WritingComparison
+from brushloop.calibrate.writing.plan_files import figure_record
+from brushloop.calibrate.writing.plan_record import PlanRecord
+from brushloop.calibrate.writing.report import write_written
+from brushloop.calibrate.writing.scores import Character, score_character, table_3
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.sessions.recording.schemas import Header, Source
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import BY, CALIBRATION
 from tests.photographed import imported, photograph

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from calibrate.report import printable, source_label, source_note
-from sessions.recording.schemas import Source
+from brushloop.calibrate.report import printable, source_label, source_note
+from brushloop.sessions.recording.schemas import Source
 
 MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2: no evidence for the model)"
 

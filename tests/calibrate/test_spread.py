@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.spread import farthest_first
+from brushloop.calibrate.spread import farthest_first
 
 
 def test_the_corners_of_a_line_come_before_its_middle() -> None:

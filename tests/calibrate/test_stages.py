@@ -11,13 +11,13 @@ import pytest
 from typer.testing import CliRunner
 
 from bench.press_sessions import Presses, session
-from calibrate.cli import app
-from calibrate.compare import MM_PER_PX
-from calibrate.compare.field import Field
-from calibrate.errors import CaptureRefused
-from calibrate.stages import trace_scaled
-from calibrate.stroke.params import Params
-from sessions.reader import Recording
+from brushloop.calibrate.cli import app
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stages import trace_scaled
+from brushloop.calibrate.stroke.params import Params
+from brushloop.sessions.reader import Recording
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_the_command_still_takes_a_session_as_it_did(tmp_path: Path) -> None:
 
 
 def test_reading_up_to_a_stroke_says_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sessions.progress.QUIET_S", 0.0)
+    monkeypatch.setattr("brushloop.sessions.progress.QUIET_S", 0.0)
     place = session(tmp_path, "three", Presses(3, seed=0))
     last = [stroke.stroke_id for stroke in Recording(place).stroke_records()][-1]
     arguments = ["preprocess", str(place), "--stroke", last, "--out", str(tmp_path / "stages.png")]

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from collect.engine.engine import Engine
-from collect.engine.open_or_resume import Opening, find_resumable, open_store
-from drivers.arcs.rpc import RpcConnection
-from drivers.clock import HostClock
-from drivers.force import stream
-from drivers.sim.brush.flaws import Flaw
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.rig import LoopbackRig
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.force import stream
+from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.rig import LoopbackRig
 from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S
 

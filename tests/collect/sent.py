@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.motion.moves import Move, Room, Way, over_sheet_move, photograph_moves
-from collect.planning.walk import StepMoves
-from collect.rig.config import RigConfig
-from collect.rig.paper import to_paper
-from drivers.geometry import distance
-from drivers.samples import Pose
-from drivers.sim.arm.motion import MotionQueue
+from brushloop.collect.motion.moves import Move, Room, Way, over_sheet_move, photograph_moves
+from brushloop.collect.planning.walk import StepMoves
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.paper import to_paper
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.motion import MotionQueue
 
 SAME_MM, SAME_DEG = 1e-6, 1e-4
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine.control import State
-from collect.engine.snapshot import Snapshot
-from collect.headless import eta_text
-from drivers.sim.faults.phases import Phase
-from sessions.journal.journal import JOURNAL_NAME, replay
-from sessions.reader import Recording
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.headless import eta_text
+from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.reader import Recording
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.protocols.config import load_protocol
-from sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.recording.mcap_file import file_sha256
-from sessions.recording.schemas import Stroke
-from sessions.repair.verify import verify_session
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.mcap_file import file_sha256
+from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.repair.verify import verify_session
 
 if TYPE_CHECKING:
     from conftest import Lab

@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from collect.engine.engine import Engine
-from collect.engine.snapshot import Snapshot
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.snapshot import Snapshot
 from tests.waiting import PATIENCE_S
 
 LOOK_S = 0.01

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from drivers.arcs.robot import AuboArcs
-from drivers.samples import Pose
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.samples import Pose
 
 LIFT_MM = 5.0
 """No test sends the tip higher than this above where it stood, lower than that, or sideways."""

@@ -14,14 +14,14 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from collect.rig.config import RigConfig
-from collect.rig.devices import limits_of, make_robot
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rpc import RpcConnection
-from drivers.clock import HostClock
-from drivers.errors import LimitExceeded, MotionError, NotConnected
-from drivers.geometry import distance
-from drivers.samples import Pose, PoseSample, QueuedLine
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import limits_of, make_robot
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import LimitExceeded, MotionError, NotConnected
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.samples import Pose, PoseSample, QueuedLine
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
 
 GENTLY = {"speed_mm_s": SPEED_MM_S, "acc_mm_s2": ACC_MM_S2}

@@ -6,13 +6,13 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.clock import HostClock
-from drivers.limits import Limits
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import HOST
-from drivers.sim.world import World
+from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import HOST
+from brushloop.drivers.sim.world import World
 
 RATE = 20.0
 

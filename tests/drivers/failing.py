@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.sim.faults.kinds import ForceFault, InkFault
-from drivers.sim.instruments.force_board import ForceBoard
-from drivers.sim.instruments.ink_station import PtyLine
+from brushloop.drivers.sim.faults.kinds import ForceFault, InkFault
+from brushloop.drivers.sim.instruments.force_board import ForceBoard
+from brushloop.drivers.sim.instruments.ink_station import PtyLine
 
 
 def fail_rounds(board: ForceBoard, *faults: ForceFault) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.sim.arcs.rtde_server import RtdeServer
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
 
 
 def mute(server: ArcsServer | RtdeServer) -> None:

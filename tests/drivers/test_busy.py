@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from collect.errors import CameraLate, describe
-from drivers.errors import DeviceTimeout, Stale, noting_lateness, too_busy
+from brushloop.collect.errors import CameraLate, describe
+from brushloop.drivers.errors import DeviceTimeout, Stale, noting_lateness, too_busy
 
 LATE = [
     lambda: CameraLate("the camera's delay is not steady: use a cable instead of Wi-Fi."),

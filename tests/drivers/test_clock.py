@@ -2,8 +2,8 @@ import time
 
 import pytest
 
-from drivers.clock import HostClock
-from drivers.sim.world import SimClock
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.world import SimClock
 
 
 def test_the_host_clock_gives_wall_time():

@@ -6,12 +6,12 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from model.baselines import Capsule, Ellipse, circle, ellipse, line
-from model.brush import Brush, DomainError
-from model.ccdbsm import CcdBsm, ccdbsm
-from model.raster.exact import coverage_at
-from model.raster.frame import centred_origin
-from model.strokes import stroke_models
+from brushloop.model.baselines import Capsule, Ellipse, circle, ellipse, line
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import CcdBsm, ccdbsm
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import centred_origin
+from brushloop.model.strokes import stroke_models
 
 GRID_MM = torch.tensor([11.0, 15.0, 20.0], dtype=torch.float64)
 MARK = ccdbsm(Brush(), GRID_MM, 5)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from model.brush import Brush, DomainError
-from model.ccdbsm import ccdbsm
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import ccdbsm
 
 # (H, alpha): O3A, O3C, O4O3, length, width, all mm, for R = 6, L = 48 and lambda = pi.
 TABLE = {

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from model.baselines import circle, ellipse, line
-from model.brush import Brush
-from model.ccdbsm import CcdBsm, ccdbsm
-from model.outline import Shape
-from model.raster.exact import coverage_at
-from model.raster.frame import PX_MM, SIZE_PX, centred_origin
+from brushloop.model.baselines import circle, ellipse, line
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import CcdBsm, ccdbsm
+from brushloop.model.outline import Shape
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import PX_MM, SIZE_PX, centred_origin
 
 Array = NDArray[np.floating[Any]]
 Curve = Callable[[Array], Array]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.drag import DragModel, distances, ink, trails
+from brushloop.model.drag import DragModel, distances, ink, trails
 
 STIFF = DragModel(half_mm=2.0, half_per_mm=0.0, leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0)
 X_MM, Y_MM = np.linspace(-10.0, 50.0, 121), np.linspace(-20.0, 20.0, 81)

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from sessions.errors import InputError
-from sessions.imports.photographs import ImportOptions, import_photographs
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.journal.lines import read_lines
-from sessions.recording.messages import encode_png, image_message, pose_message
-from sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
-from sessions.recording.writer import Outgoing, SegmentWriter
-from sessions.store import SessionStore
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.recording.messages import encode_png, image_message, pose_message
+from brushloop.sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
+from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.store import SessionStore
 
 
 class Make:
@@ -146,7 +146,7 @@ class Make:
             (folder / row["file"]).write_bytes(self.png(number))
         table = folder / "table.csv"
         with table.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
+            writer = csv.DictWriter(file, list(rows[0]))  # noqa: TID251
             writer.writeheader()
             writer.writerows(rows)
         return table

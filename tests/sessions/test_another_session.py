@@ -4,12 +4,12 @@ import shutil
 
 import pytest
 
-from sessions.errors import SessionDamaged
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.reader import Recording
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
-from sessions.store import SessionStore
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.store import SessionStore
 
 OTHER = "2026-01-03-grid-01"
 

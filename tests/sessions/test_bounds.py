@@ -5,10 +5,10 @@ import os
 import pytest
 import zstandard
 
-from sessions.folders import open_sessions
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
+from brushloop.sessions.folders import open_sessions
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
 from tests.command import brushloop
 
 HUGE = 40 * 2**30

@@ -5,10 +5,10 @@ import io
 
 import pytest
 
-from sessions.cells import CsvWriter, as_cell, as_text, number
-from sessions.export.export import export
-from sessions.imports.photographs import ImportOptions
-from sessions.reader import Recording
+from brushloop.sessions.cells import CsvWriter, as_cell, as_text, number
+from brushloop.sessions.export.export import export
+from brushloop.sessions.imports.photographs import ImportOptions
+from brushloop.sessions.reader import Recording
 
 FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1", "''=1", "＝1"]
 

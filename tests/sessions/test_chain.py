@@ -5,13 +5,13 @@ import json
 
 import pytest
 
-from sessions.errors import SessionDamaged
-from sessions.journal.codec import encode_line
-from sessions.journal.journal import JOURNAL_NAME, replay
-from sessions.journal.lines import read, read_lines
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
-from sessions.store import SessionStore
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.journal.codec import encode_line
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal.lines import read, read_lines
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.store import SessionStore
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
 
-from sessions.errors import InputError, SessionDamaged
-from sessions.reader import Recording
-from sessions.recording import index as index_file
+from brushloop.sessions.errors import InputError, SessionDamaged
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import index as index_file
 
 CUTS = 120
 FLIPS = 400

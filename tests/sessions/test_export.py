@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from sessions.errors import InputError, SessionError
-from sessions.export.export import export
-from sessions.reader import Recording
-from sessions.recording.messages import decode_gray
-from sessions.recording.schemas import Check, Quality, Topic, Wrench
-from sessions.recording.writer import Outgoing
+from brushloop.__main__ import app
+from brushloop.sessions.errors import InputError, SessionError
+from brushloop.sessions.export.export import export
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.recording.schemas import Check, Quality, Topic, Wrench
+from brushloop.sessions.recording.writer import Outgoing
 
 
 @pytest.fixture
@@ -165,7 +165,9 @@ def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(session,
 @pytest.mark.parametrize("kind", ["png", "npz", "parquet"])
 def test_a_damaged_photograph_or_a_full_disk_leaves_nothing(make, tmp_path, to, kind, monkeypatch):
     path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0))
-    monkeypatch.setattr("sessions.disk.fsync_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr(
+        "brushloop.sessions.disk.fsync_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left"))
+    )
     with pytest.raises(SessionError, match="No space left"):
         export(path, to, kind)
     assert list(tmp_path.glob("*exported*")) == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sessions.history import ZeroTouch, history_of
+from brushloop.sessions.history import ZeroTouch, history_of
 
 
 def did(store, key: str, kind: str, result: dict[str, object]) -> None:

@@ -11,13 +11,13 @@ import pytest
 from click.testing import CliRunner
 from typer.main import get_command
 
-from brushloop import app
-from sessions.errors import InputError
-from sessions.folders import open_sessions
-from sessions.journal.codec import encode_line
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.names import bare_name
-from sessions.store import SessionStore
+from brushloop.__main__ import app
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.folders import open_sessions
+from brushloop.sessions.journal.codec import encode_line
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.names import bare_name
+from brushloop.sessions.store import SessionStore
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"
@@ -89,7 +89,7 @@ def place(make, tmp_path):
 
 def rewritten(folder, change):
     """The journal again, unchained as a stranger may write it, with `change` made to each of its lines."""
-    from sessions.journal.lines import read_lines
+    from brushloop.sessions.journal.lines import read_lines
 
     lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
     data = b"".join(encode_line(line.pop("t_ns"), line) for line in lines)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
-from sessions.export.export import export
-from sessions.imports.photographs import ImportOptions
-from sessions.reader import Recording
-from sessions.recording.schemas import Source
+from brushloop.sessions.cli import app
+from brushloop.sessions.export.export import export
+from brushloop.sessions.imports.photographs import ImportOptions
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Source
 from tests.command import brushloop
 
 START = {"start_x_px": "1", "start_y_px": "1"}

@@ -6,9 +6,9 @@ import os
 
 import pytest
 
-from sessions.errors import SessionDamaged, SessionError
-from sessions.journal.journal import Journal, replay
-from sessions.journal.lines import read_lines
+from brushloop.sessions.errors import SessionDamaged, SessionError
+from brushloop.sessions.journal.journal import Journal, replay
+from brushloop.sessions.journal.lines import read_lines
 
 BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "cell": 4, "file": "0000-k1.mcap"}
 DONE = {

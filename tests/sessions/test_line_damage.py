@@ -19,12 +19,12 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 
-from sessions.journal.codec import with_crc
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.recording.schemas import Topic
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
-from sessions.store import SessionStore
+from brushloop.sessions.journal.codec import with_crc
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.store import SessionStore
 
 STROKES = 3
 QUICK = 15

@@ -9,8 +9,8 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 
-from sessions.recording.container import chunks, messages
-from sessions.recording.mcap_writer import CHUNK_BYTES, McapWriter
+from brushloop.sessions.recording.container import chunks, messages
+from brushloop.sessions.recording.mcap_writer import CHUNK_BYTES, McapWriter
 
 PLACES = {"chunk_length", "chunk_start_offset", "compressed_size", "message_index_offsets"}
 """What depends on how well a chunk was compressed; the library compresses at another level."""

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sessions.export import npz, npz_file
-from sessions.export.export import export
-from sessions.export.npz import Numbers, Texts
-from sessions.export.npz_file import NpzFile, packed_image
+from brushloop.sessions.export import npz, npz_file
+from brushloop.sessions.export.export import export
+from brushloop.sessions.export.npz import Numbers, Texts
+from brushloop.sessions.export.npz_file import NpzFile, packed_image
 
 
 def written(path: Path, members: int) -> Path:

@@ -7,15 +7,15 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
-from sessions.errors import InputError
-from sessions.export.export import export
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.reader import Recording
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
-from sessions.show import Summary, details, summaries
-from sessions.store import SessionStore
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.export.export import export
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.show import Summary, details, summaries
+from brushloop.sessions.store import SessionStore
 
 
 @pytest.fixture

@@ -7,18 +7,18 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from sessions.cli import app
-from sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
-from sessions.journal.codec import encode_line
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.recording import mcap_writer
-from sessions.repair import rewrite
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
-from sessions.show import details
-from sessions.store import SessionStore
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
+from brushloop.sessions.journal.codec import encode_line
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import mcap_writer
+from brushloop.sessions.repair import rewrite
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.show import details
+from brushloop.sessions.store import SessionStore
 
 
 @pytest.fixture

@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.recording.schemas import Topic
-from sessions.repair.repair import repair_session
-from sessions.repair.verify import verify_session
-from sessions.store import SessionStore
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.store import SessionStore
 
 PLACES = 30
 """Random places in each of the two sessions, open and closed. The soak has more, and each boundary both ways."""

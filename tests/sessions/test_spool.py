@@ -3,7 +3,7 @@
 import json
 from itertools import islice
 
-from sessions.spool import IN_MEMORY_BYTES, Spool
+from brushloop.sessions.spool import IN_MEMORY_BYTES, Spool
 
 
 def test_items_beyond_memory_come_back_in_order_and_again() -> None:

@@ -10,14 +10,14 @@ import threading
 import pytest
 from mcap.reader import make_reader
 
-from sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
-from sessions.folders import next_session_id, open_sessions
-from sessions.journal.codec import with_crc
-from sessions.journal.journal import JOURNAL_NAME, Journal
-from sessions.reader import Recording
-from sessions.recording.container import attachments
-from sessions.recording.mcap_file import count_messages
-from sessions.store import SessionStore
+from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
+from brushloop.sessions.folders import next_session_id, open_sessions
+from brushloop.sessions.journal.codec import with_crc
+from brushloop.sessions.journal.journal import JOURNAL_NAME, Journal
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.container import attachments
+from brushloop.sessions.recording.mcap_file import count_messages
+from brushloop.sessions.store import SessionStore
 
 CRC = re.compile(rb',"crc":"[0-9a-f]{8}"\}$')
 
@@ -67,7 +67,7 @@ def test_a_second_store_on_the_folder_is_locked_out(make, store):
 
 def test_a_second_process_is_locked_out_and_writes_nothing(make, store):
     before = make.tree(store.folder)
-    code = "import sys, time; from pathlib import Path; from sessions.store import SessionStore\n"
+    code = "import sys, time; from pathlib import Path; from brushloop.sessions.store import SessionStore\n"
     code += "SessionStore(Path(sys.argv[1]), None, time.time_ns)"
     ran = subprocess.run([sys.executable, "-c", code, store.folder], capture_output=True, text=True, check=False)
     assert "SessionLocked" in ran.stderr

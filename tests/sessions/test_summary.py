@@ -3,10 +3,10 @@
 import pytest
 from typer.testing import CliRunner
 
-from sessions.cli import app
-from sessions.errors import InputError
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.show import Summary, summaries
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.show import Summary, summaries
 
 
 @pytest.fixture

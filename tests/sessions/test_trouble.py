@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sessions import disk
-from sessions.errors import DiskFull, SessionError
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.repair.verify import verify_session
-from sessions.store import STEP_BYTES, SessionStore
+from brushloop.sessions import disk
+from brushloop.sessions.errors import DiskFull, SessionError
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.store import STEP_BYTES, SessionStore
 from tests.waiting import PATIENCE_S
 
 Usage = namedtuple("Usage", "total used free")
@@ -153,7 +153,7 @@ def test_a_clock_that_is_set_back_is_noted_and_reorders_nothing(make, tmp_path):
 HOLD = """
 import sys, time
 from pathlib import Path
-from sessions.store import SessionStore
+from brushloop.sessions.store import SessionStore
 store = SessionStore(Path(sys.argv[1]), None, time.time_ns)
 print("held", flush=True)
 sys.stdin.readline()
@@ -163,8 +163,8 @@ store.release()
 TOUCH = """
 import sys, time
 from pathlib import Path
-from sessions.repair.repair import repair_session
-from sessions.store import SessionStore
+from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.store import SessionStore
 folder = Path(sys.argv[1])
 for take in (lambda: SessionStore(folder, None, time.time_ns), lambda: repair_session(folder, time.time_ns)):
     try:

@@ -5,11 +5,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from typer.testing import CliRunner
 
-from sessions.cli import app
-from sessions.errors import InputError
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.recording.mcap_file import HEADER_METADATA as HEADER
-from sessions.repair.verify import verify_session
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.recording.mcap_file import HEADER_METADATA as HEADER
+from brushloop.sessions.repair.verify import verify_session
 from tests.command import brushloop
 
 

@@ -6,9 +6,9 @@ import csv
 
 import pytest
 
-from sessions.export.export import export
-from sessions.history import unlike, waits_of
-from sessions.recording.schemas import Stroke
+from brushloop.sessions.export.export import export
+from brushloop.sessions.history import unlike, waits_of
+from brushloop.sessions.recording.schemas import Stroke
 
 
 def step(kind: str, stroke_id: str, **result: object) -> dict[str, object]:

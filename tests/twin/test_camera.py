@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from twin.camera import noise_of
+from brushloop.twin.camera import noise_of
 
 
 def still(sd: float, seed: int) -> np.ndarray:

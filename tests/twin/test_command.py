@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-import brushloop
-from calibrate.errors import CalibrationError
-from drivers.sim.brush_file import load_brush
+import brushloop.__main__
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.drivers.sim.brush_file import load_brush
+from brushloop.twin.file import notes_path
+from brushloop.twin.score import PARTS
+from brushloop.twin.shape import Found, Round
 from tests.photographed import imported_presses
 from tests.twin.serial import Serial
-from twin.file import notes_path
-from twin.score import PARTS
-from twin.shape import Found, Round
 
 CELLS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
 
@@ -37,13 +37,13 @@ def _in_this_process() -> Generator[Executor]:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     first, last = Round(1.0, 1), Round(0.5, 1)
     for name, value in {"COARSE": (first,), "FINE": last, "workers": _in_this_process}.items():
-        monkeypatch.setattr(f"twin.run.{name}", value)
-    monkeypatch.setattr("twin.shape.INDIVIDUALS", range(2))
-    monkeypatch.setattr("twin.score.VOTES", 1)
+        monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
+    monkeypatch.setattr("brushloop.twin.shape.INDIVIDUALS", range(2))
+    monkeypatch.setattr("brushloop.twin.score.VOTES", 1)
 
 
 def made(session: Path, out: Path) -> str:
-    ran = CliRunner().invoke(brushloop.app, ["twin", str(session), "--out", str(out)], catch_exceptions=False)
+    ran = CliRunner().invoke(brushloop.__main__.app, ["twin", str(session), "--out", str(out)], catch_exceptions=False)
     assert ran.exit_code == 0, ran.output
     return " ".join(ran.output.split())
 
@@ -58,9 +58,9 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
         searched.append(one.blur_mm)
         return found  # how a search finds its way is tested beside it
 
-    monkeypatch.setattr("twin.run.search", counted)
+    monkeypatch.setattr("brushloop.twin.run.search", counted)
     with monkeypatch.context() as broken:
-        broken.setattr("twin.run.covariance", _power_cut)
+        broken.setattr("brushloop.twin.run.covariance", _power_cut)
         with pytest.raises(PowerCut):
             made(session, out)
     assert notes_path(out).exists()

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.sim.brush.spec import ALLOWED, BrushSpec
-from twin.constants import SHAPE, SPREAD, Constant, Offset, brush_at, offset_at, search_bounds, with_values
+from brushloop.drivers.sim.brush.spec import ALLOWED, BrushSpec
+from brushloop.twin.constants import SHAPE, SPREAD, Constant, Offset, brush_at, offset_at, search_bounds, with_values
 
 
 @given(st.sampled_from([*SHAPE, *SPREAD]), st.floats(-8.0, 8.0))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.brush import Brush, BrushSpec
-from twin.constants import Offset
-from twin.drawing import draw, mechanics, still
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.twin.constants import Offset
+from brushloop.twin.drawing import draw, mechanics, still
 
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
 HERE = Offset(0.0, 0.0, 0.0)

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.errors import CalibrationError
-from calibrate.fit.heldout import HeldOut
-from drivers.sim.brush.spec import BrushSpec
-from drivers.sim.brush_file import load_brush
-from drivers.sim.config import SoundHead
-from twin.constants import SHAPE
-from twin.file import Notes, notes_path, resumed, save_notes, twin_toml
-from twin.run import Estimate, Twin
-from twin.shape import Found
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.heldout import HeldOut
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.drivers.sim.brush_file import load_brush
+from brushloop.drivers.sim.config import SoundHead
+from brushloop.twin.constants import SHAPE
+from brushloop.twin.file import Notes, notes_path, resumed, save_notes, twin_toml
+from brushloop.twin.run import Estimate, Twin
+from brushloop.twin.shape import Found
 
 SPEC = BrushSpec(radius_mm=5.0, length_mm=42.0, friction=0.3, set_deg=9.0, seed=7)
 TWIN = Twin(

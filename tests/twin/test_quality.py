@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bench.brushfit_presses import grid
-from collect.rig.config_quality import QualityConfig
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush_file import PAPER, load_brush
-from twin.quality import LEAST_MISPLACED_MM, sound_head
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.twin.quality import LEAST_MISPLACED_MM, sound_head
 
 CELLS = [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
 

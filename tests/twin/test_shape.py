@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.spec import BrushSpec
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.twin.constants import SHAPE, Offset
+from brushloop.twin.drawing import draw
+from brushloop.twin.shape import Round, Target, choose_individual, derivatives, of_parts, off, search, start
 from tests.twin.serial import Serial
-from twin.constants import SHAPE, Offset
-from twin.drawing import draw
-from twin.shape import Round, Target, choose_individual, derivatives, of_parts, off, search, start
 
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
 CELLS = ((3.0, 0.0), (4.0, 5.0))
@@ -43,7 +43,7 @@ def test_a_search_comes_nearer_to_the_captures(target: Target) -> None:
 
 
 def test_the_individual_nearest_to_the_captures_is_chosen(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.shape.INDIVIDUALS", range(4))
+    monkeypatch.setattr("brushloop.twin.shape.INDIVIDUALS", range(4))
     ink = draw(replace(BASE, seed=2), Offset(0.0, 0.0, 0.0), CELLS, GRID)
     assert choose_individual(replace(target, mean=ink[:, 0]), start(), Serial()).seed == 2
 

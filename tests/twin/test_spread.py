@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.fit.captures import Grid
-from drivers.sim.brush.spec import BrushSpec
-from twin.constants import SPREAD, Offset, with_values
-from twin.drawing import draw
-from twin.spread import Repeats, agreement, fit_spread, statistics
+from brushloop.calibrate.fit.captures import Grid
+from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.twin.constants import SPREAD, Offset, with_values
+from brushloop.twin.drawing import draw
+from brushloop.twin.spread import Repeats, agreement, fit_spread, statistics
 
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
 CELLS = ((3.0, 0.0), (4.0, 5.0))

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.twin.run import TwinStopped, workers
 from tests.waiting import PATIENCE_S, wait_until
-from twin.run import TwinStopped, workers
 
 WORKING = """
 import os, time
-from twin.run import workers
+from brushloop.twin.run import workers
 
 if __name__ == "__main__":
     with workers(1) as pool:
@@ -26,7 +26,7 @@ if __name__ == "__main__":
 
 DRAWING = """
 import time
-from twin.run import workers
+from brushloop.twin.run import workers
 
 if __name__ == "__main__":
     with workers(1) as pool:
@@ -70,7 +70,7 @@ def test_a_command_that_is_terminated_leaves_nothing_behind(tmp_path: Path) -> N
         assert command.stdout.readline() == "0\n"
         command.send_signal(signal.SIGTERM)
         _, said = command.communicate(timeout=PATIENCE_S)
-    assert said.splitlines()[-1] == "twin.run.TwinStopped: SIGTERM: the same command continues"
+    assert said.splitlines()[-1] == "brushloop.twin.run.TwinStopped: SIGTERM: the same command continues"
     assert "leaked" not in said
 
 

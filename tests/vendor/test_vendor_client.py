@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from drivers.sim.config import SimConfig
-from drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import LoopbackRig
 from tests.waiting import PATIENCE_S
 
 pytestmark = [

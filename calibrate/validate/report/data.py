@@ -7,12 +7,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import ClassVar
 
-from calibrate.artefact import Frozen
-from calibrate.compare.field import Alignment, Tone
-from calibrate.loop.scores import LoopRecord
-from calibrate.report import Sealed, load_sealed, source_label
-from calibrate.writing.scores import WrittenRecord
-from sessions.recording.schemas import Source
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.loop.scores import LoopRecord
+from brushloop.calibrate.report import Sealed, load_sealed, source_label
+from brushloop.calibrate.writing.scores import WrittenRecord
+from brushloop.sessions.recording.schemas import Source
 
 FORMAT = "brushloop-validation-1"
 MAX_BYTES = 256 * 1024 * 1024

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.compare.images import Pixels, unpack
-from calibrate.errors import CalibrationError
-from calibrate.files import read_bounded
-from calibrate.report import BLUE, ORANGE, ink_uri, overlay_uri, plot, plot_uri
-from calibrate.validate.report.data import Report
-from calibrate.validate.run import Outcome
-from model.brush import DomainError
+from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.compare.images import Pixels, unpack
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_bounded
+from brushloop.calibrate.report import BLUE, ORANGE, ink_uri, overlay_uri, plot, plot_uri
+from brushloop.calibrate.validate.report.data import Report
+from brushloop.calibrate.validate.run import Outcome
+from brushloop.model.brush import DomainError
 
 ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""

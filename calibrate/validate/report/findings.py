@@ -5,17 +5,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-from calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.paper import ORDER
-from calibrate.compare.similarity import Polarity
-from calibrate.loop.scores import AGAIN, ANOTHER, LoopRecord
-from calibrate.report import Point, source_point
-from calibrate.validate import candidates as who
-from calibrate.validate.report.data import Report, Session, Stat
-from calibrate.validate.run import ANOTHER as ANOTHER_PRESS
-from calibrate.writing.scores import REFERENCE
-from sessions.recording.schemas import Source
+from brushloop.calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.paper import ORDER
+from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, LoopRecord
+from brushloop.calibrate.report import Point, source_point
+from brushloop.calibrate.validate import candidates as who
+from brushloop.calibrate.validate.report.data import Report, Session, Stat
+from brushloop.calibrate.validate.run import ANOTHER as ANOTHER_PRESS
+from brushloop.calibrate.writing.scores import REFERENCE
+from brushloop.sessions.recording.schemas import Source
 
 CLOSE = 0.5
 """Points below which two models count as equal."""

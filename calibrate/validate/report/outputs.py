@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from rich.table import Column, Table
 
-from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.errors import CalibrationError
-from calibrate.files import replacing
-from calibrate.loop.scores import AGAIN
-from calibrate.report import csv_text, source_label, source_note
-from calibrate.validate.report import findings, tables
-from calibrate.validate.report.data import Report, Stat
-from calibrate.validate.run import REPEATED, Outcome
-from sessions.cells import CsvWriter
-from sessions.terminal import narrow
+from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import replacing
+from brushloop.calibrate.loop.scores import AGAIN
+from brushloop.calibrate.report import csv_text, source_label, source_note
+from brushloop.calibrate.validate.report import findings, tables
+from brushloop.calibrate.validate.report.data import Report, Stat
+from brushloop.calibrate.validate.run import REPEATED, Outcome
+from brushloop.sessions.cells import CsvWriter
+from brushloop.sessions.terminal import narrow
 
 COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 500

@@ -8,19 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calibrate.artefact import FOLDER
-from calibrate.compare.ceiling import CEILING
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.paper import TABLE_3
-from calibrate.fit.artefact import FOLDER as FITS
-from calibrate.report import render, source_note
-from calibrate.validate import candidates as who
-from calibrate.validate.report import figures, findings, tables
-from calibrate.validate.report.data import Extreme, Report, Session
-from calibrate.validate.report.figures import Curve
-from calibrate.validate.report.summary import Extremes
-from calibrate.validate.run import Outcome
-from calibrate.validate.sources import LoadedSession
+from brushloop.calibrate.artefact import FOLDER
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.paper import TABLE_3
+from brushloop.calibrate.fit.artefact import FOLDER as FITS
+from brushloop.calibrate.report import render, source_note
+from brushloop.calibrate.validate import candidates as who
+from brushloop.calibrate.validate.report import figures, findings, tables
+from brushloop.calibrate.validate.report.data import Extreme, Report, Session
+from brushloop.calibrate.validate.report.figures import Curve
+from brushloop.calibrate.validate.report.summary import Extremes
+from brushloop.calibrate.validate.run import Outcome
+from brushloop.calibrate.validate.sources import LoadedSession
 
 CELL_COLUMNS = ("ccd-bsmg", who.GENERATOR_HELD_OUT, "ccd-bsm", who.FITTED_HELD_OUT, who.BEZIER_REFITTED, CEILING)
 MAX_REFUSED = 200

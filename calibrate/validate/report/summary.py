@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.compare.ceiling import CEILING, average, ceiling_values
-from calibrate.compare.field import KEYS, Alignment, Key, Tone
-from calibrate.compare.images import brush_of
-from calibrate.compare.similarity import SSIM_SETTINGS
-from calibrate.compare.stats import Summary, summarise
-from calibrate.validate import candidates as who
-from calibrate.validate.extras import Extras
-from calibrate.validate.report.data import (
+from brushloop.calibrate.compare.ceiling import CEILING, average, ceiling_values
+from brushloop.calibrate.compare.field import KEYS, Alignment, Key, Tone
+from brushloop.calibrate.compare.images import brush_of
+from brushloop.calibrate.compare.similarity import SSIM_SETTINGS
+from brushloop.calibrate.compare.stats import Summary, summarise
+from brushloop.calibrate.validate import candidates as who
+from brushloop.calibrate.validate.extras import Extras
+from brushloop.calibrate.validate.report.data import (
     CandidateInfo,
     Collected,
     Extreme,
@@ -27,12 +27,12 @@ from calibrate.validate.report.data import (
     Step,
     software,
 )
-from calibrate.validate.rows import Cell, Rows
-from calibrate.validate.run import ANOTHER, REPEATED, Outcome
-from calibrate.validate.sources import LoadedSession, one_source
-from model.brush import DomainError
-from sessions.history import history_of
-from sessions.show import details
+from brushloop.calibrate.validate.rows import Cell, Rows
+from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Outcome
+from brushloop.calibrate.validate.sources import LoadedSession, one_source
+from brushloop.model.brush import DomainError
+from brushloop.sessions.history import history_of
+from brushloop.sessions.show import details
 
 MEASURES = ("csim", "ssim")
 MAX_CELLS = 60
@@ -257,7 +257,7 @@ def _collected(one: LoadedSession) -> Collected | None:
 
 def _ratios(one: LoadedSession, rows: Rows, mine: NDArray[np.int64]) -> tuple[float | None, float | None]:
     """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
-    from model.ccdbsm import ccdbsm
+    from brushloop.model.ccdbsm import ccdbsm
 
     brush = brush_of(one.header)
     drawn: dict[Cell, tuple[float, float]] = {}

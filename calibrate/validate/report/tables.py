@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calibrate.compare.ceiling import CEILING
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.paper import TABLE_1, TABLE_2, Printed
-from calibrate.compare.similarity import Polarity
-from calibrate.loop.scores import AGAIN, LoopRecord
-from calibrate.validate import candidates as who
-from calibrate.validate.report.data import CandidateInfo, Report, Stat
-from calibrate.validate.run import ANOTHER as ANOTHER_PRESS
-from calibrate.validate.run import REPEATED
-from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.paper import TABLE_1, TABLE_2, Printed
+from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.loop.scores import AGAIN, LoopRecord
+from brushloop.calibrate.validate import candidates as who
+from brushloop.calibrate.validate.report.data import CandidateInfo, Report, Stat
+from brushloop.calibrate.validate.run import ANOTHER as ANOTHER_PRESS
+from brushloop.calibrate.validate.run import REPEATED
+from brushloop.calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",

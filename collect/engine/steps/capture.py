@@ -7,22 +7,22 @@ import contextlib
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.pix2len import Plane
-from calibrate.board.view import see_board
-from calibrate.errors import CalibrationError
-from calibrate.stroke.params import Gray
-from collect.engine.last_capture import LastCapture, pictures_of, published_mark
-from collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
-from collect.engine.steps.retake import decide
-from collect.errors import BadPicture, NeedsOperator, StepError
-from collect.protocols.steps import MARKING, Result, StepKind
-from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
-from collect.quality.verdict import Check, Family, Verdict
-from collect.rig.optics import undistorted
-from collect.rig.paper import Cell
-from drivers.samples import Frame
-from sessions.history import limit_s, unlike, waits_of
-from sessions.recording import schemas
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke.params import Gray
+from brushloop.collect.engine.last_capture import LastCapture, pictures_of, published_mark
+from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
+from brushloop.collect.engine.steps.retake import decide
+from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
+from brushloop.collect.protocols.steps import MARKING, Result, StepKind
+from brushloop.collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
+from brushloop.collect.quality.verdict import Check, Family, Verdict
+from brushloop.collect.rig.optics import undistorted
+from brushloop.collect.rig.paper import Cell
+from brushloop.drivers.samples import Frame
+from brushloop.sessions.history import limit_s, unlike, waits_of
+from brushloop.sessions.recording import schemas
 
 MOVED_MM = 1.0
 """Distance by which the sheet may seem to have moved in the picture since the first mark of the session."""

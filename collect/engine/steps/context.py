@@ -7,25 +7,25 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from calibrate.board.pix2len import Plane
-from calibrate.board.view import see_board
-from calibrate.errors import CalibrationError
-from collect.engine.force_guard import ForceGuard
-from collect.engine.progress import Progress
-from collect.engine.recorder import Recorder
-from collect.errors import BadPicture
-from collect.motion.procedures import Procedures
-from collect.operator import Asker, OperatorRequests
-from collect.protocols.config import ProtocolConfig
-from collect.protocols.steps import Step
-from collect.rig.devices import Rig
-from collect.rig.paper import Cell, Sheet
-from collect.touch.places import used_cells as touched_cells
-from drivers.cancellation import finished
-from sessions.store import Attempt, SessionStore
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.engine.force_guard import ForceGuard
+from brushloop.collect.engine.progress import Progress
+from brushloop.collect.engine.recorder import Recorder
+from brushloop.collect.errors import BadPicture
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.operator import Asker, OperatorRequests
+from brushloop.collect.protocols.config import ProtocolConfig
+from brushloop.collect.protocols.steps import Step
+from brushloop.collect.rig.devices import Rig
+from brushloop.collect.rig.paper import Cell, Sheet
+from brushloop.collect.touch.places import used_cells as touched_cells
+from brushloop.drivers.cancellation import finished
+from brushloop.sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
-    from calibrate.stroke.params import Gray
+    from brushloop.calibrate.stroke.params import Gray
 
 _R = TypeVar("_R")
 

@@ -9,14 +9,14 @@ import asyncio
 from collections.abc import Generator
 from contextlib import contextmanager
 
-from collect.engine.steps.capture import look_at_sheet
-from collect.engine.steps.context import RunContext, StepContext
-from collect.errors import NeedsOperator
-from collect.motion.moves import Move
-from collect.motion.procedures import TOUCH_TOLERANCE_MM
-from collect.protocols.steps import Result
-from collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
-from drivers.samples import PoseSample
+from brushloop.collect.engine.steps.capture import look_at_sheet
+from brushloop.collect.engine.steps.context import RunContext, StepContext
+from brushloop.collect.errors import NeedsOperator
+from brushloop.collect.motion.moves import Move
+from brushloop.collect.motion.procedures import TOUCH_TOLERANCE_MM
+from brushloop.collect.protocols.steps import Result
+from brushloop.collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
+from brushloop.drivers.samples import PoseSample
 
 LEVEL_RISES = 0.005
 """A dose that raises the level of the well by less than this has not arrived."""

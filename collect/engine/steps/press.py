@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import asyncio
 
-from collect.engine.steps.capture import look_at_sheet
-from collect.engine.steps.context import StepContext
-from collect.engine.steps.dip import DipToTouch, fill_brush, must_dip
-from collect.motion.moves import press_moves, stroke_moves
-from collect.motion.procedures import check_drawn, draw_stroke
-from collect.protocols.plan import Drawn
-from collect.protocols.steps import Result
-from collect.rig.devices import limits_of
-from collect.rig.paper import Cell
-from sessions.history import WAIT
+from brushloop.collect.engine.steps.capture import look_at_sheet
+from brushloop.collect.engine.steps.context import StepContext
+from brushloop.collect.engine.steps.dip import DipToTouch, fill_brush, must_dip
+from brushloop.collect.motion.moves import press_moves, stroke_moves
+from brushloop.collect.motion.procedures import check_drawn, draw_stroke
+from brushloop.collect.protocols.plan import Drawn
+from brushloop.collect.protocols.steps import Result
+from brushloop.collect.rig.devices import limits_of
+from brushloop.collect.rig.paper import Cell
+from brushloop.sessions.history import WAIT
 
 
 async def press(context: StepContext) -> Result:

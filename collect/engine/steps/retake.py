@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.stroke.params import Gray
-from collect.engine.steps.context import RunContext, StepContext
-from collect.operator import Choice, OperatorRequest, Prompt
-from collect.protocols.steps import Result, StepKind
-from collect.quality.verdict import Verdict
-from collect.rig.paper import Cell
-from sessions.remarks import remarks_of
+from brushloop.calibrate.stroke.params import Gray
+from brushloop.collect.engine.steps.context import RunContext, StepContext
+from brushloop.collect.operator import Choice, OperatorRequest, Prompt
+from brushloop.collect.protocols.steps import Result, StepKind
+from brushloop.collect.quality.verdict import Verdict
+from brushloop.collect.rig.paper import Cell
+from brushloop.sessions.remarks import remarks_of
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40

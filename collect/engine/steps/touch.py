@@ -6,22 +6,22 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-from collect.engine.steps.context import RunContext, StepContext
-from collect.engine.steps.dip import fill_brush, set_light
-from collect.errors import ConfigError, StepError
-from collect.motion.moves import visit_moves
-from collect.operator import Choice, Prompt
-from collect.planning.limit_check import check_poses, check_step
-from collect.planning.walk import touch_of
-from collect.protocols.steps import Result
-from collect.rig.config_touch import TouchConfig
-from collect.rig.paper import PaperPlane
-from collect.touch.arm import ForceTap
-from collect.touch.heights import PlaneResult, kept
-from collect.touch.measure import asked, measure_plane
-from collect.touch.selfcheck import self_check, triangle_on
-from drivers.samples import Frame
-from sessions.recording.messages import Transform
+from brushloop.collect.engine.steps.context import RunContext, StepContext
+from brushloop.collect.engine.steps.dip import fill_brush, set_light
+from brushloop.collect.errors import ConfigError, StepError
+from brushloop.collect.motion.moves import visit_moves
+from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.planning.limit_check import check_poses, check_step
+from brushloop.collect.planning.walk import touch_of
+from brushloop.collect.protocols.steps import Result
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.touch.arm import ForceTap
+from brushloop.collect.touch.heights import PlaneResult, kept
+from brushloop.collect.touch.measure import asked, measure_plane
+from brushloop.collect.touch.selfcheck import self_check, triangle_on
+from brushloop.drivers.samples import Frame
+from brushloop.sessions.recording.messages import Transform
 
 
 async def zero_touch(context: StepContext) -> Result:

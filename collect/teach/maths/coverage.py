@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from calibrate.board.detect import BoardView
-from calibrate.board.intrinsics import GRID, distinct_views, guidance, held, nominal_normals
-from collect.teach.guide import Picture
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.intrinsics import GRID, distinct_views, guidance, held, nominal_normals
+from brushloop.collect.teach.guide import Picture
 
 WIDTH_PX = 320
 SEEN, UNSEEN, CORNER = 90, 40, 255

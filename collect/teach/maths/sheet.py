@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calibrate.board.register import mixed_up
-from calibrate.board.spec import BoardSpec, size_mm
-from collect.errors import CannotTeach
-from collect.rig.paper import PlaneFit, fit_plane
+from brushloop.calibrate.board.register import mixed_up
+from brushloop.calibrate.board.spec import BoardSpec, size_mm
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.rig.paper import PlaneFit, fit_plane
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board.detect import BoardView
-from calibrate.board.pix2len import apply, homography
-from calibrate.board.spec import BoardSpec, size_mm
-from calibrate.board.view import paper_mm
-from collect.errors import CannotTeach
-from collect.rig.optics import Gray
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.pix2len import apply, homography
+from brushloop.calibrate.board.spec import BoardSpec, size_mm
+from brushloop.calibrate.board.view import paper_mm
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.rig.optics import Gray
 
 Floats = NDArray[np.float64]
 STEP_MM = 0.25

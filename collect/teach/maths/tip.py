@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibrate.line import student_95
-from collect.errors import CannotTeach
-from drivers.samples import Pose
+from brushloop.calibrate.line import student_95
+from brushloop.collect.errors import CannotTeach
+from brushloop.drivers.samples import Pose
 
 Floats = NDArray[np.float64]
 LEAST_TOUCHES = 4

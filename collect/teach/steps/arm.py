@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from collect.errors import CannotTeach
-from collect.teach.arm_reader import Address, Cabinet, answers, find_framing, reading
-from collect.teach.day import Day, Step
-from collect.teach.store import Notebook, StepName
-from drivers.arcs.codes import MOVING_ALLOWED
-from drivers.arcs.robot import AUBOPE_PORT
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.arm_reader import Address, Cabinet, answers, find_framing, reading
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.store import Notebook, StepName
+from brushloop.drivers.arcs.codes import MOVING_ALLOWED
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
 
 RTDE_PORT = 30010
 LONGEST_TOOL_MM = 600.0

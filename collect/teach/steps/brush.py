@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collect.errors import CannotTeach
-from collect.operator import Choice
-from collect.rig.config_devices import InkDeviceConfig, InkStationConfig, ModbusPumpConfig
-from collect.rig.devices import make_ink
-from collect.rig.plausible import brush_shorter_than_tool, deepest_press
-from collect.teach.day import Day, Step
-from collect.teach.store import Notebook, StepName
-from drivers.clock import Clock
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.operator import Choice
+from brushloop.collect.rig.config_devices import InkDeviceConfig, InkStationConfig, ModbusPumpConfig
+from brushloop.collect.rig.devices import make_ink
+from brushloop.collect.rig.plausible import brush_shorter_than_tool, deepest_press
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.store import Notebook, StepName
+from brushloop.drivers.clock import Clock
 
 DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""

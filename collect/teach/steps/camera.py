@@ -11,15 +11,15 @@ from pathlib import Path
 
 import cv2
 
-from calibrate.board.artefact import lens_file
-from calibrate.board.detect import BoardView, find_board
-from calibrate.board.intrinsics import GOOD_VIEWS, RMS_LIMIT_PX, Fitted, fit_lens
-from calibrate.board.spec import BoardSpec, describe
-from calibrate.errors import CalibrationError
-from calibrate.files import read_gray
-from collect.errors import CannotTeach
-from collect.operator import Choice
-from collect.teach.cameras import (
+from brushloop.calibrate.board.artefact import lens_file
+from brushloop.calibrate.board.detect import BoardView, find_board
+from brushloop.calibrate.board.intrinsics import GOOD_VIEWS, RMS_LIMIT_PX, Fitted, fit_lens
+from brushloop.calibrate.board.spec import BoardSpec, describe
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_gray
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.cameras import (
     Gray,
     devices,
     frame_rate_hz,
@@ -29,12 +29,12 @@ from collect.teach.cameras import (
     still,
     taught_camera,
 )
-from collect.teach.day import Day, Step
-from collect.teach.guide import Brought, Target
-from collect.teach.maths.coverage import coverage_picture, still_missing
-from collect.teach.steps.sheet import board_of
-from collect.teach.store import Notebook, StepName
-from drivers.errors import DeviceError
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import Brought, Target
+from brushloop.collect.teach.maths.coverage import coverage_picture, still_missing
+from brushloop.collect.teach.steps.sheet import board_of
+from brushloop.collect.teach.store import Notebook, StepName
+from brushloop.drivers.errors import DeviceError
 
 Take = Callable[[], Awaitable[Gray]]
 VIEW = "aside.lens_view_"

@@ -9,15 +9,15 @@ import statistics
 import numpy as np
 from numpy.typing import NDArray
 
-from collect.errors import CannotTeach
-from collect.rig.config_devices import ForceConfig
-from collect.rig.devices import make_force
-from collect.teach.day import Day, Step
-from collect.teach.guide import Target
-from collect.teach.maths.sheet import corners_of
-from collect.teach.store import Notebook, StepName, Taught, now_utc
-from drivers.force.rounds import LOOPBACK_CHANNEL
-from drivers.samples import ForceSample
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.rig.config_devices import ForceConfig
+from brushloop.collect.rig.devices import make_force
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import Target
+from brushloop.collect.teach.maths.sheet import corners_of
+from brushloop.collect.teach.store import Notebook, StepName, Taught, now_utc
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.samples import ForceSample
 
 CHANNEL = "can0"
 """Channel of a gateway, unless one was typed."""

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import asyncio
 
-from calibrate.files import read_gray
-from collect.errors import CannotTeach, ConfigError
-from collect.planning.limit_check import ask_reach
-from collect.rig.config import RigConfig
-from collect.rig.picture import draw_rig
-from collect.teach.day import Day, Step
-from collect.teach.maths.box import Point, hull
-from collect.teach.rig_text import rig_of
-from collect.teach.steps.places import sheet_corners, sheet_heights, tips
-from collect.teach.store import Notebook, StepName, Taught, Value, now_utc
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
+from brushloop.calibrate.files import read_gray
+from brushloop.collect.errors import CannotTeach, ConfigError
+from brushloop.collect.planning.limit_check import ask_reach
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.picture import draw_rig
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.maths.box import Point, hull
+from brushloop.collect.teach.rig_text import rig_of
+from brushloop.collect.teach.steps.places import sheet_corners, sheet_heights, tips
+from brushloop.collect.teach.store import Notebook, StepName, Taught, Value, now_utc
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose
 
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""

@@ -8,18 +8,18 @@ import math
 import cv2
 import numpy as np
 
-from collect.errors import CannotTeach
-from collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
-from collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
-from collect.rig.paper import to_base, to_paper
-from collect.teach.arm_reader import ArmReader
-from collect.teach.cameras import side_by_side, still, taught_camera
-from collect.teach.day import Day, Step
-from collect.teach.guide import Target, TargetKind
-from collect.teach.jog import touch
-from collect.teach.maths.sheet import Point, corners_of
-from collect.teach.maths.tip import tip_of
-from collect.teach.store import Notebook, StepName, Taught, Value, now_utc
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
+from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
+from brushloop.collect.rig.paper import to_base, to_paper
+from brushloop.collect.teach.arm_reader import ArmReader
+from brushloop.collect.teach.cameras import side_by_side, still, taught_camera
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import Target, TargetKind
+from brushloop.collect.teach.jog import touch
+from brushloop.collect.teach.maths.sheet import Point, corners_of
+from brushloop.collect.teach.maths.tip import tip_of
+from brushloop.collect.teach.store import Notebook, StepName, Taught, Value, now_utc
 
 TRAVEL_MM = 60.0
 """Travel height above the highest corner of the sheet: room for a dry run 30 mm above it."""

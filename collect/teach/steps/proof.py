@@ -10,19 +10,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from collect.engine.dry_run import DryRunEngine
-from collect.engine.engine import Engine
-from collect.engine.open_or_resume import Opening, open_store
-from collect.errors import CannotTeach
-from collect.planning.limit_check import check_protocol
-from collect.rig.config import RigConfig
-from collect.rig.doctor import examine
-from collect.rig.paper import PaperPlane
-from collect.teach.day import Day, Step
-from collect.teach.rig_text import rig_of, rig_text
-from collect.teach.store import Notebook, StepName
-from drivers.cancellation import finished
-from sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.collect.engine.dry_run import DryRunEngine
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import Opening, open_store
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.planning.limit_check import check_protocol
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.doctor import examine
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.rig_text import rig_of, rig_text
+from brushloop.collect.teach.store import Notebook, StepName
+from brushloop.drivers.cancellation import finished
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
 
 ABOVE_MM = 30.0
 SLOW_MM_S = 45.0

@@ -8,20 +8,28 @@ from collections import defaultdict
 
 import numpy as np
 
-from calibrate.board.artefact import read_lens
-from calibrate.board.detect import find_board
-from calibrate.board.spec import BoardSpec
-from calibrate.errors import CalibrationError
-from collect.errors import CannotTeach
-from collect.teach.arm_reader import ArmReader
-from collect.teach.cameras import still, taught_camera
-from collect.teach.day import Day, Step
-from collect.teach.guide import Target, TargetKind
-from collect.teach.jog import touch
-from collect.teach.maths.sheet import CORNERS, Point, SheetFit, check_board, corners_of, expected_mm, fit_sheet
-from collect.teach.maths.sheet_seen import OFF_MM, check_seen, seen_margins, touched_margins
-from collect.teach.maths.tip import tip_of
-from collect.teach.store import Notebook, StepName, Taught, now_utc
+from brushloop.calibrate.board.artefact import read_lens
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.arm_reader import ArmReader
+from brushloop.collect.teach.cameras import still, taught_camera
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import Target, TargetKind
+from brushloop.collect.teach.jog import touch
+from brushloop.collect.teach.maths.sheet import (
+    CORNERS,
+    Point,
+    SheetFit,
+    check_board,
+    corners_of,
+    expected_mm,
+    fit_sheet,
+)
+from brushloop.collect.teach.maths.sheet_seen import OFF_MM, check_seen, seen_margins, touched_margins
+from brushloop.collect.teach.maths.tip import tip_of
+from brushloop.collect.teach.store import Notebook, StepName, Taught, now_utc
 
 BOARD: TargetKind = "board-corner"
 SHEET: TargetKind = "sheet-corner"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collect.errors import CannotTeach
-from collect.rig.plausible import brush_square
-from collect.teach.arm_reader import ArmReader
-from collect.teach.day import Day, Step
-from collect.teach.guide import Target
-from collect.teach.jog import touch
-from collect.teach.maths.tip import LEAST_TOUCHES, AxisFit, elsewhere, find_axis, find_tip
-from collect.teach.store import Notebook, StepName, Taught, now_utc
-from drivers.geometry import distance
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.rig.plausible import brush_square
+from brushloop.collect.teach.arm_reader import ArmReader
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import Target
+from brushloop.collect.teach.jog import touch
+from brushloop.collect.teach.maths.tip import LEAST_TOUCHES, AxisFit, elsewhere, find_axis, find_tip
+from brushloop.collect.teach.store import Notebook, StepName, Taught, now_utc
+from brushloop.drivers.geometry import distance
 
 MOST_TOUCHES = 24
 GOOD_MM = 0.18

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
-from drivers.geometry import from_wire, to_wire
-from drivers.samples import Pose
-from drivers.sim.arcs.power import EMERGENCY_STOPS, Power
-from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
-from drivers.sim.world import World
+from brushloop.drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+from brushloop.drivers.geometry import from_wire, to_wire
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arcs.power import EMERGENCY_STOPS, Power
+from brushloop.drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.world import World
 
 ROBOT = "rob1"
 IK_NO_CONVERGE = -23

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import LOOPBACK_CONTROL_BOX, ReturnCode, RobotMode
-from drivers.geometry import to_wire
-from drivers.sim.arcs.cabinet import ROBOT, SOFT_STOP_M_S2, Cabinet
-from drivers.sim.arcs.moves import Moves
+from brushloop.drivers.arcs.codes import LOOPBACK_CONTROL_BOX, ReturnCode, RobotMode
+from brushloop.drivers.geometry import to_wire
+from brushloop.drivers.sim.arcs.cabinet import ROBOT, SOFT_STOP_M_S2, Cabinet
+from brushloop.drivers.sim.arcs.moves import Moves
 
 INTERFACE_VERSION = 24000
 CONTROL_SOFTWARE_VERSION = 31001

@@ -11,11 +11,11 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
-from drivers.geometry import from_wire
-from drivers.samples import Pose
-from drivers.sim.arcs.cabinet import SOFT_STOP_M_S2, Cabinet
-from drivers.sim.arm.kinematics import LIMITS_DEG, Joints, inverse, inverted, matrix_of
+from brushloop.drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+from brushloop.drivers.geometry import from_wire
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arcs.cabinet import SOFT_STOP_M_S2, Cabinet
+from brushloop.drivers.sim.arm.kinematics import LIMITS_DEG, Joints, inverse, inverted, matrix_of
 
 JOINT_SPEEDS_RAD_S = (2.5964, 2.5964, 2.5964, 3.1105, 3.1105, 3.1105)
 JOINT_ACCS_RAD_S2 = (31.1, 31.1, 31.1, 20.7, 20.7, 20.7)

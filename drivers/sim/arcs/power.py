@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+from brushloop.drivers.arcs.codes import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
 
 BOOT_S = 0.7
 POWER_ON_S = 1.0

@@ -8,16 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.arcs.framing import FrameDecoder, encode_short
-from drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
-from drivers.errors import ProtocolViolation
-from drivers.geometry import to_wire
-from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arm.motion import Rest
-from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import KINDS, Device
-from drivers.sim.faults.phases import Truth
-from drivers.sim.server import LoopbackServer
+from brushloop.drivers.arcs.framing import FrameDecoder, encode_short
+from brushloop.drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.geometry import to_wire
+from brushloop.drivers.sim.arcs.cabinet import Cabinet
+from brushloop.drivers.sim.arm.motion import Rest
+from brushloop.drivers.sim.faults.board import FaultBoard
+from brushloop.drivers.sim.faults.kinds import KINDS, Device
+from brushloop.drivers.sim.faults.phases import Truth
+from brushloop.drivers.sim.server import LoopbackServer
 
 MAX_HZ = 500.0
 BACKLOG_BYTES = 32 * 1024

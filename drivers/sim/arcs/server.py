@@ -12,17 +12,17 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from drivers.arcs.codes import SafetyMode
-from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
-from drivers.arcs.rpc import named
-from drivers.errors import ProtocolViolation
-from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arcs.methods import methods
-from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import LOST, REPLIES, STOPS, Device, Fault
-from drivers.sim.faults.phases import Truth
-from drivers.sim.server import LoopbackServer
-from drivers.sim.world import World
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode
+from brushloop.drivers.arcs.rpc import named
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.sim.arcs.cabinet import Cabinet
+from brushloop.drivers.sim.arcs.methods import methods
+from brushloop.drivers.sim.faults.board import FaultBoard
+from brushloop.drivers.sim.faults.kinds import LOST, REPLIES, STOPS, Device, Fault
+from brushloop.drivers.sim.faults.phases import Truth
+from brushloop.drivers.sim.server import LoopbackServer
+from brushloop.drivers.sim.world import World
 
 PIECE_S = 0.001
 CUTS = (2, 6, 9)

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import rotation
-from drivers.samples import Pose
+from brushloop.drivers import rotation
+from brushloop.drivers.samples import Pose
 
 Matrix = NDArray[np.float64]
 Joints = tuple[float, float, float, float, float, float]

@@ -12,11 +12,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from drivers.geometry import distance
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverted
-from drivers.sim.arm.paths import Line, Path, fixed
-from drivers.sim.arm.plan import Corners, Move, Ramp, pieces_of, ramps_of
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverted
+from brushloop.drivers.sim.arm.paths import Line, Path, fixed
+from brushloop.drivers.sim.arm.plan import Corners, Move, Ramp, pieces_of, ramps_of
 
 __all__ = ["STEADY_LAG_S", "MotionQueue", "Move", "Ramp", "Segment"]
 

@@ -9,9 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.geometry import distance, interpolate
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import Joints, Matrix, forward, matrix_of, pose_of
+from brushloop.drivers.geometry import distance, interpolate
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import Joints, Matrix, forward, matrix_of, pose_of
 
 ROTATION_AS_LINEAR_MM = 1.0
 """Below this travel, ARCS reads speed and acceleration as rad/s and rad/s2."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.sim.arm.paths import Corner, Line, Path
+from brushloop.drivers.sim.arm.paths import Corner, Line, Path
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.geometry import distance
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
-from drivers.sim.arm.motion import SAME_POSE_DEG, SAME_POSE_MM, MotionQueue
-from drivers.sim.arm.paths import JointLine, Part
-from drivers.sim.arm.plan import Move
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.arm.motion import SAME_POSE_DEG, SAME_POSE_MM, MotionQueue
+from brushloop.drivers.sim.arm.paths import JointLine, Part
+from brushloop.drivers.sim.arm.plan import Move
 
 SAME_JOINT_RAD = 1e-6
 

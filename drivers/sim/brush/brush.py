@@ -11,10 +11,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.brush.drag import Stances, Waypoint, draw_drag
-from drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
-from drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
-from drivers.sim.brush.mechanics import (
+from brushloop.drivers.sim.brush.drag import Stances, Waypoint, draw_drag
+from brushloop.drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
+from brushloop.drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
+from brushloop.drivers.sim.brush.mechanics import (
     LOAD_STEP_MM,
     Bundle,
     SpineShape,
@@ -24,8 +24,8 @@ from drivers.sim.brush.mechanics import (
     pull_spine,
     rest_spine,
 )
-from drivers.sim.brush.paper import Footprint
-from drivers.sim.brush.spec import BrushSpec, within
+from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.spec import BrushSpec, within
 
 __all__ = ["Brush", "BrushSpec", "Flaw", "Footprint", "Waypoint"]
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import rotation
-from drivers.force.rounds import Wrench
-from drivers.geometry import interpolate, lean
-from drivers.samples import Pose
-from drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers import rotation
+from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.geometry import interpolate, lean
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 
 SIDEWAYS_MM = 0.5
 """A contact that travels less far sideways is a press."""

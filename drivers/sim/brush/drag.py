@@ -11,9 +11,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from drivers.sim.brush.footprint import MARGIN_MM, Tuft, frame_around
-from drivers.sim.brush.mechanics import SpineShape, Vector
-from drivers.sim.brush.paper import Dots, Footprint, Image, scatter, soak
+from brushloop.drivers.sim.brush.footprint import MARGIN_MM, Tuft, frame_around
+from brushloop.drivers.sim.brush.mechanics import SpineShape, Vector
+from brushloop.drivers.sim.brush.paper import Dots, Footprint, Image, scatter, soak
 
 STEP_MM = 0.3
 """Longest distance that the commanded tip travels between two moments of a drag."""

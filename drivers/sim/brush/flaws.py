@@ -11,7 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from drivers.sim.brush.mechanics import Vector
+from brushloop.drivers.sim.brush.mechanics import Vector
 
 CLEFT_RAD = math.radians(13.0)
 """Angle at which each half of a fully split tuft leaves the axis."""

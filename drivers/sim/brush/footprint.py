@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.brush.flaws import Trouble
-from drivers.sim.brush.mechanics import Bundle, SpineShape, Vector
-from drivers.sim.brush.paper import Dots, Footprint, scatter, soak
-from drivers.sim.brush.spec import BrushSpec
+from brushloop.drivers.sim.brush.flaws import Trouble
+from brushloop.drivers.sim.brush.mechanics import Bundle, SpineShape, Vector
+from brushloop.drivers.sim.brush.paper import Dots, Footprint, scatter, soak
+from brushloop.drivers.sim.brush.spec import BrushSpec
 
 STATION_MM = 0.25
 """Spacing of deposit points along a bristle."""

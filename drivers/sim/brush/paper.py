@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.brush.mechanics import Vector
-from drivers.sim.brush.spec import BrushSpec
+from brushloop.drivers.sim.brush.mechanics import Vector
+from brushloop.drivers.sim.brush.spec import BrushSpec
 
 Image = NDArray[np.float32]
 

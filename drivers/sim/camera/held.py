@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.rotation import columns as axes
-from drivers.rotation import of_vector
-from drivers.sim.camera.optics import Optics
-from drivers.sim.config import Table, View
+from brushloop.drivers.rotation import columns as axes
+from brushloop.drivers.rotation import of_vector
+from brushloop.drivers.sim.camera.optics import Optics
+from brushloop.drivers.sim.config import Table, View
 
 PX_PER_MM = 6.0
 EDGE_MM = 5.0

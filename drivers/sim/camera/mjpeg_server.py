@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera.source import LOOPBACK_SERVER
-from drivers.samples import Pose
-from drivers.sim.camera.scene import NOISE_FIELDS
-from drivers.sim.config import View
-from drivers.sim.faults.board import FaultBoard
-from drivers.sim.faults.kinds import KINDS, Device
-from drivers.sim.server import LoopbackServer
+from brushloop.drivers.camera.source import LOOPBACK_SERVER
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.camera.scene import NOISE_FIELDS
+from brushloop.drivers.sim.config import View
+from brushloop.drivers.sim.faults.board import FaultBoard
+from brushloop.drivers.sim.faults.kinds import KINDS, Device
+from brushloop.drivers.sim.server import LoopbackServer
 
 NOISE_LEVELS = 6
 """Number of gray levels of a covered sensor, which is not quite black."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.config import View
+from brushloop.drivers.sim.config import View
 
 Floats = NDArray[np.float64]
 SHADOW_SOFTNESS = 0.02

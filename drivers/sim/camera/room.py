@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import Matrix, skeleton
-from drivers.sim.world import World
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import Matrix, skeleton
+from brushloop.drivers.sim.world import World
 
 WIDTH_PX, HEIGHT_PX = 640, 480
 PX_PER_M = 260.0

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.samples import Pose
-from drivers.sim.brush.paper import PX_PER_MM
-from drivers.sim.camera.held import Held, held_picture
-from drivers.sim.camera.optics import Optics
-from drivers.sim.config import Table
-from drivers.sim.world import World
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.brush.paper import PX_PER_MM
+from brushloop.drivers.sim.camera.held import Held, held_picture
+from brushloop.drivers.sim.camera.optics import Optics
+from brushloop.drivers.sim.config import Table
+from brushloop.drivers.sim.world import World
 
 TABLE_GRAY = 120
 PAPER_GRAY = 228

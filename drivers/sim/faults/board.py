@@ -8,8 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.sim.faults.kinds import STOPS, Device, Fault
-from drivers.sim.faults.phases import Truth
+from brushloop.drivers.sim.faults.kinds import STOPS, Device, Fault
+from brushloop.drivers.sim.faults.phases import Truth
 
 KEPT = 100
 """Finished faults that are still listed."""

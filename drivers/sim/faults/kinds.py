@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from drivers.sim.described import complaint
-from drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.described import complaint
+from brushloop.drivers.sim.faults.phases import Phase
 
 ALWAYS = 1_000_000
 """A count that no session reaches."""

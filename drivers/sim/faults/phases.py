@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drivers.samples import Pose
-from drivers.sim.config import Table
-from drivers.sim.world import World
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.config import Table
+from brushloop.drivers.sim.world import World
 
 ON_PAPER_MM = 0.1
 """A tip that ends or rests no farther above than this counts as on the paper, which is taught with an error."""

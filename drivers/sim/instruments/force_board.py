@@ -18,10 +18,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from drivers.errors import ProtocolViolation
-from drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
-from drivers.sim.faults.kinds import ForceFault
-from drivers.sim.server import LoopbackServer
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
+from brushloop.drivers.sim.faults.kinds import ForceFault
+from brushloop.drivers.sim.server import LoopbackServer
 
 BUS_ERROR = 0x04
 """Class of an error frame: the controller has a problem but is on the bus."""

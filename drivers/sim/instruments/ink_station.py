@@ -13,10 +13,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from drivers.errors import ProtocolViolation
-from drivers.ink.station import number_of, seal, unseal
-from drivers.sim.faults.kinds import InkFault
-from drivers.sim.world import Well
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.ink.station import number_of, seal, unseal
+from brushloop.drivers.sim.faults.kinds import InkFault
+from brushloop.drivers.sim.world import Well
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 BYTE_S = 0.001

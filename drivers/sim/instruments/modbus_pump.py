@@ -6,9 +6,9 @@ import math
 import time
 from collections.abc import Callable
 
-from drivers.errors import ProtocolViolation
-from drivers.ink.modbus import WRITE_BYTES, WRITE_REGISTER, exception, read_write, seal, unseal
-from drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, STOP
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.ink.modbus import WRITE_BYTES, WRITE_REGISTER, exception, read_write, seal, unseal
+from brushloop.drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, STOP
 
 FULL_SPEED = 2
 

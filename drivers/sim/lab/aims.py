@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivers.samples import Pose
-from drivers.sim.camera.held import Held
-from drivers.sim.camera.optics import Floats
-from drivers.sim.lab.facts import PIN_TILT_DEG, Facts
-from drivers.sim.lab.places import Place, azimuth_deg, board_size_mm, corner, held, in_base, over_sheet
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.camera.held import Held
+from brushloop.drivers.sim.camera.optics import Floats
+from brushloop.drivers.sim.lab.facts import PIN_TILT_DEG, Facts
+from brushloop.drivers.sim.lab.places import Place, azimuth_deg, board_size_mm, corner, held, in_base, over_sheet
 
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; it is brought to the others by eye."""

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverse, inverted, matrix_of
-from drivers.sim.brush.brush import BrushSpec
-from drivers.sim.camera.optics import homography
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.lab.places import (
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverse, inverted, matrix_of
+from brushloop.drivers.sim.brush.brush import BrushSpec
+from brushloop.drivers.sim.camera.optics import homography
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.lab.places import (
     CORNERS,
     Place,
     azimuth_deg,
@@ -26,7 +26,7 @@ from drivers.sim.lab.places import (
     over_sheet,
     shifted,
 )
-from drivers.sim.world import tool_of
+from brushloop.drivers.sim.world import tool_of
 
 PICTURE_PX = (1280, 960)
 PRINTS = ((26, 20, 12.0, 9.0), (24, 19, 12.0, 9.0), (22, 17, 14.0, 10.5), (27, 20, 12.0, 9.0))

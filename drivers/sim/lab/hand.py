@@ -7,13 +7,13 @@ import math
 
 from scipy.spatial.transform import Rotation
 
-from drivers.arcs.codes import MOVING_ALLOWED, RobotMode
-from drivers.geometry import interpolate
-from drivers.samples import Pose
-from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arm.kinematics import Joints, inverted
-from drivers.sim.lab.facts import LIFT_MM, joints_for
-from drivers.sim.lab.places import shifted, withdrawn
+from brushloop.drivers.arcs.codes import MOVING_ALLOWED, RobotMode
+from brushloop.drivers.geometry import interpolate
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arcs.cabinet import Cabinet
+from brushloop.drivers.sim.arm.kinematics import Joints, inverted
+from brushloop.drivers.sim.lab.facts import LIFT_MM, joints_for
+from brushloop.drivers.sim.lab.places import shifted, withdrawn
 
 SPEED_RAD_S, ACC_RAD_S2 = 0.35, 1.0
 LOOK_S = 0.005

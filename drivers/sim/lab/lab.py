@@ -24,22 +24,22 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from drivers.arcs.robot import AUBOPE_PORT
-from drivers.force.rounds import LOOPBACK_CHANNEL
-from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.camera.held import Held
-from drivers.sim.camera.mjpeg_server import MjpegServer
-from drivers.sim.camera.room import RoomScene
-from drivers.sim.config import View
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from drivers.sim.lab.aims import TOUCHED, Aims
-from drivers.sim.lab.facts import LIFT_MM, PICTURE_PX, draw
-from drivers.sim.lab.hand import Hand
-from drivers.sim.lab.seen import Seen, printed
-from drivers.sim.lab.traps import Trap, mended, spring
-from drivers.sim.rig import LoopbackRig
-from drivers.sim.server import LoopbackServer
-from drivers.sim.world import World
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.sim.arcs.cabinet import Cabinet
+from brushloop.drivers.sim.camera.held import Held
+from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
+from brushloop.drivers.sim.camera.room import RoomScene
+from brushloop.drivers.sim.config import View
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.lab.aims import TOUCHED, Aims
+from brushloop.drivers.sim.lab.facts import LIFT_MM, PICTURE_PX, draw
+from brushloop.drivers.sim.lab.hand import Hand
+from brushloop.drivers.sim.lab.seen import Seen, printed
+from brushloop.drivers.sim.lab.traps import Trap, mended, spring
+from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.server import LoopbackServer
+from brushloop.drivers.sim.world import World
 
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 CAMERA_PORTS = (8080, 8081)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivers.samples import Pose
-from drivers.sim.config import Table
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.config import Table
 
 Place = tuple[float, float, float]
 """x, y, z in the base frame, in mm."""

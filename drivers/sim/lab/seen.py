@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.sim.camera.optics import camera_matrix
-from drivers.sim.lab.facts import Facts
-from drivers.sim.lab.places import CORNERS, corner, in_base
-from drivers.sim.lab.traps import Trap
-from drivers.sim.world import tool_of
+from brushloop.drivers.sim.camera.optics import camera_matrix
+from brushloop.drivers.sim.lab.facts import Facts
+from brushloop.drivers.sim.lab.places import CORNERS, corner, in_base
+from brushloop.drivers.sim.lab.traps import Trap
+from brushloop.drivers.sim.world import tool_of
 
 PRESS_SHARE = 0.45
 """Deepest press, as a share of the free length, that the maker of the brush allows."""

@@ -11,8 +11,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from drivers.sim.lab.facts import Facts
-from drivers.sim.lab.places import CORNERS, over_sheet
+from brushloop.drivers.sim.lab.facts import Facts
+from brushloop.drivers.sim.lab.places import CORNERS, over_sheet
 
 
 class Trap(StrEnum):

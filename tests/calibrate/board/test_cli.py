@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from brushloop import app
-from calibrate.board.artefact import LensFile
-from calibrate.board.lens import Gray
-from calibrate.board.pix2len import apply
-from calibrate.board.spec import BoardSpec, charuco_board
-from calibrate.errors import CalibrationError
+from brushloop.__main__ import app
+from brushloop.calibrate.board.artefact import LensFile
+from brushloop.calibrate.board.lens import Gray
+from brushloop.calibrate.board.pix2len import apply
+from brushloop.calibrate.board.spec import BoardSpec, charuco_board
+from brushloop.calibrate.errors import CalibrationError
 
 if TYPE_CHECKING:
     from conftest import Photographed
@@ -317,7 +317,7 @@ def test_drift_refuses_what_is_no_session_with_boards(photographed: Photographed
 def test_long_work_says_how_far_it_is(
     photographed: Photographed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sessions.progress.QUIET_S", 0.0)
+    monkeypatch.setattr("brushloop.sessions.progress.QUIET_S", 0.0)
     paths = [saved(tmp_path / f"{number}.png", BLANK) for number in range(2)]
     assert "photographs searched for the board: 1 of 2, about" in run("intrinsics", *paths, *BOARD).output
     session = photographed(tmp_path / "s", SPEC, [BLANK, BLANK])

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.board.drift import drift
-from calibrate.board.spec import BoardSpec, charuco_board
-from calibrate.board.view import preflight, see_board_and_lens
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.drift import drift
+from brushloop.calibrate.board.spec import BoardSpec, charuco_board
+from brushloop.calibrate.board.view import preflight, see_board_and_lens
+from brushloop.calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=14.0, dictionary="DICT_5X5_100", origin_mm=(-10.0, 5.0))
 HOUR_NS = 3_600_000_000_000

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.artefact import HASH_CHARS, load_artefact
-from calibrate.board.artefact import LensFile, lens_file
-from calibrate.board.cameras import solve, two_cameras
-from calibrate.board.detect import BoardView, find_board
-from calibrate.board.intrinsics import fit_lens, guidance
-from calibrate.board.lens import Lens, lens_of
-from calibrate.board.spec import BoardSpec, Checkerboard, charuco_board
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.artefact import HASH_CHARS, load_artefact
+from brushloop.calibrate.board.artefact import LensFile, lens_file
+from brushloop.calibrate.board.cameras import solve, two_cameras
+from brushloop.calibrate.board.detect import BoardView, find_board
+from brushloop.calibrate.board.intrinsics import fit_lens, guidance
+from brushloop.calibrate.board.lens import Lens, lens_of
+from brushloop.calibrate.board.spec import BoardSpec, Checkerboard, charuco_board
+from brushloop.calibrate.errors import CalibrationError
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "opencv_calib"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="OpenCV's real photographs of boards are not here")

@@ -14,22 +14,22 @@ import pytest
 from typer.testing import CliRunner
 
 from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
-from brushloop import app
-from calibrate.artefact import current, load_artefact
-from calibrate.board.artefact import LensFile, lens_file, read_lens
-from calibrate.board.detect import find_board
-from calibrate.board.intrinsics import fit_lens
-from calibrate.board.lens import LensUsed
-from calibrate.board.view import see_board
-from calibrate.calibration import Calibration
-from calibrate.compare.field import Field, Tone, captured_mm
-from calibrate.compare.images import prepare_press
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.session import FITTED, calibrate_session
-from calibrate.stroke.params import PX_PER_MM
-from collect.tui.captures import Review
-from sessions.reader import Recording
-from sessions.recording.schemas import Stroke
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.board.artefact import LensFile, lens_file, read_lens
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.intrinsics import fit_lens
+from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import Field, Tone, captured_mm
+from brushloop.calibrate.compare.images import prepare_press
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.session import FITTED, calibrate_session
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.collect.tui.captures import Review
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.board.detect import find_board
-from calibrate.board.pdf import POINTS_PER_MM, write_pdf
-from calibrate.board.spec import BoardSpec, Checkerboard
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.pdf import POINTS_PER_MM, write_pdf
+from brushloop.calibrate.board.spec import BoardSpec, Checkerboard
+from brushloop.calibrate.errors import CalibrationError
 
 BOARD = BoardSpec(squares=(7, 5), square_mm=25.0, marker_mm=18.0, dictionary="DICT_5X5_50", origin_mm=(0.0, 0.0))
 PX_PER_MM = 8

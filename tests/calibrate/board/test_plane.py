@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from calibrate.board.detect import find_board
-from calibrate.board.lens import unknown_lens
-from calibrate.board.pix2len import Plane, apply, distorted_share, fit_plane, local_scale
-from calibrate.board.spec import BoardSpec
-from calibrate.board.view import DISTORTED_SHARE, paper_mm, see_board
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.lens import unknown_lens
+from brushloop.calibrate.board.pix2len import Plane, apply, distorted_share, fit_plane, local_scale
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.board.view import DISTORTED_SHARE, paper_mm, see_board
+from brushloop.calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.board.artefact import registration_file
-from calibrate.board.register import read_points, register
-from calibrate.errors import CalibrationError
+from brushloop.calibrate.board.artefact import registration_file
+from brushloop.calibrate.board.register import read_points, register
+from brushloop.calibrate.errors import CalibrationError
 
 ROBOT = np.array([[460.0, -110.0], [460.0, 100.0], [310.0, 100.0], [310.0, -110.0], [380.0, 0.0], [420.0, 50.0]])
 NAMES = [f"touch {k}" for k in range(6)]

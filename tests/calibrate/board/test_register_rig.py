@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from brushloop import app
-from calibrate.board.rig_file import PaperLines, read_rig
-from calibrate.errors import CalibrationError
-from collect.rig.config import PaperConfig, RigConfig, load_rig
-from collect.rig.paper import to_base
-from drivers.geometry import brush_pose
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.world import World
+from brushloop.__main__ import app
+from brushloop.calibrate.board.rig_file import PaperLines, read_rig
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.rig.config import PaperConfig, RigConfig, load_rig
+from brushloop.collect.rig.paper import to_base
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
 
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
 AT = Addresses("127.0.0.1", 1, 2, 3, None, None)

@@ -6,11 +6,11 @@ import numba
 import numpy as np
 import pytest
 
-from calibrate.compare import compiled
-from calibrate.compare.compiled import compare
-from calibrate.compare.field import BEST_SHIFT_PX, Alignment
-from calibrate.compare.images import pack, unpack
-from calibrate.compare.similarity import csim, similarity, ssim
+from brushloop.calibrate.compare import compiled
+from brushloop.calibrate.compare.compiled import compare
+from brushloop.calibrate.compare.field import BEST_SHIFT_PX, Alignment
+from brushloop.calibrate.compare.images import pack, unpack
+from brushloop.calibrate.compare.similarity import csim, similarity, ssim
 
 
 def marks(rng: np.random.Generator, count: int, tones: int) -> np.ndarray:

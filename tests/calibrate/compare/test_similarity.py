@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from skimage.metrics import structural_similarity
 
-from calibrate.compare.similarity import binary_scores, csim, ssim
+from brushloop.calibrate.compare.similarity import binary_scores, csim, ssim
 
 images = hnp.arrays(np.float64, (16, 16), elements=st.floats(0, 1))
 

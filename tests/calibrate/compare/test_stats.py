@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.compare.stats import holm, paired, summarise
+from brushloop.calibrate.compare.stats import holm, paired, summarise
 
 
 def strata(*sizes: int) -> np.ndarray:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.drags.measure import along_axis, defects
-from calibrate.stroke.measure import measure
+from brushloop.calibrate.drags.measure import along_axis, defects
+from brushloop.calibrate.stroke.measure import measure
 
 
 def bar(angle_deg: float = 0.0) -> np.ndarray:

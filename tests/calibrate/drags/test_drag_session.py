@@ -8,25 +8,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
+from rich.console import Console  # noqa: TID251
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.artefact import current, load_artefact
-from calibrate.drags.artefact import DragArtefact
-from calibrate.drags.captures import commanded_path, figures_of, read_drags
-from calibrate.drags.fit import SPREAD_MM, fit_drags
-from calibrate.drags.measure import validate_drags
-from calibrate.drags.predict import predictors
-from calibrate.drags.report import DragValidation, summary, write_drags
-from calibrate.drags.run import FOLDER, LAGGING, STAMPS
-from calibrate.errors import CalibrationError
-from calibrate.stroke.params import Params
-from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from model.drag import DragModel, distances, trails
-from model.drag import ink as chance
-from sessions.reader import Recording
-from sessions.recording.schemas import Header, Source
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.drags.artefact import DragArtefact
+from brushloop.calibrate.drags.captures import commanded_path, figures_of, read_drags
+from brushloop.calibrate.drags.fit import SPREAD_MM, fit_drags
+from brushloop.calibrate.drags.measure import validate_drags
+from brushloop.calibrate.drags.predict import predictors
+from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
+from brushloop.calibrate.drags.run import FOLDER, LAGGING, STAMPS
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke.params import Params
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
+from brushloop.model.drag import DragModel, distances, trails
+from brushloop.model.drag import ink as chance
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Header, Source
 from tests.photographed import imported, photograph
 
 STROKES = [

@@ -4,16 +4,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.artefact import put_to_use
-from calibrate.drags import predicted, run
-from calibrate.drags.captures import Drawn, commanded_path
-from calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
-from calibrate.drags.predict import BETWEEN_SESSIONS, Learned, learn, predictors
-from calibrate.drags.residual import Residual, threshold
-from calibrate.drags.run import different
-from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from model.drag import DragModel, distances, ink, trails
-from sessions.recording.schemas import Header, Source
+from brushloop.calibrate.artefact import put_to_use
+from brushloop.calibrate.drags import predicted, run
+from brushloop.calibrate.drags.captures import Drawn, commanded_path
+from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
+from brushloop.calibrate.drags.predict import BETWEEN_SESSIONS, Learned, learn, predictors
+from brushloop.calibrate.drags.residual import Residual, threshold
+from brushloop.calibrate.drags.run import different
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
+from brushloop.model.drag import DragModel, distances, ink, trails
+from brushloop.sessions.recording.schemas import Header, Source
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)
 TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.drags.captures import read_drags
-from calibrate.drags.measure import FLAGGED_WEIGHT, validate_drags
-from calibrate.drags.report import DragValidation, summary, write_drags
-from calibrate.stroke.params import Params
-from sessions.imports.photographs import ImportOptions, import_photographs
-from sessions.reader import Recording
+from brushloop.calibrate.drags.captures import read_drags
+from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, validate_drags
+from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
+from brushloop.calibrate.stroke.params import Params
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.reader import Recording
 
 PX = 10
 LEFT, TOP = 200, 250

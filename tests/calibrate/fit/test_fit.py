@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.compare.ceiling import CEILING
-from calibrate.fit.captures import Grid, Pressed
-from calibrate.fit.fit import draw, fit_presses, touch_errors, zero_touches
-from calibrate.fit.heldout import FITTED, leave_cell_out
-from calibrate.fit.run import touch_estimates
-from calibrate.fit.sizes import FEWEST_CELLS, sizes_of
-from model.fitted import NAMES, PARAMETERS, FittedPress, published
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.fit.captures import Grid, Pressed
+from brushloop.calibrate.fit.fit import draw, fit_presses, touch_errors, zero_touches
+from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
+from brushloop.calibrate.fit.run import touch_estimates
+from brushloop.calibrate.fit.sizes import FEWEST_CELLS, sizes_of
+from brushloop.model.fitted import NAMES, PARAMETERS, FittedPress, published
 
 PX_MM = 0.4
 GRID = Grid((np.arange(100) + 0.5) * PX_MM - 31.0, 8.0 - (np.arange(40) + 0.5) * PX_MM)

@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.artefact import current, load_artefact
-from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.errors import CalibrationError
-from calibrate.fit.artefact import FOLDER, BrushFit
-from calibrate.fit.captures import read_presses
-from calibrate.fit.run import correction, fit_session
-from calibrate.validate.report.data import load_report
-from model.fitted import NAME, NAMES
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.compare.field import Alignment, Field, Tone
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
+from brushloop.calibrate.fit.captures import read_presses
+from brushloop.calibrate.fit.run import correction, fit_session
+from brushloop.calibrate.validate.report.data import load_report
+from brushloop.model.fitted import NAME, NAMES
 from tests.photographed import imported_presses
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]

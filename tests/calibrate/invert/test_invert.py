@@ -10,20 +10,20 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.compare.field import Field
-from calibrate.errors import CalibrationError
-from calibrate.invert.files import PROTOCOL, write_inversion
-from calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread
-from collect.protocols.config import load_protocol
-from collect.protocols.presses import ReplayConfig
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
-from model.inversion.press import Range
-from model.raster.exact import coverage_at
-from sessions.imports.photographs import ImportOptions, import_photographs
-from sessions.reader import Capture
-from sessions.recording.messages import encode_png
-from sessions.recording.schemas import Stroke
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.invert.files import PROTOCOL, write_inversion
+from brushloop.calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.presses import ReplayConfig
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.inversion.press import Range
+from brushloop.model.raster.exact import coverage_at
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.reader import Capture
+from brushloop.sessions.recording.messages import encode_png
+from brushloop.sessions.recording.schemas import Stroke
 from tests.command import brushloop
 
 PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]

@@ -8,16 +8,16 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.compare.stats import interval_over_groups
-from calibrate.loop.compare import Pairs, pair_up
-from calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
-from model.brush import Brush
-from model.raster.exact import coverage_at
-from model.strokes import stroke_model
-from sessions.reader import Capture
-from sessions.recording.messages import encode_png
-from sessions.recording.schemas import Stroke
+from brushloop.calibrate.compare.field import Alignment, Field, Tone
+from brushloop.calibrate.compare.stats import interval_over_groups
+from brushloop.calibrate.loop.compare import Pairs, pair_up
+from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
+from brushloop.model.brush import Brush
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_model
+from brushloop.sessions.reader import Capture
+from brushloop.sessions.recording.messages import encode_png
+from brushloop.sessions.recording.schemas import Stroke
 from tests.calibrate.given import CALIBRATION
 
 MODEL = stroke_model("ccd-bsm", Brush())

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.board.register import register
-from calibrate.errors import CaptureRefused
-from calibrate.stroke.difference import new_stroke
+from brushloop.calibrate.board.register import register
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.stroke.difference import new_stroke
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "frida_page_sequence"
 PAGE_MM = (203.2, 279.4)

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.errors import CaptureRefused
-from calibrate.line import fit_line
-from calibrate.stroke.measure import measure
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import rectify, rescale
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.line import fit_line
+from brushloop.calibrate.stroke.measure import measure
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import rectify, rescale
 
 PAGE = (800, 800)
 PARAMS = Params()

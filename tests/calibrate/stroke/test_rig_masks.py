@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
-from calibrate.board.pix2len import Plane
-from calibrate.board.view import see_board_and_lens
-from calibrate.compare import MM_PER_PX
-from calibrate.stages import trace_seen
-from calibrate.stroke.params import PX_PER_MM, Params
-from calibrate.stroke.preprocess import prepare
-from calibrate.stroke.rectify import rectify_distorted
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.view import see_board_and_lens
+from brushloop.calibrate.compare import MM_PER_PX
+from brushloop.calibrate.stages import trace_seen
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import rectify_distorted
 
 
 def overlaps(shot: Shot, plane: Plane) -> list[float]:

@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.compare.field import Alignment, Tone
-from calibrate.errors import CalibrationError
-from calibrate.loop.scores import LoopRecord
-from calibrate.validate.report import tables
-from calibrate.validate.report.data import load_report
-from calibrate.validate.run import REPEATED
-from sessions.imports.photographs import ImportOptions, import_photographs
-from sessions.reader import Recording
-from sessions.recording.schemas import Source
+from brushloop.__main__ import app
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.loop.scores import LoopRecord
+from brushloop.calibrate.validate.report import tables
+from brushloop.calibrate.validate.report.data import load_report
+from brushloop.calibrate.validate.run import REPEATED
+from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Source
 from tests.calibrate.records import loop_record, table_of, written_record
 
 FAST = ("--model", "line", "--no-held-out", "--no-parquet")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.validate.pool import ClusterError, Dask
+from brushloop.calibrate.validate.pool import ClusterError, Dask
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [
@@ -131,8 +131,8 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
 
 def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     program = (
-        "import calibrate.validate.store as store; store.VERSION = 'of tomorrow'\n"
-        "from calibrate.validate.pool import ClusterError, Dask\n"
+        "import brushloop.calibrate.validate.store as store; store.VERSION = 'of tomorrow'\n"
+        "from brushloop.calibrate.validate.pool import ClusterError, Dask\n"
         f"try:\n    Dask({cluster.address!r})\nexcept ClusterError as error:\n    print(error)\n"
     )
     deadline = time.monotonic() + PATIENCE_S
@@ -153,11 +153,11 @@ def test_workers_open_the_recording_themselves_or_are_sent_the_photographs(
     program = f"""
 from dataclasses import replace
 from pathlib import Path
-from calibrate.compare.field import Field
-from calibrate.validate import jobs
-from calibrate.validate.pool import Dask, Threads
-from calibrate.validate.sources import open_session, opened
-from calibrate.validate.store import Store
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.validate import jobs
+from brushloop.calibrate.validate.pool import Dask, Threads
+from brushloop.calibrate.validate.sources import open_session, opened
+from brushloop.calibrate.validate.store import Store
 
 def prepared(scheduler, session, name):
     ran = []
@@ -193,10 +193,10 @@ def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, s
     program = f"""
 import os, signal
 from pathlib import Path
-from calibrate.compare.field import Field
-from calibrate.validate.jobs import PrepareJob, prepare_job
-from calibrate.validate.pool import Dask, Threads
-from sessions.reader import Recording
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.validate.jobs import PrepareJob, prepare_job
+from brushloop.calibrate.validate.pool import Dask, Threads
+from brushloop.sessions.reader import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
 jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
 there = {{}}

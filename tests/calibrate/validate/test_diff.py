@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.errors import CalibrationError
-from calibrate.validate.diff import compare
+from brushloop.__main__ import app
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate.diff import compare
 
 MODELS = ("--model", "line", "--model", "ellipse", "--no-held-out")
 

@@ -11,17 +11,17 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.compare.field import Alignment, Tone
-from calibrate.validate.report.data import load_report
-from calibrate.validate.sources import LoadedSession
-from calibrate.validate.tuning import align_captures
-from model.brush import Brush
-from model.train import SHIPPED_GENERATOR
-from model.train.checkpoint import load_generator, load_weights
-from model.train.data import load_captures
-from model.train.errors import TrainError
-from sessions.recording.schemas import Source
+from brushloop.__main__ import app
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.validate.report.data import load_report
+from brushloop.calibrate.validate.sources import LoadedSession
+from brushloop.calibrate.validate.tuning import align_captures
+from brushloop.model.brush import Brush
+from brushloop.model.train import SHIPPED_GENERATOR
+from brushloop.model.train.checkpoint import load_generator, load_weights
+from brushloop.model.train.data import load_captures
+from brushloop.model.train.errors import TrainError
+from brushloop.sessions.recording.schemas import Source
 
 # One word a line, as the file's owner would write it.
 TRAINING = """

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.compare.ceiling import CEILING
-from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.fit.captures import read_presses
-from calibrate.fit.heldout import BEZIER, FITTED
-from calibrate.fit.run import fit_session
-from calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT
-from calibrate.validate.main import Request, validate
-from sessions.progress import unseen
+from brushloop.calibrate.compare.ceiling import CEILING
+from brushloop.calibrate.compare.field import Alignment, Field, Tone
+from brushloop.calibrate.fit.captures import read_presses
+from brushloop.calibrate.fit.heldout import BEZIER, FITTED
+from brushloop.calibrate.fit.run import fit_session
+from brushloop.calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT
+from brushloop.calibrate.validate.main import Request, validate
+from brushloop.sessions.progress import unseen
 
 NAMES = {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}
 

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
-from calibrate.compare.images import pack, simulated, simulated_pixels
-from calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
-from model.brush import Brush
-from model.raster.exact import coverage_at
-from model.strokes import stroke_models
-from sessions.reader import Capture
-from sessions.recording.messages import encode_png
-from sessions.recording.schemas import Stroke
+from brushloop.calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
+from brushloop.calibrate.compare.images import pack, simulated, simulated_pixels
+from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
+from brushloop.model.brush import Brush
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_models
+from brushloop.sessions.reader import Capture
+from brushloop.sessions.recording.messages import encode_png
+from brushloop.sessions.recording.schemas import Stroke
 from tests.calibrate.given import CALIBRATION
 
 MODELS = stroke_models(Brush())

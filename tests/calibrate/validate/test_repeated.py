@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bench.validate import scoring
-from calibrate.compare.field import Field
-from calibrate.validate import jobs
-from calibrate.validate.jobs import PrepareJob, Press, prepare_job
-from calibrate.validate.pool import Threads
-from calibrate.validate.run import ANOTHER, REPEATED, Options, validate_presses
-from calibrate.validate.sources import open_session
-from sessions.reader import Recording
+from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.validate import jobs
+from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
+from brushloop.calibrate.validate.pool import Threads
+from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Options, validate_presses
+from brushloop.calibrate.validate.sources import open_session
+from brushloop.sessions.reader import Recording
 
 
 def test_the_repetition_is_scored_against_its_original_only(

@@ -15,18 +15,18 @@ import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.compare.field import KEYS, Alignment, Tone
-from calibrate.errors import CalibrationError
-from calibrate.validate.gates import GateMissed, parse_gate
-from calibrate.validate.report.data import Collected, Report, load_report
-from calibrate.validate.report.findings import trust
-from calibrate.validate.report.outputs import COLUMNS, score_rows
-from calibrate.validate.report.page import _of_session
-from calibrate.validate.run import Outcome
-from sessions.reader import Recording
-from sessions.recording.schemas import Source
-from sessions.remarks import Remark, add_remark
+from brushloop.__main__ import app
+from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate.gates import GateMissed, parse_gate
+from brushloop.calibrate.validate.report.data import Collected, Report, load_report
+from brushloop.calibrate.validate.report.findings import trust
+from brushloop.calibrate.validate.report.outputs import COLUMNS, score_rows
+from brushloop.calibrate.validate.report.page import _of_session
+from brushloop.calibrate.validate.run import Outcome
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.remarks import Remark, add_remark
 from tests.browser import BROWSER, content_widths_px
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.validate.store import Store
+from brushloop.calibrate.validate.store import Store
 from tests.command import brushloop
 from tests.waiting import wait_until
 
@@ -61,8 +61,8 @@ def test_after_kill_9_the_same_command_gives_the_same_bytes_and_repeats_nothing(
 def test_a_second_run_does_no_work_again(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from typer.testing import CliRunner
 
-    from brushloop import app
-    from calibrate.validate import heldout, jobs, run
+    from brushloop.__main__ import app
+    from brushloop.calibrate.validate import heldout, jobs, run
 
     arguments = ["validate", str(session), "--out", str(tmp_path)]
     assert CliRunner().invoke(app, arguments).exit_code == 0
@@ -82,7 +82,7 @@ def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) 
     from filelock import FileLock
     from typer.testing import CliRunner
 
-    from brushloop import app
+    from brushloop.__main__ import app
 
     (tmp_path / "work").mkdir()
     with FileLock(tmp_path / "work" / "lock"):

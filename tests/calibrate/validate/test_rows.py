@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.compare.field import KEYS
-from calibrate.validate.jobs import Press
-from calibrate.validate.rows import CHUNK, Entry, Rows, Scores
-from calibrate.validate.store import Store
+from brushloop.calibrate.compare.field import KEYS
+from brushloop.calibrate.validate.jobs import Press
+from brushloop.calibrate.validate.rows import CHUNK, Entry, Rows, Scores
+from brushloop.calibrate.validate.store import Store
 
 NAMES = ["ours", "theirs", "another press", "robot writing"]
 COLUMNS = [[0, 1, 2, 3], [1, 2, 3]]

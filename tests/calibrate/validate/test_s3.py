@@ -14,11 +14,11 @@ import pytest
 from typer.testing import CliRunner
 
 from bench.preprocess_rigs import sheet
-from brushloop import app, main
-from calibrate.session import calibrate_session
-from calibrate.validate.report.data import load_report
-from calibrate.validate.sources import open_session
-from sessions.recording.schemas import Stroke
+from brushloop.__main__ import app, main
+from brushloop.calibrate.session import calibrate_session
+from brushloop.calibrate.validate.report.data import load_report
+from brushloop.calibrate.validate.sources import open_session
+from brushloop.sessions.recording.schemas import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -20,12 +20,12 @@ from typing import Any
 import fsspec
 import pytest
 
-from calibrate.artefact import current, put_to_use
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
-from calibrate.validate import sources
-from calibrate.validate.sources import fetched, open_session
-from sessions.errors import SessionDamaged
+from brushloop.calibrate.artefact import current, put_to_use
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate import sources
+from brushloop.calibrate.validate.sources import fetched, open_session
+from brushloop.sessions.errors import SessionDamaged
 from tests.calibrate.given import CALIBRATION
 
 
@@ -208,7 +208,7 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
     folder.mkdir()
     (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
     lines = [{"t_ns": 1, "event": "open", "header": {}}, {"t_ns": 2, "event": "closed", "sha256": "0" * 64}]
-    from sessions.journal.codec import encode_line
+    from brushloop.sessions.journal.codec import encode_line
 
     with (folder / "journal.jsonl").open("wb") as file:
         for line in lines:

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.validate.store import Store
+from brushloop.calibrate.validate.store import Store
 
 PUTTING = """
 import sys
 from pathlib import Path
-from calibrate.validate.store import Store
+from brushloop.calibrate.validate.store import Store
 with Store(Path(sys.argv[1])) as store:
     for number in range(100_000):
         store.put(str(number), {"data": bytes(5000)})

@@ -10,7 +10,7 @@ import pytest
 
 from bench import written
 from bench.harness import BenchError
-from calibrate.writing.scores import REFERENCE
+from brushloop.calibrate.writing.scores import REFERENCE
 from tests.calibrate.records import table_of
 
 

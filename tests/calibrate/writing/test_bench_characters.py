@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bench.characters import SIDE_MM, Writer, _result, run
-from calibrate.writing.compare import as_ink
-from calibrate.writing.plan_files import figure_record
-from calibrate.writing.scores import Character
-from drivers.sim.brush.brush import BrushSpec
-from model.characters.ink import swept
-from model.characters.plan import Path as Way
+from brushloop.calibrate.writing.compare import as_ink
+from brushloop.calibrate.writing.plan_files import figure_record
+from brushloop.calibrate.writing.scores import Character
+from brushloop.drivers.sim.brush.brush import BrushSpec
+from brushloop.model.characters.ink import swept
+from brushloop.model.characters.plan import Path as Way
 
 
 def test_a_stroke_lies_where_it_was_drawn_and_is_cut_by_the_cell() -> None:

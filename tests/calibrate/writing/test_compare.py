@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.board.lens import LensUsed
-from calibrate.compare.field import Alignment, Tone
-from calibrate.compare.similarity import Polarity
-from calibrate.errors import CalibrationError, CaptureRefused
-from calibrate.stroke.rectify import rectify_by
-from calibrate.writing.compare import as_ink, captured, read_reference
-from calibrate.writing.plan_files import figure_record
-from calibrate.writing.plan_record import PlanRecord, load_plan, points_digest
-from calibrate.writing.scores import (
+from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.stroke.rectify import rectify_by
+from brushloop.calibrate.writing.compare import as_ink, captured, read_reference
+from brushloop.calibrate.writing.plan_files import figure_record
+from brushloop.calibrate.writing.plan_record import PlanRecord, load_plan, points_digest
+from brushloop.calibrate.writing.scores import (
     ANOTHER,
     KEYS,
     PLANNED,
@@ -30,9 +30,9 @@ from calibrate.writing.scores import (
     score_character,
     table_3,
 )
-from sessions.reader import Capture
-from sessions.recording.messages import encode_png
-from sessions.recording.schemas import Source, Stroke
+from brushloop.sessions.reader import Capture
+from brushloop.sessions.recording.messages import encode_png
+from brushloop.sessions.recording.schemas import Source, Stroke
 from tests.calibrate.given import BY, CALIBRATION
 from tests.calibrate.records import written_record
 

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.drags.captures import Drawn
-from calibrate.errors import CalibrationError
-from calibrate.writing import footprint
-from calibrate.writing.footprint import FOLDER, FootprintArtefact, fit_session, load_footprint
-from calibrate.writing.practice import FIGURES, MARGIN, practice_strokes, write_practice
-from collect.protocols.config import load_protocol
-from collect.protocols.write import WriteConfig
-from model.characters.brush import Reach
-from model.characters.plan import without_tilt
-from model.footprint import NAMES, Footprint
-from sessions.recording.schemas import Header, Source
+from brushloop.calibrate.drags.captures import Drawn
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing import footprint
+from brushloop.calibrate.writing.footprint import FOLDER, FootprintArtefact, fit_session, load_footprint
+from brushloop.calibrate.writing.practice import FIGURES, MARGIN, practice_strokes, write_practice
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.write import WriteConfig
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.plan import without_tilt
+from brushloop.model.footprint import NAMES, Footprint
+from brushloop.sessions.recording.schemas import Header, Source
 from tests.calibrate.given import BY, CALIBRATION
 from tests.command import brushloop
 

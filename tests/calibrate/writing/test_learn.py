@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
-from calibrate.writing.compare import WritingComparison, as_ink
-from calibrate.writing.learn import MOST_MM, learned, missed, reach_of
-from calibrate.writing.plan_files import figure_record
-from calibrate.writing.plan_record import PlanRecord, arrays
-from calibrate.writing.report import write_written
-from calibrate.writing.rounds import lost_by_phase, phase_table, round_of
-from calibrate.writing.scores import Character, score_character
-from model.characters.ink import swept
-from model.characters.lead import covered, drawn, first_lead, lead
-from model.characters.plan import Path as Way
-from model.footprint import NAMES, START, Footprint
-from sessions.recording.schemas import Header, Source
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing.compare import WritingComparison, as_ink
+from brushloop.calibrate.writing.learn import MOST_MM, learned, missed, reach_of
+from brushloop.calibrate.writing.plan_files import figure_record
+from brushloop.calibrate.writing.plan_record import PlanRecord, arrays
+from brushloop.calibrate.writing.report import write_written
+from brushloop.calibrate.writing.rounds import lost_by_phase, phase_table, round_of
+from brushloop.calibrate.writing.scores import Character, score_character
+from brushloop.model.characters.ink import swept
+from brushloop.model.characters.lead import covered, drawn, first_lead, lead
+from brushloop.model.characters.plan import Path as Way
+from brushloop.model.footprint import NAMES, START, Footprint
+from brushloop.sessions.recording.schemas import Header, Source
 from tests.calibrate.given import BY, CALIBRATION
 
 SIDE_MM = 48.0

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from brushloop import app
-from calibrate.artefact import FittedValue
-from calibrate.drags.artefact import DragArtefact
-from calibrate.errors import CalibrationError
-from calibrate.writing.plan import Settings, plan, read_requests
-from calibrate.writing.plan_files import PICTURE, write_plan
-from calibrate.writing.plan_record import PROTOCOL, load_plan
-from collect.protocols.config import load_protocol
-from collect.protocols.write import WriteConfig
-from model.brush import Brush
-from model.characters.brush import Reach
-from model.drag import DragModel
-from model.strokes import stroke_model
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import FittedValue
+from brushloop.calibrate.drags.artefact import DragArtefact
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing.plan import Settings, plan, read_requests
+from brushloop.calibrate.writing.plan_files import PICTURE, write_plan
+from brushloop.calibrate.writing.plan_record import PROTOCOL, load_plan
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.write import WriteConfig
+from brushloop.model.brush import Brush
+from brushloop.model.characters.brush import Reach
+from brushloop.model.drag import DragModel
+from brushloop.model.strokes import stroke_model
 from tests.calibrate.given import BY
 from tests.command import brushloop
 

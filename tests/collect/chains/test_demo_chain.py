@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-import brushloop
-from collect.chains import demo
-from collect.chains.commands import GIVEN_UP, CommandFailed
-from collect.chains.demo import FULL, QUICK, Demo, Size
-from collect.chains.demo_rig import DemoRig
-from collect.chains.loop import LoopRequest
-from collect.chains.writing import WritingRequest
-from collect.errors import ConfigError
-from collect.protocols.config import load_protocol
-from collect.rig.config import load_rig
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from sessions.store import SessionStore
+import brushloop.__main__
+from brushloop.collect.chains import demo
+from brushloop.collect.chains.commands import GIVEN_UP, CommandFailed
+from brushloop.collect.chains.demo import FULL, QUICK, Demo, Size
+from brushloop.collect.chains.demo_rig import DemoRig
+from brushloop.collect.chains.loop import LoopRequest
+from brushloop.collect.chains.writing import WritingRequest
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import load_rig
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.sessions.store import SessionStore
 from tests.sessions.conftest import Make
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
@@ -163,9 +163,12 @@ def test_the_command_passes_on_what_was_asked_for(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(demo, "Demo", Noted)
     words = ["demo", "--out", str(tmp_path)]
-    assert CliRunner().invoke(brushloop.app, words).exit_code == GIVEN_UP
-    assert CliRunner().invoke(brushloop.app, [*words, "--full", "--repeats", "1", "--seed", "5"]).exit_code == GIVEN_UP
-    assert CliRunner().invoke(brushloop.app, [*words, "--brush", "loopback"]).exit_code == GIVEN_UP
+    assert CliRunner().invoke(brushloop.__main__.app, words).exit_code == GIVEN_UP
+    assert (
+        CliRunner().invoke(brushloop.__main__.app, [*words, "--full", "--repeats", "1", "--seed", "5"]).exit_code
+        == GIVEN_UP
+    )
+    assert CliRunner().invoke(brushloop.__main__.app, [*words, "--brush", "loopback"]).exit_code == GIVEN_UP
     assert asked == [
         (tmp_path, QUICK, 2, 60.0, 1, Path("paper")),
         (tmp_path, FULL, 1, 60.0, 5, Path("paper")),

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from calibrate.loop.scores import read_loop
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.reader import Recording
+from brushloop.calibrate.loop.scores import read_loop
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.reader import Recording
 from tests.waiting import wait_until
 
 if TYPE_CHECKING:

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from collect.chains import commands
-from collect.chains.commands import CommandFailed, finished_session, run_command
-from collect.chains.loop import SETTINGS as FILE
-from collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
-from collect.errors import ConfigError
-from collect.protocols.config import load_protocol
-from collect.rig.config import load_rig
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from sessions.store import SessionStore
+from brushloop.collect.chains import commands
+from brushloop.collect.chains.commands import CommandFailed, finished_session, run_command
+from brushloop.collect.chains.loop import SETTINGS as FILE
+from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import load_rig
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.sessions.store import SessionStore
 from tests.sessions.conftest import Make
 
 SETTINGS = Settings(

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.writing.plan_record import FILE as PLAN
-from calibrate.writing.plan_record import PROTOCOL, FigureRecord, PlanRecord
-from collect.chains import writing
-from collect.chains.writing import FOOTPRINT, Writing, WritingRequest
-from collect.errors import ConfigError
-from sessions.journal.journal import JOURNAL_NAME
+from brushloop.calibrate.writing.plan_record import FILE as PLAN
+from brushloop.calibrate.writing.plan_record import PROTOCOL, FigureRecord, PlanRecord
+from brushloop.collect.chains import writing
+from brushloop.collect.chains.writing import FOOTPRINT, Writing, WritingRequest
+from brushloop.collect.errors import ConfigError
+from brushloop.sessions.journal.journal import JOURNAL_NAME
 from tests.calibrate.given import BY
 
 CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, read_written
-from sessions.reader import Recording
+from brushloop.calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, read_written
+from brushloop.sessions.reader import Recording
 
 if TYPE_CHECKING:
     from tests.collect.chains.conftest import Bench

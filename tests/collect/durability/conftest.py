@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from drivers.sim.faults.phases import Phase
-from sessions.journal.journal import JOURNAL_NAME
+from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.sessions.journal.journal import JOURNAL_NAME
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab

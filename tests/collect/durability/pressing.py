@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 from typing import Any, cast
 
-from collect.motion.procedures import Procedures
-from collect.rig.config import load_rig
-from collect.rig.devices import Rig, make_robot
-from collect.rig.paper import Sheet
-from drivers.clock import HostClock
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import Rig, make_robot
+from brushloop.collect.rig.paper import Sheet
+from brushloop.drivers.clock import HostClock
 
 
 async def press_for_ever(path: Path, seed: int) -> None:

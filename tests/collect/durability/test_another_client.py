@@ -14,21 +14,21 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.errors import StepVoid
-from collect.motion.procedures import Procedures
-from collect.rig.config import load_rig
-from collect.rig.devices import connected
-from collect.rig.paper import Cell, Sheet, to_base
-from drivers.clock import HostClock
-from drivers.errors import ArmMoved, PathDisturbed
-from drivers.geometry import brush_pose, to_wire
-from drivers.samples import Pose
+from brushloop.collect.errors import StepVoid
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import connected
+from brushloop.collect.rig.paper import Cell, Sheet, to_base
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ArmMoved, PathDisturbed
+from brushloop.drivers.geometry import brush_pose, to_wire
+from brushloop.drivers.samples import Pose
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from drivers.sim.rig import LoopbackRig
+    from brushloop.drivers.sim.rig import LoopbackRig
 
 HOLD, LINE, RELEASE = (f"rob1.MotionControl.{name}" for name in ("stopMove", "moveLine", "startMove"))
 REQUESTS_IN_HOLD = 10

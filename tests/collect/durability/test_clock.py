@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.errors import CollectAborted
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.recording import container
-from sessions.repair.verify import verify_session
+from brushloop.collect.errors import CollectAborted
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import container
+from brushloop.sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
 from tests.collect.until import until, wait_for_end
 

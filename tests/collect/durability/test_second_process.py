@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from drivers.sim.config import SimConfig
-from drivers.sim.rig import LoopbackRig
-from sessions.repair.verify import verify_session
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.sessions.repair.verify import verify_session
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.durability.conftest import the_session
 from tests.command import brushloop

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sessions.reader import Recording
-from sessions.repair.verify import verify_session
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import parked, the_session
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from collect.engine.progress import Progress
-from collect.engine.steps import dip as dipping
-from collect.engine.steps import touch as touching
-from collect.engine.steps.context import RunMemory
-from collect.planning.summary import make_plan
-from collect.protocols.config import load_protocol
-from collect.protocols.steps import StepKind
-from collect.rig.config import load_rig
-from collect.tui.captures import Review
-from drivers.samples import Pose
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.recording import container
-from sessions.recording.schemas import Quality, Topic
+from brushloop.collect.engine.progress import Progress
+from brushloop.collect.engine.steps import dip as dipping
+from brushloop.collect.engine.steps import touch as touching
+from brushloop.collect.engine.steps.context import RunMemory
+from brushloop.collect.planning.summary import make_plan
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.tui.captures import Review
+from brushloop.drivers.samples import Pose
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.schemas import Quality, Topic
 from tests.collect.sent import noting
 from tests.collect.until import wait_for_end
 

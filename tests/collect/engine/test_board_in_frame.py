@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrate.errors import CalibrationError
-from collect.engine.steps import context
-from collect.engine.steps.context import RunContext
-from collect.errors import BadPicture
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.engine.steps import context
+from brushloop.collect.engine.steps.context import RunContext
+from brushloop.collect.errors import BadPicture
 
 
 class Camera:

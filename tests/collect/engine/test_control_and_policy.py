@@ -6,11 +6,11 @@ import threading
 
 import pytest
 
-from collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State, check_transition
-from collect.engine.policy import MAX_FAILURES, Action, decide
-from collect.errors import ForceTooHigh, SheetFull, StepVoid, arm_at_fault
-from collect.protocols.steps import Step, StepKind
-from drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
+from brushloop.collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State, check_transition
+from brushloop.collect.engine.policy import MAX_FAILURES, Action, decide
+from brushloop.collect.errors import ForceTooHigh, SheetFull, StepVoid, arm_at_fault
+from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
 
 
 def test_stop_is_possible_from_every_state_that_is_not_over() -> None:

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine.control import State
-from collect.engine.engine import UNCHECKED, Engine
-from collect.engine.snapshot import Snapshot
-from collect.errors import CollectAborted, ConfigError
-from drivers.arcs.codes import SafetyMode
-from drivers.errors import RobotNotSafe
-from drivers.samples import Identity
-from sessions.journal.journal import replay
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import UNCHECKED, Engine
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.errors import CollectAborted, ConfigError
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.errors import RobotNotSafe
+from brushloop.drivers.samples import Identity
+from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
     (lab.folder / "rig.toml").write_text(text)
     lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0, 10.0]")  # 6 presses, 4 cells
 
-    from collect.errors import SheetFull
+    from brushloop.collect.errors import SheetFull
 
     with pytest.raises(SheetFull, match="--sheet 2"):
         run(lab.engine())
@@ -198,7 +198,7 @@ def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
 
 
 def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
+    monkeypatch.setattr("brushloop.drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
     with pytest.raises(ConfigError, match=r"real hardware.*--arm"):
         run(lab.engine())
     assert not lab.sessions.exists()
@@ -216,7 +216,7 @@ def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
     monkeypatch.setattr(
-        "drivers.arcs.robot.Identity", lambda device, _model, *rest: Identity(device, "another arm", *rest)
+        "brushloop.drivers.arcs.robot.Identity", lambda device, _model, *rest: Identity(device, "another arm", *rest)
     )
     with pytest.raises(ConfigError, match="was begun on"):
         run(lab.engine(armed=True))

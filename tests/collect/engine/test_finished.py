@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.chains.commands import ending
-from collect.engine.open_or_resume import Opening
-from collect.start import start
+from brushloop.collect.chains.commands import ending
+from brushloop.collect.engine.open_or_resume import Opening
+from brushloop.collect.start import start
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
@@ -30,7 +30,8 @@ def test_it_is_printed_after_the_screen_too(
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     monkeypatch.setattr(
-        "collect.tui.runner.run_screen", lambda engine, *_options: (engine.start(), wait_for_end(engine), engine)[-1]
+        "brushloop.collect.tui.runner.run_screen",
+        lambda engine, *_options: (engine.start(), wait_for_end(engine), engine)[-1],
     )
     opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
     assert start(opening, on_screen=True, preview="off") == 0

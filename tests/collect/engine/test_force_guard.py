@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from collect.engine.force_guard import ForceGuard
-from collect.errors import ForceTooHigh, arm_at_fault, describe, rest_is_unknown
-from drivers.errors import DeviceError, MotionFailed
-from drivers.samples import ForceSample, Stamp
+from brushloop.collect.engine.force_guard import ForceGuard
+from brushloop.collect.errors import ForceTooHigh, arm_at_fault, describe, rest_is_unknown
+from brushloop.drivers.errors import DeviceError, MotionFailed
+from brushloop.drivers.samples import ForceSample, Stamp
 
 
 class Cell:

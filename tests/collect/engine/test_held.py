@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine.control import State
-from collect.engine.open_or_resume import Opening
-from collect.errors import ConfigError
-from drivers.arcs.codes import SafetyMode
-from drivers.errors import RobotNotSafe
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.open_or_resume import Opening
+from brushloop.collect.errors import ConfigError
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.errors import RobotNotSafe
 from tests.collect.until import until, wait_for_end
 from tests.command import brushloop
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from conftest import Lab
 
-    from collect.engine.engine import Engine
-    from collect.operator import Prompt
+    from brushloop.collect.engine.engine import Engine
+    from brushloop.collect.operator import Prompt
 
 
 def slowly(lab: Lab) -> None:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcap.reader import make_reader
 
-from collect.engine.control import State
-from collect.errors import ForceTooHigh, NeedsOperator, PosesLate
-from drivers.arcs.robot import AuboArcs
-from drivers.errors import ConnectionLost, Stuck
-from drivers.ink.port import InkRefused
-from drivers.sim.faults.kinds import Device, Fault
-from sessions.journal.journal import replay
-from sessions.recording.schemas import Topic
+from brushloop.collect.engine.control import State
+from brushloop.collect.errors import ForceTooHigh, NeedsOperator, PosesLate
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.errors import ConnectionLost, Stuck
+from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.sim.faults.kinds import Device, Fault
+from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.recording.schemas import Topic
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from conftest import Collected, Lab
 
-    from collect.engine.engine import Engine
+    from brushloop.collect.engine.engine import Engine
 
 
 def run(engine: Engine) -> None:

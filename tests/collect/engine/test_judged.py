@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from collect.engine.control import State
-from collect.engine.steps import capture as capturing
-from collect.errors import CollectAborted, NeedsOperator, Parked
-from collect.quality.checks import check_drawing
-from collect.quality.verdict import Verdict
-from drivers.sim.brush.flaws import Flaw
-from sessions.journal.journal import JOURNAL_NAME, replay
-from sessions.reader import Recording
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.steps import capture as capturing
+from brushloop.collect.errors import CollectAborted, NeedsOperator, Parked
+from brushloop.collect.quality.checks import check_drawing
+from brushloop.collect.quality.verdict import Verdict
+from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.reader import Recording
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until
 
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from calibrate.stroke.params import Gray
-    from collect.engine.engine import Engine
-    from collect.engine.snapshot import Snapshot
+    from brushloop.calibrate.stroke.params import Gray
+    from brushloop.collect.engine.engine import Engine
+    from brushloop.collect.engine.snapshot import Snapshot
 
 
 def run(engine: Engine) -> None:
@@ -135,7 +135,7 @@ def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: La
 
 
 def test_saying_no_to_real_hardware_leaves_it_as_it_is(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
+    monkeypatch.setattr("brushloop.drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
     engine = sharp_lab.engine(watched=True)
     with pytest.raises(CollectAborted, match="nothing moved"):
         answered(engine, "x", over=lambda now: now.state in (State.STOPPED, State.FAILED))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.compare.field import Alignment, Field, Tone
-from calibrate.compare.images import simulated
-from collect.engine.last_capture import LastCapture, published_mark
-from model.strokes import stroke_model
+from brushloop.calibrate.compare.field import Alignment, Field, Tone
+from brushloop.calibrate.compare.images import simulated
+from brushloop.collect.engine.last_capture import LastCapture, published_mark
+from brushloop.model.strokes import stroke_model
 
 BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}
 

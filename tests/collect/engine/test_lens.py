@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
-from calibrate.artefact import load_artefact
-from calibrate.board.artefact import LensFile
-from calibrate.calibration import Calibration
-from calibrate.session import calibrate_session
-from collect.engine.control import State
-from collect.errors import ConfigError, StepError
-from collect.rig.config import load_rig
-from collect.tui.captures import Review
-from sessions.journal.journal import replay
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.recording import container
-from sessions.recording.schemas import Topic
+from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.board.artefact import LensFile
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.session import calibrate_session
+from brushloop.collect.engine.control import State
+from brushloop.collect.errors import ConfigError, StepError
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.tui.captures import Review
+from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.schemas import Topic
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:

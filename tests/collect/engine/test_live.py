@@ -23,17 +23,17 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from collect.engine.live import HOST, QUEUE_LIMIT, LiveView
-from collect.engine.open_or_resume import Opening
-from collect.engine.telemetry import FRAME_PERIOD_S
-from collect.errors import ConfigError
-from collect.start import start
-from drivers.samples import Frame, Stamp
-from sessions.recording import container
-from sessions.recording.messages import encode_png, image_message, pose_message
-from sessions.recording.schemas import Topic, Wrench
-from sessions.recording.writer import Outgoing
-from sessions.repair.verify import verify_session
+from brushloop.collect.engine.live import HOST, QUEUE_LIMIT, LiveView
+from brushloop.collect.engine.open_or_resume import Opening
+from brushloop.collect.engine.telemetry import FRAME_PERIOD_S
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.start import start
+from brushloop.drivers.samples import Frame, Stamp
+from brushloop.sessions.recording import container
+from brushloop.sessions.recording.messages import encode_png, image_message, pose_message
+from brushloop.sessions.recording.schemas import Topic, Wrench
+from brushloop.sessions.recording.writer import Outgoing
+from brushloop.sessions.repair.verify import verify_session
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S
 

@@ -8,18 +8,18 @@ from typing import Any
 
 import pytest
 
-from collect import headless
-from collect.engine.control import State
-from collect.engine.engine import Engine
-from collect.engine.snapshot import Snapshot
-from collect.protocols.presses import GridConfig
-from collect.rig.config import load_rig
-from collect.rig.devices import Rig, make_robot
-from collect.tui.app import OperatorApp
-from drivers.geometry import brush_pose
-from drivers.samples import Identity
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect import headless
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import Rig, make_robot
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Identity
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from tests.collect.tui.fake import SET_UP, FakeEngine, picture
 from tests.collect.tui.test_app import look
 

@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
-from collect.engine.open_or_resume import Opening, find_resumable, put_in_sheet
-from collect.errors import ConfigError
-from collect.headless import RunnableEngine
-from collect.planning.limit_check import distinct_steps
-from collect.protocols.steps import StepKind
-from collect.tui.browser import Paths, SessionBrowser
-from drivers.clock import HostClock
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from sessions.difference import Difference
-from sessions.recording.schemas import Header, Source
-from sessions.store import SessionStore
+from brushloop.collect.engine.open_or_resume import Opening, find_resumable, put_in_sheet
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.headless import RunnableEngine
+from brushloop.collect.planning.limit_check import distinct_steps
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.sessions.difference import Difference
+from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))

@@ -7,17 +7,17 @@ import threading
 
 import pytest
 
-from collect.engine.control import State
-from collect.engine.engine import Engine
-from collect.engine.perform import Performer
-from collect.engine.snapshot import Mark
-from collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
-from collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from collect.protocols.steps import Result, Step, StepKind
-from drivers.errors import DeviceTimeout
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.remarks import mark_bad_or_good
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.perform import Performer
+from brushloop.collect.engine.snapshot import Mark
+from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
+from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
+from brushloop.collect.protocols.steps import Result, Step, StepKind
+from brushloop.drivers.errors import DeviceTimeout
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.engine.control import State
-from collect.engine.engine import Engine
-from collect.errors import CollectAborted, NeedsOperator, Parked
-from drivers.errors import DeviceError
-from drivers.sim.config import View
-from sessions.journal.journal import JOURNAL_NAME
-from sessions.store import SessionStore
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.errors import CollectAborted, NeedsOperator, Parked
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.sim.config import View
+from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.store import SessionStore
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.until import until, wait_for_end
 

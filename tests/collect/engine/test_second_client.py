@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.control import State
-from drivers.arcs.controller import Controller
-from drivers.arcs.rpc import RpcConnection
-from drivers.arcs.waiting import Tolerance, until_settled
-from drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
-from drivers.geometry import brush_pose, from_wire, lean, to_wire
-from sessions.journal.lines import read_lines
+from brushloop.collect.engine.control import State
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.waiting import Tolerance, until_settled
+from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
+from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
+from brushloop.sessions.journal.lines import read_lines
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from collect.engine.engine import Engine
-    from drivers.samples import Pose
+    from brushloop.collect.engine.engine import Engine
+    from brushloop.drivers.samples import Pose
 
 
 PAPER_Z_MM, SAFE_Z_MM = 120.0, 180.0

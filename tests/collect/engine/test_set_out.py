@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.engine import Engine
-from collect.engine.steps import capture as capturing
-from collect.engine.steps.context import meanwhile
-from collect.errors import BadPicture, CollectAborted
-from collect.motion.procedures import Procedures
-from sessions.journal.lines import read_lines
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.steps import capture as capturing
+from brushloop.collect.engine.steps.context import meanwhile
+from brushloop.collect.errors import BadPicture, CollectAborted
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.sessions.journal.lines import read_lines
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import Any, cast
 
 import pytest
 
-from collect.engine.recorder import Recorder
-from drivers.clock import HostClock
-from drivers.samples import ForceSample, Stamp
-from sessions.recording.writer import Outgoing
+from brushloop.collect.engine.recorder import Recorder
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.samples import ForceSample, Stamp
+from brushloop.sessions.recording.writer import Outgoing
 
 MS = 1_000_000
 SECOND = 1000 * MS

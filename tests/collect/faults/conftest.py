@@ -13,14 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from collect.engine.engine import Engine
-from collect.engine.open_or_resume import Opening, find_resumable, open_store
-from drivers.arcs import stopping
-from drivers.arcs.rpc import RpcConnection
-from drivers.clock import HostClock
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import LoopbackRig
-from drivers.sim.world import SimClock
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
+from brushloop.drivers.arcs import stopping
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.world import SimClock
 from tests.waiting import PATIENCE_S
 
 FAST = 300.0

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.control import State
-from collect.errors import describe
+from brushloop.collect.engine.control import State
+from brushloop.collect.errors import describe
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until
 
 if TYPE_CHECKING:
     from conftest import Stage
 
-    from collect.engine.engine import Engine
+    from brushloop.collect.engine.engine import Engine
 
 DOWN = "The brush may be down"
 RELEASE = "rob1.MotionControl.startMove"

@@ -14,19 +14,26 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.control import State
-from collect.engine.engine import Engine
-from drivers.arcs import stopping
-from drivers.arcs.codes import SafetyMode
-from drivers.arcs.rpc import RpcConnection
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, MotionFailed, ProtocolViolation, RobotNotSafe
-from drivers.geometry import distance
-from drivers.samples import Pose
-from drivers.sim.faults.kinds import ALWAYS, Fault
-from drivers.sim.faults.phases import Phase
-from sessions.journal.journal import replay
-from sessions.journal.lines import read_lines
-from sessions.store import SessionStore
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.engine import Engine
+from brushloop.drivers.arcs import stopping
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    MotionFailed,
+    ProtocolViolation,
+    RobotNotSafe,
+)
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Fault
+from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.store import SessionStore
 from tests.collect.faults.conftest import CAMERA_TIMEOUT_S
 from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S

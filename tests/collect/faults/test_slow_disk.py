@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.engine.control import State
-from drivers.sim.faults.phases import Phase
-from sessions.errors import SessionError
-from sessions.journal.journal import replay
-from sessions.journal.lines import read_lines
-from sessions.reader import Recording
-from sessions.recording.writer import ChannelTable
+from brushloop.collect.engine.control import State
+from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording.writer import ChannelTable
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
     stage: Stage, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A queue of five stands for the 20 000 messages that a slower disk would take minutes to fill."""
-    monkeypatch.setattr("sessions.store.QUEUE_LIMIT", 5)
+    monkeypatch.setattr("brushloop.sessions.store.QUEUE_LIMIT", 5)
     disk.message_s = 0.1
     error, state = run(stage)
     assert isinstance(error, SessionError)

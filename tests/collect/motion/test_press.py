@@ -9,15 +9,15 @@ from typing import Any, cast
 
 import pytest
 
-from collect.errors import StepVoid
-from collect.motion.moves import press_moves
-from collect.motion.procedures import Procedures
-from collect.rig.config import load_rig
-from collect.rig.devices import Rig, limits_of
-from collect.rig.paper import Sheet
-from drivers.samples import Identity, Pose, QueuedLine
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect.errors import StepVoid
+from brushloop.collect.motion.moves import press_moves
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import Rig, limits_of
+from brushloop.collect.rig.paper import Sheet
+from brushloop.drivers.samples import Identity, Pose, QueuedLine
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 
 NOBODY = Identity("robot", "made up", "", True)
 

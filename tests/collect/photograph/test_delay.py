@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.photograph.delay import ArmPlace, CameraDelay, FrameChange, Look, look
+from brushloop.collect.photograph.delay import ArmPlace, CameraDelay, FrameChange, Look, look
 
 ENTERS = 0.4
 """The share of its way at which the arm comes into the picture; nothing below knows it."""

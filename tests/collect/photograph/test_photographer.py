@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from collect.errors import ArmInPicture, CameraLate
-from collect.photograph.delay import CameraDelay, Look
-from drivers.samples import Frame
+from brushloop.collect.errors import ArmInPicture, CameraLate
+from brushloop.collect.photograph.delay import CameraDelay, Look
+from brushloop.drivers.samples import Frame
 from tests.collect.photograph.theatre import OUT_MM, OVER_MM, PERIOD_S, Theatre
 
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from collect.photograph.photographer import ArmTrips, Photographer
-from collect.rig.config_devices import CameraConfig
-from drivers.clock import Clock
-from drivers.samples import Frame, Pose, PoseSample, Stamp
+from brushloop.collect.photograph.photographer import ArmTrips, Photographer
+from brushloop.collect.rig.config_devices import CameraConfig
+from brushloop.drivers.clock import Clock
+from brushloop.drivers.samples import Frame, Pose, PoseSample, Stamp
 from tests.simulated_time import LoopClock
 
 PERIOD_S, TRIP_S = 0.02, 0.06

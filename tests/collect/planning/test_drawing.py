@@ -8,22 +8,22 @@ from pathlib import Path
 
 import pytest
 
-from collect.motion.moves import stroke_moves
-from collect.motion.procedures import check_drawn, draw_stroke
-from collect.planning.walk import sheet_of, walk
-from collect.protocols.config import load_protocol
-from collect.protocols.plan import Drawn
-from collect.protocols.steps import StepKind
-from collect.rig.config import RigConfig, load_rig
-from collect.rig.devices import limits_of, make_robot
-from collect.rig.paper import PaperPlane
-from drivers.arcs.robot import AuboArcs
-from drivers.clock import HostClock
-from drivers.errors import LimitExceeded
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.world import World
+from brushloop.collect.motion.moves import stroke_moves
+from brushloop.collect.motion.procedures import check_drawn, draw_stroke
+from brushloop.collect.planning.walk import sheet_of, walk
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.plan import Drawn
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.devices import limits_of, make_robot
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import LimitExceeded
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
 
 WRITE = Path(__file__).parents[3] / "examples" / "protocol-write.toml"
 PLANE = PaperPlane(120.0)

@@ -8,21 +8,21 @@ from pathlib import Path
 
 import pytest
 
-from collect.errors import ConfigError
-from collect.motion.moves import Move, Way
-from collect.planning.estimate import _apart, bundle_ml, ink_need, move_s, reach_of, trapezoid_s, way_s
-from collect.planning.limit_check import all_poses, check_poses, check_protocol
-from collect.planning.summary import Plan, make_plan
-from collect.planning.walk import moves_of, sheet_of, walk
-from collect.protocols.config import ProtocolConfig, load_protocol
-from collect.protocols.plan import Drawn
-from collect.protocols.steps import MARKING, StepKind
-from collect.rig.config import RigConfig, load_rig
-from collect.rig.devices import limits_of
-from collect.rig.paper import PaperPlane
-from drivers.geometry import brush_pose, distance
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.motion.moves import Move, Way
+from brushloop.collect.planning.estimate import _apart, bundle_ml, ink_need, move_s, reach_of, trapezoid_s, way_s
+from brushloop.collect.planning.limit_check import all_poses, check_poses, check_protocol
+from brushloop.collect.planning.summary import Plan, make_plan
+from brushloop.collect.planning.walk import moves_of, sheet_of, walk
+from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
+from brushloop.collect.protocols.plan import Drawn
+from brushloop.collect.protocols.steps import MARKING, StepKind
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.devices import limits_of
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))

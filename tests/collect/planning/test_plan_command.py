@@ -11,22 +11,22 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-import collect.cli
-from collect.errors import ConfigError
-from collect.planning.limit_check import _for_tool, all_poses, ask_reach
-from collect.planning.picture import draw_plan
-from collect.planning.summary import make_plan
-from collect.protocols.config import load_protocol
-from collect.rig.config import RigConfig, load_rig
-from collect.rig.paper import PaperPlane
-from drivers.arcs.codes import RobotMode
-from drivers.errors import ConnectionLost, ProtocolViolation
-from drivers.geometry import brush_pose, from_wire
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.arm.kinematics import inverted, matrix_of
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.world import World
+import brushloop.collect.cli
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.planning.limit_check import _for_tool, all_poses, ask_reach
+from brushloop.collect.planning.picture import draw_plan
+from brushloop.collect.planning.summary import make_plan
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.drivers.arcs.codes import RobotMode
+from brushloop.drivers.errors import ConnectionLost, ProtocolViolation
+from brushloop.drivers.geometry import brush_pose, from_wire
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arm.kinematics import inverted, matrix_of
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
 from tests.command import brushloop
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -55,7 +55,7 @@ def at(rig_path: Path, port: int) -> RigConfig:
 
 def plan(rig_path: Path, name: str, *options: str) -> str:
     arguments = ["plan", "--config", str(rig_path), "--protocol", str(EXAMPLES / name), *options]
-    ran = CliRunner().invoke(collect.cli.app, arguments, catch_exceptions=False)
+    ran = CliRunner().invoke(brushloop.collect.cli.app, arguments, catch_exceptions=False)
     assert ran.exit_code == 0
     return ran.stdout
 

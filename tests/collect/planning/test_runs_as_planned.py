@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from collect.engine.perform import Performer
-from collect.engine.steps.context import StepContext
-from collect.motion.moves import inking_moves
-from collect.planning.limit_check import all_poses, check_protocol
-from collect.planning.walk import moves_of
-from collect.protocols.config import load_protocol
-from collect.protocols.steps import MARKING, Result, Step, StepKind
-from collect.rig.config import load_rig
-from collect.rig.paper import PaperPlane
-from drivers.samples import Pose
+from brushloop.collect.engine.perform import Performer
+from brushloop.collect.engine.steps.context import StepContext
+from brushloop.collect.motion.moves import inking_moves
+from brushloop.collect.planning.limit_check import all_poses, check_protocol
+from brushloop.collect.planning.walk import moves_of
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.drivers.samples import Pose
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting
 from tests.collect.until import wait_for_end

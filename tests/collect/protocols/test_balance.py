@@ -6,9 +6,9 @@ from collections import defaultdict
 
 import pytest
 
-from collect.protocols.plan import Planned
-from collect.protocols.presses import GridConfig
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.plan import Planned
+from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.rig.paper import Layout
 
 PAPER = {"heights_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
 

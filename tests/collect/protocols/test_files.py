@@ -10,11 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from collect.errors import ConfigError
-from collect.protocols import config as protocol_config
-from collect.protocols.config import load_protocol
-from collect.protocols.presses import GridConfig, ListConfig
-from collect.protocols.write import WriteConfig
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols import config as protocol_config
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.protocols.presses import GridConfig, ListConfig
+from brushloop.collect.protocols.write import WriteConfig
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 LIST = 'kind = "list"\nfile = "p.csv"\n'

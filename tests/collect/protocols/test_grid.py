@@ -9,10 +9,10 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.protocols.presses import GridConfig
-from collect.protocols.steps import Step, StepKind
-from collect.rig.config import PaperConfig
-from collect.rig.paper import Sheet, to_base
+from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.paper import Sheet, to_base
 
 heights = st.lists(st.integers(1, 30).map(float), min_size=1, max_size=5, unique=True)
 tilts = st.lists(st.integers(0, 15).map(float), min_size=1, max_size=4, unique=True)
@@ -53,7 +53,8 @@ def test_steps_of_a_stroke_follow_each_other_and_a_capture_belongs_to_the_cell_t
 def test_keys_are_stable_across_processes_and_tell_steps_apart() -> None:
     step = Step(StepKind.PRESS, 3, {"height_mm": 11.0, "tilt_deg": 5.0})
     program = (
-        "from collect.protocols.steps import *;print(Step(StepKind.PRESS, 3, {'tilt_deg': 5.0, 'height_mm': 11.0}).key)"
+        "from brushloop.collect.protocols.steps import *;"
+        "print(Step(StepKind.PRESS, 3, {'tilt_deg': 5.0, 'height_mm': 11.0}).key)"
     )
     other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip()
     assert other == step.key

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from collect.protocols.calibration import CalibrationConfig
-from collect.protocols.config import ProtocolConfig, load_protocol
-from collect.protocols.plan import strokes_of, strokes_text
-from collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
-from collect.protocols.steps import MARKING, Step, StepKind
-from collect.protocols.write import DrawnStroke, Figure, WriteConfig
-from collect.rig.paper import Layout
+from brushloop.collect.protocols.calibration import CalibrationConfig
+from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
+from brushloop.collect.protocols.plan import strokes_of, strokes_text
+from brushloop.collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
+from brushloop.collect.protocols.steps import MARKING, Step, StepKind
+from brushloop.collect.protocols.write import DrawnStroke, Figure, WriteConfig
+from brushloop.collect.rig.paper import Layout
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.stroke.params import PX_PER_MM
-from collect.quality.ink import Ink, Patch
-from collect.quality.measure import measure_mark
-from collect.rig.config_quality import QualityConfig
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.collect.quality.ink import Ink, Patch
+from brushloop.collect.quality.measure import measure_mark
+from brushloop.collect.rig.config_quality import QualityConfig
 
 
 @pytest.mark.parametrize("photo_px_per_mm", [6.25, 3.3, 2.5])

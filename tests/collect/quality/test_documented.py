@@ -6,7 +6,7 @@ import json
 import re
 from pathlib import Path
 
-from collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_quality import QualityConfig
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "quality.md"
 UNITS = {"_mm": "mm", "_mm2": "mm²", "_mm2_per_mm": "mm²/mm", "_deg": "deg", "_level": "gray level"}

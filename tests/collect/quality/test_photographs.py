@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.quality_photographs import INK, WHITENED, judge, named, rows
-from collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_quality import QualityConfig
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "frida_bigbrush_tilt_16x20"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real photographs is not here")

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from calibrate.board.lens import unknown_lens
-from calibrate.board.pix2len import Plane
-from collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
-from collect.quality.measure import blur_px, glare, paper_level
-from collect.quality.verdict import Failure, Family
-from collect.rig.config_quality import QualityConfig
-from collect.rig.paper import Cell
+from brushloop.calibrate.board.lens import unknown_lens
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
+from brushloop.collect.quality.measure import blur_px, glare, paper_level
+from brushloop.collect.quality.verdict import Failure, Family
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.paper import Cell
 
 LIMITS = QualityConfig()
 PX = 8.0

@@ -9,9 +9,9 @@ import pytest
 
 from bench.quality import Score, score
 from bench.quality_set import SPOTLESS_MM2, Bench, Patch, Sample
-from collect.quality.checks import cell_is_blank, check_capture
-from collect.quality.verdict import Failure
-from collect.rig.config_quality import QualityConfig
+from brushloop.collect.quality.checks import cell_is_blank, check_capture
+from brushloop.collect.quality.verdict import Failure
+from brushloop.collect.rig.config_quality import QualityConfig
 
 pytestmark = pytest.mark.xdist_group("quality")  # drawn once
 EACH, SOUND = 2, 10

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.board.rig_file import read_rig
-from calibrate.errors import CalibrationError
-from collect.errors import ConfigError
-from collect.protocols.config import load_protocol
-from collect.rig.config import load_rig
-from drivers.sim.brush_file import load_brush
-from drivers.sim.described import SimFileError
-from model.train.config import load_config
-from model.train.errors import TrainError
+from brushloop.calibrate.board.rig_file import read_rig
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import load_rig
+from brushloop.drivers.sim.brush_file import load_brush
+from brushloop.drivers.sim.described import SimFileError
+from brushloop.model.train.config import load_config
+from brushloop.model.train.errors import TrainError
 from tests.collect.rig.test_config import RIG
 
 DIGITS = "9" * 10_000

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from collect.errors import ConfigError
-from collect.planning.limit_check import check_protocol
-from collect.protocols.config import load_protocol
-from collect.rig.config import load_rig
-from collect.rig.config_devices import LimitsConfig, RobotConfig
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.planning.limit_check import check_protocol
+from brushloop.collect.protocols.config import load_protocol
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.config_devices import LimitsConfig, RobotConfig
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
 PROTOCOL = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from collect.errors import StepError
-from collect.rig.config import PaperConfig
-from collect.rig.paper import PaperPlane, fit_plane, to_base, to_paper
-from drivers.geometry import brush_pose, distance, lean
-from drivers.samples import Pose
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.paper import PaperPlane, fit_plane, to_base, to_paper
+from brushloop.drivers.geometry import brush_pose, distance, lean
+from brushloop.drivers.samples import Pose
 
 CORNERS = [(5.0, 5.0), (235.0, 5.0), (5.0, 165.0), (235.0, 165.0)]
 slopes = st.floats(-0.017, 0.017)  # 1 deg

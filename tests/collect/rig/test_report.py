@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from collect.rig.config import load_rig
-from collect.rig.doctor import Finding
-from collect.rig.report import write_report
-from collect.rig.scrub import numbers_only, scrubber_of
-from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.world import World
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.doctor import Finding
+from brushloop.collect.rig.report import write_report
+from brushloop.collect.rig.scrub import numbers_only, scrubber_of
+from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
 from tests.command import brushloop
 from tests.drivers.arcs.transcript import Archive
 

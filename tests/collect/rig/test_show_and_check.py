@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from tests.command import brushloop
 
 

@@ -11,18 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from collect.errors import ConfigError
-from collect.rig.config import RigConfig, load_rig
-from collect.rig.devices import sole_driver
-from drivers import exclusive as sole
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.devices import sole_driver
+from brushloop.drivers import exclusive as sole
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 
 HOLD = """
 import encodings.idna, os, sys, time
 from pathlib import Path
-from collect.rig.config import load_rig
-from collect.rig.devices import sole_driver
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import sole_driver
 rig = load_rig(Path(sys.argv[1]))
 if len(sys.argv) > 2:
     os.setuid(int(sys.argv[2]))

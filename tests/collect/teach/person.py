@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from collect.operator import Choice
-from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
-from drivers.force.rounds import Wrench
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
-from drivers.sim.rig import LoopbackRig
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
+from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.rig import LoopbackRig
 
 CORNERS = ("lower left", "lower right", "upper right", "upper left")
 PIN_MM = (330.0, 180.0, 160.0)

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from collect.errors import CollectAborted
-from collect.teach.day import Day
-from collect.teach.guide import LeftOff, Shown, StepState
-from collect.teach.steps.camera import CameraStep
-from collect.teach.store import Notebook, Taught, TaughtFile, now_utc
-from collect.teach.wizard import Wizard
-from drivers.clock import HostClock
-from drivers.errors import DeviceTimeout
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import LeftOff, Shown, StepState
+from brushloop.collect.teach.steps.camera import CameraStep
+from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
+from brushloop.collect.teach.wizard import Wizard
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import DeviceTimeout
 
 
 class Leaving:

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from collect.teach.arm_reader import Address, Cabinet, reading
-from collect.teach.day import Day
-from collect.teach.steps.arm import ArmStep
-from drivers.clock import HostClock
-from drivers.errors import ProtocolViolation
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig
-from drivers.sim.world import World
+from brushloop.collect.teach.arm_reader import Address, Cabinet, reading
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.steps.arm import ArmStep
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import World
 
 
 async def cabinet_that_answers(getter: str, answer: object) -> Cabinet:

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from collect.errors import CollectAborted
-from collect.operator import Choice
-from collect.teach.day import Day
-from collect.teach.guide import LeftOff, Shown, StepState, WentBack
-from collect.teach.steps import brush
-from collect.teach.steps.brush import BrushStep
-from collect.teach.steps.force import ForceStep
-from collect.teach.store import Taught, now_utc
-from collect.teach.wizard import Wizard
-from drivers.clock import HostClock
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import LeftOff, Shown, StepState, WentBack
+from brushloop.collect.teach.steps import brush
+from brushloop.collect.teach.steps.brush import BrushStep
+from brushloop.collect.teach.steps.force import ForceStep
+from brushloop.collect.teach.store import Taught, now_utc
+from brushloop.collect.teach.wizard import Wizard
+from brushloop.drivers.clock import HostClock
 
 TAUGHT = {
     "robot.tcp_offset_mm": [0.0, 0.0, 180.0],

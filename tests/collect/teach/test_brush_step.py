@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from collect.errors import CannotTeach
-from collect.teach.day import Day
-from collect.teach.steps.brush import STATION, BrushStep
-from drivers.clock import HostClock
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.steps.brush import STATION, BrushStep
+from brushloop.drivers.clock import HostClock
 
 
 class Enter:

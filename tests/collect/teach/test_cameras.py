@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from collect.teach.cameras import NUMBER_PX, TILE_PX, side_by_side
+from brushloop.collect.teach.cameras import NUMBER_PX, TILE_PX, side_by_side
 
 
 def test_a_picture_of_every_camera_is_shown_whatever_its_size() -> None:

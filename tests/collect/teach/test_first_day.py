@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from collect.rig.config import RigConfig, load_rig
-from collect.rig.doctor import Finding
-from collect.rig.paper import PaperPlane
-from collect.teach import cameras
-from collect.teach.day import Day
-from collect.teach.guide import Brought, Target
-from collect.teach.steps import proof
-from collect.teach.steps.proof import ProofStep, Proven, read_proof
-from collect.teach.store import Notebook, TaughtFile
-from collect.teach.wizard import Wizard
-from drivers.clock import Clock, HostClock
-from drivers.sim.lab.traps import Trap
+from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.doctor import Finding
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.teach import cameras
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Brought, Target
+from brushloop.collect.teach.steps import proof
+from brushloop.collect.teach.steps.proof import ProofStep, Proven, read_proof
+from brushloop.collect.teach.store import Notebook, TaughtFile
+from brushloop.collect.teach.wizard import Wizard
+from brushloop.drivers.clock import Clock, HostClock
+from brushloop.drivers.sim.lab.traps import Trap
 from tests.collect.teach.unknown import Errors, InLab, errors, first_day, in_lab, newest_session
 
 SMALL_PX = (800, 600)

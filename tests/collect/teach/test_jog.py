@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from collect.operator import Choice
-from collect.teach.day import Day
-from collect.teach.guide import Brought, JogStep, JogView, Shown, Target
-from collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S, touch
-from collect.teach.store import touch_of
-from collect.tui.teach_app import TeachApp
-from collect.tui.teach_guide import ScreenGuide
-from drivers.arcs.codes import RobotMode
-from drivers.clock import HostClock
-from drivers.geometry import brush_pose
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig
-from drivers.sim.world import World
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, Shown, Target
+from brushloop.collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S, touch
+from brushloop.collect.teach.store import touch_of
+from brushloop.collect.tui.teach_app import TeachApp
+from brushloop.collect.tui.teach_guide import ScreenGuide
+from brushloop.drivers.arcs.codes import RobotMode
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import World
 
 HOME_MM = (250.0, -230.0, 260.0)
 TIP = [0.0, 0.0, 180.0]

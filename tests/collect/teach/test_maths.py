@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calibrate.board.register import mixed_up, register
-from calibrate.board.spec import BoardSpec
-from calibrate.errors import CalibrationError
-from collect.errors import CannotTeach
-from collect.teach.maths.box import hull
-from collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
-from collect.teach.maths.tip import AxisFit, elsewhere, find_axis, find_tip, tip_of
-from drivers.samples import Pose
+from brushloop.calibrate.board.register import mixed_up, register
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.maths.box import hull
+from brushloop.collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
+from brushloop.collect.teach.maths.tip import AxisFit, elsewhere, find_axis, find_tip, tip_of
+from brushloop.drivers.samples import Pose
 
 BOARD = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
 PIN_MM = np.array([320.0, 150.0, 90.0])

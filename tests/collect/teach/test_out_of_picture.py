@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collect.errors import CannotTeach
-from collect.operator import Choice
-from collect.photograph.frames import Thumbnail
-from collect.teach.day import Day
-from collect.teach.guide import Shown
-from collect.teach.steps.places import VIEW, PlacesStep, text_of
-from collect.teach.store import touch_of
-from drivers.clock import HostClock
-from drivers.geometry import brush_pose
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig
-from drivers.sim.world import World
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.operator import Choice
+from brushloop.collect.photograph.frames import Thumbnail
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Shown
+from brushloop.collect.teach.steps.places import VIEW, PlacesStep, text_of
+from brushloop.collect.teach.store import touch_of
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import World
 
 PARK_MM, AWAY_MM, POT_MM = (250.0, -230.0, 260.0), (420.0, -260.0, 260.0), (300.0, 40.0, 121.0)
 

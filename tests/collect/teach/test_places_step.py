@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from collect.errors import CannotTeach
-from collect.teach.steps.places import PlacesStep, check_pot, check_wipe
-from collect.teach.store import Notebook, Taught, now_utc, touch_of
-from drivers.geometry import brush_pose
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.steps.places import PlacesStep, check_pot, check_wipe
+from brushloop.collect.teach.store import Notebook, Taught, now_utc, touch_of
+from brushloop.drivers.geometry import brush_pose
 
 WELL = (300.0, 40.0, 121.0)
 

@@ -8,16 +8,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from collect.errors import CannotTeach, ConfigError
-from collect.operator import Choice
-from collect.rig.config import load_rig
-from collect.teach.day import Day
-from collect.teach.guide import Shown
-from collect.teach.steps import proof
-from collect.teach.steps.proof import ProofStep, folder_beside, slowly
-from drivers.clock import HostClock
-from drivers.sim.config import SimConfig
-from drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.collect.errors import CannotTeach, ConfigError
+from brushloop.collect.operator import Choice
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Shown
+from brushloop.collect.teach.steps import proof
+from brushloop.collect.teach.steps.proof import ProofStep, folder_beside, slowly
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 
 
 def test_each_proof_is_recorded_in_a_new_folder_beside_the_rig(tmp_path: Path) -> None:

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.board.detect import find_board
-from calibrate.board.spec import BoardSpec, charuco_board, size_mm
-from collect.errors import CannotTeach
-from collect.teach.maths.sheet_seen import Margins, check_seen, seen_margins, touched_margins
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.spec import BoardSpec, charuco_board, size_mm
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.maths.sheet_seen import Margins, check_seen, seen_margins, touched_margins
 
 SPEC = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
 LAID = Margins(38.0, 27.0, 31.0, 35.0)

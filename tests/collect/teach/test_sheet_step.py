@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from collect.errors import CannotTeach
-from collect.teach.steps.sheet import BOARD, all_corners
-from collect.teach.store import Notebook, Taught, Value, now_utc, touch_of
-from drivers.geometry import brush_pose
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.teach.steps.sheet import BOARD, all_corners
+from brushloop.collect.teach.store import Notebook, Taught, Value, now_utc, touch_of
+from brushloop.drivers.geometry import brush_pose
 
 BOARD_MM = {"lower left": (0.0, 0.0), "lower right": (0.0, -312.0), "upper left": (240.0, 0.0)}
 """From its lower left corner along the base axes: the board is turned by -90 deg."""

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from collect.rig.plausible import brush_square
-from collect.teach.day import Day
-from collect.teach.guide import Brought, Target
-from collect.teach.steps.arm import ArmStep
-from collect.teach.steps.tip import TipStep
-from collect.teach.store import Notebook, touch_of
-from drivers.clock import HostClock
-from drivers.samples import Pose
-from drivers.sim.lab.seen import truth
+from brushloop.collect.rig.plausible import brush_square
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Brought, Target
+from brushloop.collect.teach.steps.arm import ArmStep
+from brushloop.collect.teach.steps.tip import TipStep
+from brushloop.collect.teach.store import Notebook, touch_of
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.lab.seen import truth
 from tests.collect.teach.person import leaning
 from tests.collect.teach.unknown import InLab, in_lab
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from collect.teach.day import Day
-from collect.teach.watch import watched
-from collect.tui.teach_guide import ScreenGuide
-from drivers.clock import HostClock
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig
-from drivers.sim.world import World
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.watch import watched
+from brushloop.collect.tui.teach_guide import ScreenGuide
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import World
 
 
 async def test_the_flange_is_shown_and_the_tip_once_it_is_taught(tmp_path: Path) -> None:

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from collect.errors import CollectAborted
-from collect.operator import Choice
-from collect.rig.config import load_rig
-from collect.rig.paper import to_base
-from collect.teach.day import Day
-from collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
-from collect.teach.wizard import Wizard
-from drivers.clock import HostClock
-from drivers.sim.lab.lab import UnknownLab
-from drivers.sim.lab.seen import Seen, truth
-from drivers.sim.lab.traps import Trap
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Choice
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.paper import to_base
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
+from brushloop.collect.teach.wizard import Wizard
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.lab.lab import UnknownLab
+from brushloop.drivers.sim.lab.seen import Seen, truth
+from brushloop.drivers.sim.lab.traps import Trap
 from tests.waiting import PATIENCE_S
 
 KIND = {"ink-station": "i", "modbus-pump": "p"}

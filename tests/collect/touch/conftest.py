@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from collect.motion.moves import photograph_moves
-from collect.motion.procedures import Procedures
-from collect.rig.config import load_rig
-from collect.rig.devices import Rig, limits_of
-from collect.touch.arm import ForceTap
-from drivers.geometry import brush_pose
-from drivers.samples import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
-from drivers.sim.camera.scene import Scene
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.world import World
+from brushloop.collect.motion.moves import photograph_moves
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.devices import Rig, limits_of
+from brushloop.collect.touch.arm import ForceTap
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
+from brushloop.drivers.sim.camera.scene import Scene
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
 
 SMALL_TABLE = Table(
     sheet_mm=(110.0, 80.0),

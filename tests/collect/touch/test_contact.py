@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from collect.errors import StepError
-from collect.touch.camera import first_ink
-from collect.touch.force import find_contact
+from brushloop.collect.errors import StepError
+from brushloop.collect.touch.camera import first_ink
+from brushloop.collect.touch.force import find_contact
 
 NOISE_N = 0.002
 

@@ -8,13 +8,13 @@ import sys
 import numpy as np
 import pytest
 
-from collect.errors import StepError
-from collect.rig.config_touch import ForceTouchConfig
-from collect.touch.force import Contact, Reading, touch_by_force
-from collect.touch.heights import SPAN_SIGMAS, Reach
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.contact import Reaction
-from drivers.sim.config import SimConfig
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config_touch import ForceTouchConfig
+from brushloop.collect.touch.force import Contact, Reading, touch_by_force
+from brushloop.collect.touch.heights import SPAN_SIGMAS, Reach
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.contact import Reaction
+from brushloop.drivers.sim.config import SimConfig
 
 NOISE_N = SimConfig().force_noise_n
 REACH = Reach(122.0, 120.0, 118.0)

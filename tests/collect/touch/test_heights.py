@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from collect.errors import StepError
-from collect.rig.config_touch import TouchConfig
-from collect.touch.heights import Touch, at_one_point
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.touch.heights import Touch, at_one_point
 
 
 @pytest.mark.parametrize(

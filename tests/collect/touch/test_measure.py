@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from collect.errors import NeedsOperator, StepError
-from collect.operator import Asker
-from collect.rig.config_touch import TouchConfig
-from collect.touch.heights import PlaneResult
-from collect.touch.measure import Jogged, asked, measure_plane
-from drivers.errors import MotionFailed
-from drivers.samples import Pose
+from brushloop.collect.errors import NeedsOperator, StepError
+from brushloop.collect.operator import Asker
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.touch.heights import PlaneResult
+from brushloop.collect.touch.measure import Jogged, asked, measure_plane
+from brushloop.drivers.errors import MotionFailed
+from brushloop.drivers.samples import Pose
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench

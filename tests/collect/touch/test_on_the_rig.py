@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from collect.motion.procedures import Procedures
-from collect.planning.walk import moves_of
-from collect.protocols.steps import Step, StepKind
-from collect.rig.config import load_rig
-from collect.rig.config_touch import TouchConfig
-from collect.rig.devices import connected
-from collect.rig.paper import PaperPlane
-from collect.touch.arm import ForceTap
-from collect.touch.measure import measure_plane
-from drivers.clock import HostClock
-from drivers.samples import Pose
-from drivers.sim.config import SimConfig, Table, View
-from drivers.sim.rig import LoopbackRig
+from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.planning.walk import moves_of
+from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.devices import connected
+from brushloop.collect.rig.paper import PaperPlane
+from brushloop.collect.touch.arm import ForceTap
+from brushloop.collect.touch.measure import measure_plane
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.rig import LoopbackRig
 from tests.collect.sent import not_checked, noting
 
 VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from collect.rig.config import PaperConfig
-from collect.rig.config_touch import TouchConfig
-from collect.rig.paper import Sheet
-from collect.touch.places import used_cells
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.paper import Sheet
+from brushloop.collect.touch.places import used_cells
 
 PAPER = PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(244.0, 172.0), touch_point_mm=(2.0, 2.0))
 SHEET = Sheet(PAPER)

@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from collect.errors import StepError
-from collect.rig.config import PaperConfig
-from collect.rig.config_touch import SelfCheckConfig
-from collect.rig.paper import PaperPlane, Sheet, to_base
-from collect.touch.selfcheck import (
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.config_touch import SelfCheckConfig
+from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
+from brushloop.collect.touch.selfcheck import (
     SelfCheck,
     Triangle,
     judge,
@@ -29,7 +29,7 @@ from collect.touch.selfcheck import (
     triangle_of,
     triangle_on,
 )
-from drivers.samples import Pose
+from brushloop.drivers.samples import Pose
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench

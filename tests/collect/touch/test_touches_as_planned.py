@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from collect.errors import ConfigError
-from collect.planning.limit_check import check_step
-from collect.planning.walk import moves_of
-from collect.protocols.steps import Step, StepKind
-from collect.rig.config import RigConfig
-from collect.rig.config_touch import TouchConfig
-from collect.rig.paper import PaperPlane, Sheet
-from collect.touch.measure import Jogged, measure_plane
-from collect.touch.selfcheck import partners, self_check, triangle_on
-from drivers.samples import Pose
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.planning.limit_check import check_step
+from brushloop.collect.planning.walk import moves_of
+from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config_touch import TouchConfig
+from brushloop.collect.rig.paper import PaperPlane, Sheet
+from brushloop.collect.touch.measure import Jogged, measure_plane
+from brushloop.collect.touch.selfcheck import partners, self_check, triangle_on
+from brushloop.drivers.samples import Pose
 from tests.collect.sent import lowest_mm, not_checked, not_sent
 
 if TYPE_CHECKING:

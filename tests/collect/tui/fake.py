@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from collect.engine.control import State
-from collect.engine.last_capture import LastCapture, published_mark
-from collect.engine.snapshot import CellCount, Fact, Mark, Picture, SetUpStep, SheetMap, Snapshot, Standing
-from collect.errors import CollectAborted
-from collect.operator import Choice, OperatorRequest, Prompt
-from collect.protocols.steps import StepKind
-from collect.quality.verdict import Check, Failure, Verdict
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.last_capture import LastCapture, published_mark
+from brushloop.collect.engine.snapshot import CellCount, Fact, Mark, Picture, SetUpStep, SheetMap, Snapshot, Standing
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Choice, OperatorRequest, Prompt
+from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.quality.verdict import Check, Failure, Verdict
 
 HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from collect.rig.doctor import Finding
-from collect.tui.browser import Paths, SessionBrowser
-from collect.tui.captures import CapturePictures, Review, ReviewCapture
-from collect.tui.pictures import Pictures
-from collect.tui.review_screen import ReviewScreen
-from sessions.remarks import Remark
-from sessions.show import Details, Sheet, Summary
+from brushloop.collect.rig.doctor import Finding
+from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.review_screen import ReviewScreen
+from brushloop.sessions.remarks import Remark
+from brushloop.sessions.show import Details, Sheet, Summary
 from tests.collect.tui.fake import blot
 
 FINDINGS = [

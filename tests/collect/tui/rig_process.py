@@ -11,10 +11,10 @@ import sys
 from pathlib import Path
 
 from bench.processes import lines_of_input, tell
-from drivers.arcs.codes import SafetyMode
-from drivers.sim.brush.flaws import Flaw
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import LoopbackRig
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
 
 MOST_PRESSES = 100
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=5.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from unittest.mock import patch
 
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console  # noqa: TID251
 from textual.app import App
 
 

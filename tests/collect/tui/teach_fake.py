@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from collect.errors import CollectAborted
-from collect.operator import Choice
-from collect.teach.guide import Brought, JogView, Shown, StepState, Target
-from collect.tui.teach_app import TeachApp
-from collect.tui.teach_guide import ScreenGuide
-from drivers.geometry import brush_pose
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Choice
+from brushloop.collect.teach.guide import Brought, JogView, Shown, StepState, Target
+from brushloop.collect.tui.teach_app import TeachApp
+from brushloop.collect.tui.teach_guide import ScreenGuide
+from brushloop.drivers.geometry import brush_pose
 
 STEPS = (
     StepState("arm", "Find the arm", 3, "taught", "192.0.2.7:30004"),

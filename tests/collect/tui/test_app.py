@@ -13,16 +13,16 @@ from textual.pilot import Pilot
 from textual.widget import Widget
 from textual.widgets import Static
 
-from collect.engine.control import FINAL, State
-from collect.errors import ConfigError
-from collect.operator import OperatorRequest
-from collect.tui.app import OperatorApp
-from collect.tui.keys import RUN_KEYS
-from collect.tui.question_screens import Confirm
-from collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT
-from collect.tui.text import SOFTWARE_STOP
-from collect.tui.themes import LIGHT
-from collect.tui.widgets import HelpScreen, Line
+from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.operator import OperatorRequest
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.keys import RUN_KEYS
+from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT
+from brushloop.collect.tui.text import SOFTWARE_STOP
+from brushloop.collect.tui.themes import LIGHT
+from brushloop.collect.tui.widgets import HelpScreen, Line
 from tests.collect.tui.fake import (
     DONE,
     ERROR,

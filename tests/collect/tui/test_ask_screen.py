@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from collect.engine.control import State
-from collect.operator import Choice, Prompt
-from collect.tui.app import OperatorApp
-from collect.tui.question_screens import AskScreen, Confirm
-from collect.tui.set_up_screen import SetUpScreen
+from brushloop.collect.engine.control import State
+from brushloop.collect.operator import Choice, Prompt
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.question_screens import AskScreen, Confirm
+from brushloop.collect.tui.set_up_screen import SetUpScreen
 from tests.collect.tui.fake import SET_UP, SPLIT, TOUCHED, FakeEngine, picture
 from tests.collect.tui.screen_text import has_picture
 from tests.collect.tui.test_app import look

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collect.tui.app import OperatorApp
-from collect.tui.end_screen import EndScreen, alike_text, contact_sheet
-from collect.tui.finish_screen import FinishScreen
-from sessions.repair.verify import Verdict
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.end_screen import EndScreen, alike_text, contact_sheet
+from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.sessions.repair.verify import Verdict
 from tests.collect.tui.fake import DONE, FakeEngine, marked_grid, picture
 from tests.collect.tui.fake_browser import FakeReview
 from tests.collect.tui.screen_text import has_picture
@@ -19,8 +19,8 @@ from tests.collect.tui.test_app import look
 
 
 async def test_a_finished_session_is_shown_on_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("collect.tui.captures.Review", lambda folder: FakeReview(folder.parent))
-    monkeypatch.setattr("collect.tui.finish_screen.verify", lambda _folder: Verdict("s", "closed"))
+    monkeypatch.setattr("brushloop.collect.tui.captures.Review", lambda folder: FakeReview(folder.parent))
+    monkeypatch.setattr("brushloop.collect.tui.finish_screen.verify", lambda _folder: Verdict("s", "closed"))
     folder = str(tmp_path / "2026-11-21-grid-01")
     engine = FakeEngine(picture(folder=folder))
     app = OperatorApp(engine, again=lambda _session_id: engine)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collect.engine.snapshot import CellCount
-from collect.tui.panes import BAD, COMPLETE, LEFT_OUT, NEXT, NOW, grid_content
+from brushloop.collect.engine.snapshot import CellCount
+from brushloop.collect.tui.panes import BAD, COMPLETE, LEFT_OUT, NEXT, NOW, grid_content
 from tests.collect.tui.fake import grid_of, marked_grid
 
 

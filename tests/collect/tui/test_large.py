@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from collect.quality.verdict import Check, Failure
-from collect.tui.app import OperatorApp
-from collect.tui.capture_screen import CaptureScreen, words_content
-from collect.tui.large import difference, limit_text, of_last, over_photograph
-from collect.tui.run_screen import RunScreen
-from collect.tui.text import age_text
-from collect.tui.widgets import KeyBar
+from brushloop.collect.quality.verdict import Check, Failure
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.capture_screen import CaptureScreen, words_content
+from brushloop.collect.tui.large import difference, limit_text, of_last, over_photograph
+from brushloop.collect.tui.run_screen import RunScreen
+from brushloop.collect.tui.text import age_text
+from brushloop.collect.tui.widgets import KeyBar
 from tests.collect.tui.fake import FakeEngine, capture, full_picture
 from tests.collect.tui.screen_text import has_picture
 from tests.collect.tui.test_app import look

@@ -9,11 +9,11 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input
 
-from collect.engine.control import State
-from collect.tui.app import OperatorApp
-from collect.tui.finish_screen import FinishScreen
-from collect.tui.themes import LIGHT, SAFE
-from sessions.repair.verify import Verdict
+from brushloop.collect.engine.control import State
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.collect.tui.themes import LIGHT, SAFE
+from brushloop.sessions.repair.verify import Verdict
 from tests.collect.tui.fake import (
     DONE,
     FAILED,
@@ -110,7 +110,7 @@ def test_without_a_run(snap_compare: Callable[..., bool], tmp_path: Path, name: 
 @pytest.mark.parametrize("size", SIZES)
 def test_the_end_of_a_session(snap_compare: Callable[..., bool], monkeypatch: pytest.MonkeyPatch, size: str) -> None:
     sound = Verdict("2026-11-21-grid-01", "closed", files=44, strokes=12, messages=22528)
-    monkeypatch.setattr("collect.tui.finish_screen.verify", lambda _folder: sound)
+    monkeypatch.setattr("brushloop.collect.tui.finish_screen.verify", lambda _folder: sound)
     app = OperatorApp(browser=FakeBrowser(), now_s=lambda: 1010.0)
 
     async def finish(pilot: Pilot[None]) -> None:

@@ -11,10 +11,10 @@ import signal
 import pytest
 from textual.pilot import Pilot
 
-from collect.errors import CollectAborted
-from collect.tui.app import OperatorApp
-from collect.tui.runner import ScreenCrashed, run_screen
-from collect.tui.terminal import TerminalDriver, _LostWrites
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.runner import ScreenCrashed, run_screen
+from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
 from tests.collect.tui.fake import FakeEngine, picture
 
 

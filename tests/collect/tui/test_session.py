@@ -12,21 +12,21 @@ import pytest
 from textual.pilot import Pilot
 
 from bench.processes import Process, started
-from collect.engine.control import State
-from collect.engine.snapshot import Snapshot
-from collect.start import engine_for
-from collect.tui.app import OperatorApp
-from collect.tui.browser import Paths, SessionBrowser
-from collect.tui.end_screen import EndScreen
-from collect.tui.finish_screen import FinishScreen
-from collect.tui.question_screens import AskScreen
-from collect.tui.review_screen import ReviewScreen
-from collect.tui.run_screen import RunScreen
-from collect.tui.set_up_screen import SetUpScreen
-from collect.tui.start_screen import StartScreen
-from sessions.reader import Recording
-from sessions.remarks import remarks_of
-from sessions.repair.verify import verify_session
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.start import engine_for
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.end_screen import EndScreen
+from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.review_screen import ReviewScreen
+from brushloop.collect.tui.run_screen import RunScreen
+from brushloop.collect.tui.set_up_screen import SetUpScreen
+from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.sessions.reader import Recording
+from brushloop.sessions.remarks import remarks_of
+from brushloop.sessions.repair.verify import verify_session
 from tests.collect.tui.screen_text import has_picture, shown
 from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S

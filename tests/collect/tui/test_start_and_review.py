@@ -15,18 +15,18 @@ from textual.app import App
 from textual.geometry import Size
 from textual.pilot import Pilot
 
-from collect.errors import ConfigError
-from collect.tui.app import OperatorApp
-from collect.tui.capture_screen import CaptureScreen
-from collect.tui.dots import Cells
-from collect.tui.finish_screen import FinishScreen, run_command, verdict_content
-from collect.tui.force_text import force_bar, plot, plot_title, scale_n, spark
-from collect.tui.levels import Coloured
-from collect.tui.pictures import CellPicture, ImagePicture, Pictures
-from collect.tui.question_screens import Confirm
-from collect.tui.start_screen import StartScreen
-from sessions.remarks import remarks_of
-from sessions.repair.verify import Finding, Verdict
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.capture_screen import CaptureScreen
+from brushloop.collect.tui.dots import Cells
+from brushloop.collect.tui.finish_screen import FinishScreen, run_command, verdict_content
+from brushloop.collect.tui.force_text import force_bar, plot, plot_title, scale_n, spark
+from brushloop.collect.tui.levels import Coloured
+from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
+from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.sessions.remarks import remarks_of
+from brushloop.sessions.repair.verify import Finding, Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.screen_text import has_picture, shown
@@ -217,8 +217,10 @@ async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monke
         on_line("captures: 3 of 30, about 5 s left")
         return 0, "\n".join(f"line {n}" for n in range(30))
 
-    monkeypatch.setattr("collect.tui.finish_screen.run_command", command)
-    monkeypatch.setattr("collect.tui.finish_screen.verify", lambda _folder: Verdict("s", "closed", files=3, strokes=2))
+    monkeypatch.setattr("brushloop.collect.tui.finish_screen.run_command", command)
+    monkeypatch.setattr(
+        "brushloop.collect.tui.finish_screen.verify", lambda _folder: Verdict("s", "closed", files=3, strokes=2)
+    )
     app = OperatorApp(browser=FakeBrowser())
     async with app.run_test(size=(120, 40)) as pilot:
         await ready(app, pilot)

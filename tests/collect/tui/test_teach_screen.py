@@ -12,11 +12,11 @@ from contextlib import asynccontextmanager
 import pytest
 from textual.pilot import Pilot
 
-from collect.errors import CollectAborted
-from collect.teach.guide import Brought, JogStep, LeftOff, WentBack
-from collect.tui.question_screens import Confirm
-from collect.tui.teach_app import TeachApp
-from collect.tui.teach_guide import Teaching
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.teach.guide import Brought, JogStep, LeftOff, WentBack
+from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.teach_app import TeachApp
+from brushloop.collect.tui.teach_guide import Teaching
 from tests.collect.tui.screen_text import shown
 from tests.collect.tui.teach_fake import Asking, app_of
 from tests.waiting import PATIENCE_S

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from collect.tui.app import OperatorApp
-from collect.tui.themes import DARK, LIGHT, SAFE, chosen, chosen_file, keep
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.themes import DARK, LIGHT, SAFE, chosen, chosen_file, keep
 from tests.collect.tui.fake import FakeEngine, picture
 
 

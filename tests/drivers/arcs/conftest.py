@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.arcs import stopping
+from brushloop.drivers.arcs import stopping
 
 
 @pytest.fixture(autouse=True)

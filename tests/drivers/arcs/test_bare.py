@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.arcs.framing import MAX_DEPTH, BareDecoder
-from drivers.arcs.rpc import encode_bare_request
-from drivers.errors import ProtocolViolation
+from brushloop.drivers.arcs.framing import MAX_DEPTH, BareDecoder
+from brushloop.drivers.arcs.rpc import encode_bare_request
+from brushloop.drivers.errors import ProtocolViolation
 
 scalars = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text())
 values = st.recursive(scalars, lambda v: st.lists(v, max_size=4) | st.dictionaries(st.text(), v, max_size=4))

@@ -11,13 +11,13 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from drivers.arcs.codes import RobotMode
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rpc import Framing
-from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, NotPowered, RobotNotSafe, RpcError
-from drivers.geometry import brush_pose, distance
-from drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.arcs.codes import RobotMode
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.rpc import Framing
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ConnectionLost, NotPowered, RobotNotSafe, RpcError
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.sim.arcs.server import ArcsServer
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 FAR = brush_pose(250.0, -30.0, 260.0)

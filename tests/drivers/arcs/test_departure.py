@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rpc import RpcConnection
-from drivers.arcs.settings import TOOL_OFFSET, require_same
-from drivers.arcs.waiting import Tolerance, until_settled
-from drivers.errors import ArmMoved, LimitExceeded, NotPowered, RobotNotSafe, SettingsChanged
-from drivers.geometry import brush_pose, distance
-from drivers.samples import Pose
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.rig import HOST
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.settings import TOOL_OFFSET, require_same
+from brushloop.drivers.arcs.waiting import Tolerance, until_settled
+from brushloop.drivers.errors import ArmMoved, LimitExceeded, NotPowered, RobotNotSafe, SettingsChanged
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.rig import HOST
 
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 ABOVE, LOW = brush_pose(300.0, -200.0, 200.0), brush_pose(300.0, -200.0, 130.0)

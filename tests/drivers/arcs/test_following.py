@@ -9,15 +9,22 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.arcs import queueing
-from drivers.arcs.codes import QueueFull
-from drivers.arcs.queueing import legs_of
-from drivers.arcs.robot import AuboArcs
-from drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRefused, ProtocolViolation, RobotNotSafe
-from drivers.geometry import brush_pose, distance
-from drivers.limits import Limits
-from drivers.samples import Pose
-from drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.arcs import queueing
+from brushloop.drivers.arcs.codes import QueueFull
+from brushloop.drivers.arcs.queueing import legs_of
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.errors import (
+    ConnectionLost,
+    LimitExceeded,
+    MotionFailed,
+    MotionRefused,
+    ProtocolViolation,
+    RobotNotSafe,
+)
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arcs.server import ArcsServer
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}
 SLOW = {**WAY, "speed_mm_s": 3.0}

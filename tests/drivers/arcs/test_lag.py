@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from drivers.arcs.lag import LagMeter
-from drivers.geometry import brush_pose
-from drivers.samples import Pose, PoseSample, Stamp
+from brushloop.drivers.arcs.lag import LagMeter
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose, PoseSample, Stamp
 
 Path = Callable[[float], Pose]
 

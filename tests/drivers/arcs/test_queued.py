@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.robot import AuboArcs
-from drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRefused
-from drivers.geometry import brush_pose, distance
-from drivers.samples import Pose, QueuedLine
-from drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRefused
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.samples import Pose, QueuedLine
+from brushloop.drivers.sim.arcs.server import ArcsServer
 from tests.drivers.muting import mute
 
 HOME = brush_pose(250.0, -230.0, 260.0)

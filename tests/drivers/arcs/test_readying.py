@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.codes import OutOfReach, QueueFull, RobotMode, SafetyMode, WrongOperationalMode
-from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.clock import HostClock
-from drivers.errors import MotionFailed, MotionRefused, RpcError
-from drivers.geometry import brush_pose, distance, from_wire, lean
-from drivers.limits import Limits
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.arm.kinematics import forward, pose_of
-from drivers.sim.rig import HOST
+from brushloop.drivers.arcs.codes import OutOfReach, QueueFull, RobotMode, SafetyMode, WrongOperationalMode
+from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import MotionFailed, MotionRefused, RpcError
+from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arm.kinematics import forward, pose_of
+from brushloop.drivers.sim.rig import HOST
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 BEYOND = brush_pose(900.0, 0.0, 250.0)

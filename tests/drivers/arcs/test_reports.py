@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.arcs.robot import ArcsOptions, AuboArcs
-from drivers.arcs.survey import survey
-from drivers.clock import HostClock
-from drivers.limits import Limits
+from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.arcs.survey import survey
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.limits import Limits
 from tests.drivers.arcs.transcript import AnsweringByName, Archive, following, serving
 
 REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))

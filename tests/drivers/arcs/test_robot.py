@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.arcs import robot as robot_module
-from drivers.arcs.codes import RobotMode, SafetyMode
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.waiting import planned_s
-from drivers.errors import (
+from brushloop.drivers.arcs import robot as robot_module
+from brushloop.drivers.arcs.codes import RobotMode, SafetyMode
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.waiting import planned_s
+from brushloop.drivers.errors import (
     ConnectionLost,
     LimitExceeded,
     MotionFailed,
@@ -24,11 +24,11 @@ from drivers.errors import (
     Stale,
     WrongGeneration,
 )
-from drivers.geometry import brush_pose, distance
-from drivers.limits import Limits
-from drivers.protocols import Robot
-from drivers.samples import Pose, PoseSample
-from drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.protocols import Robot
+from brushloop.drivers.samples import Pose, PoseSample
+from brushloop.drivers.sim.arcs.server import ArcsServer
 from tests.drivers.muting import mute
 
 NEAR = brush_pose(260.0, -220.0, 250.0)

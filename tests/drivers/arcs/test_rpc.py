@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.arcs.framing import encode
-from drivers.arcs.rpc import RpcConnection
-from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
+from brushloop.drivers.arcs.framing import encode
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
 from tests.drivers.arcs.transcript import Answer, Controller, following, hang_up, nothing, reply, result, sends
 
 TIMEOUT_S = 0.5

@@ -14,21 +14,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.arcs import telemetry
-from drivers.arcs.framing import FrameDecoder, encode, encode_short
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rtde import PING, RtdeStream, decode_message, encode_sample, encode_topic, outputs_of
-from drivers.arcs.settings import ArcsOptions
-from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, Stale
-from drivers.geometry import brush_pose, distance
-from drivers.limits import Limits
-from drivers.samples import PoseSample, QueuedLine
-from drivers.sim.arcs.rtde_server import RtdeServer
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from drivers.sim.rig import HOST
-from drivers.sim.server import LoopbackServer
+from brushloop.drivers.arcs import telemetry
+from brushloop.drivers.arcs.framing import FrameDecoder, encode, encode_short
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.rtde import PING, RtdeStream, decode_message, encode_sample, encode_topic, outputs_of
+from brushloop.drivers.arcs.settings import ArcsOptions
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, Stale
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import PoseSample, QueuedLine
+from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.rig import HOST
+from brushloop.drivers.sim.server import LoopbackServer
 from tests.drivers.muting import mute
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'

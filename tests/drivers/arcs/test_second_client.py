@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rpc import RpcConnection
-from drivers.errors import PathDisturbed
-from drivers.geometry import brush_pose
-from drivers.samples import Pose, QueuedLine
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.rig import HOST
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.errors import PathDisturbed
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose, QueuedLine
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.rig import HOST
 
 X_MM, Y_MM, PAPER_Z_MM = 250.0, -230.0, 220.0
 TOP, DEEP = brush_pose(X_MM, Y_MM, 300.0), brush_pose(X_MM, Y_MM, 200.0)

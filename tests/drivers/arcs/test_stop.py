@@ -7,11 +7,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.arcs import stopping
-from drivers.arcs.robot import AuboArcs
-from drivers.errors import ConnectionLost, DeviceTimeout, MotionError
-from drivers.geometry import brush_pose, distance
-from drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.arcs import stopping
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, MotionError
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.sim.arcs.server import ArcsServer
 from tests.drivers.muting import mute, mute_to
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock

@@ -7,13 +7,13 @@ import asyncio
 
 import pytest
 
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.rpc import RpcConnection
-from drivers.errors import DeviceTimeout, MotionFailed, RobotNotSafe
-from drivers.geometry import brush_pose
-from drivers.samples import QueuedLine
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.errors import DeviceTimeout, MotionFailed, RobotNotSafe
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import QueuedLine
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
 from tests.waiting import PATIENCE_S
 
 TOP_Z_MM, DEEP_Z_MM = 300.0, 200.0

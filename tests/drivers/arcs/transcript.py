@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
-from drivers.arcs.rpc import Framing, encode_bare_request, encode_request
+from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode
+from brushloop.drivers.arcs.rpc import Framing, encode_bare_request, encode_request
 
 Answer = Callable[[str, asyncio.StreamWriter], Awaitable[None]]
 Line = tuple[str, dict[str, Any] | None, Answer]

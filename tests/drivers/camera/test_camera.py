@@ -10,16 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from drivers.camera import CameraOptions, OpenCvCamera, opencv
-from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
-from drivers.protocols import Camera
-from drivers.samples import Frame, Stamp
-from drivers.sim.camera.mjpeg_server import MjpegServer
-from drivers.sim.camera.scene import Scene, read_strip
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import HOST
-from drivers.sim.world import World
+from brushloop.drivers.camera import CameraOptions, OpenCvCamera, opencv
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
+from brushloop.drivers.protocols import Camera
+from brushloop.drivers.samples import Frame, Stamp
+from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
+from brushloop.drivers.sim.camera.scene import Scene, read_strip
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import HOST
+from brushloop.drivers.sim.world import World
 from tests.waiting import PATIENCE_S
 
 CLOCK = HostClock()

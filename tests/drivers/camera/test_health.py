@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.camera import CameraOptions, Locked, OpenCvCamera
-from drivers.camera.health import Fault, FrameHealth
-from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
-from drivers.samples import Stamp
+from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera
+from brushloop.drivers.camera.health import Fault, FrameHealth
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
+from brushloop.drivers.samples import Stamp
 
 CLOCK = HostClock()
 PERIOD = 100_000_000

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.force.rounds import RoundAssembler, Wrench, encode_round
+from brushloop.drivers.force.rounds import RoundAssembler, Wrench, encode_round
 
 THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)
 SOME = settings(max_examples=100, deadline=None)

@@ -13,13 +13,21 @@ import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 
-from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, LimitExceeded, NotConnected, Stale, Stuck
-from drivers.force.rounds import Wrench, encode_round
-from drivers.force.sri_m8123 import SriM8123, SriOptions
-from drivers.protocols import ForceSensor
-from drivers.samples import ForceSample
-from drivers.sim.faults.kinds import ForceFault
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    LimitExceeded,
+    NotConnected,
+    Stale,
+    Stuck,
+)
+from brushloop.drivers.force.rounds import Wrench, encode_round
+from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.protocols import ForceSensor
+from brushloop.drivers.samples import ForceSample
+from brushloop.drivers.sim.faults.kinds import ForceFault
 from tests.drivers.force.virtual_board import SimForceSensor
 
 WRENCH: Wrench = (1.0, -2.0, 3.5, 0.25, -0.5, 0.125)
@@ -353,13 +361,13 @@ async def test_where_too_few_rounds_came_a_bias_averages_longer(sensor: SriM8123
 
 
 async def test_a_bias_from_too_few_rounds_is_refused(sensor: SriM8123, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("drivers.force.sri_m8123.MORE_BIAS_S", 0.0)
+    monkeypatch.setattr("brushloop.drivers.force.sri_m8123.MORE_BIAS_S", 0.0)
     with pytest.raises(DeviceTimeout, match="10 are needed"):
         await sensor.bias(0.02)
 
 
 async def test_a_bias_over_silence_is_refused(board: SimForceSensor, sensor: SriM8123, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("drivers.force.sri_m8123.MORE_BIAS_S", 0.0)
+    monkeypatch.setattr("brushloop.drivers.force.sri_m8123.MORE_BIAS_S", 0.0)
     board.fail(*[ForceFault.SILENCE] * 60)
     with pytest.raises(Stale):
         await sensor.bias(0.4)

@@ -14,9 +14,9 @@ from typing import Self
 
 import can
 
-from drivers.force.rounds import Wrench
-from drivers.sim.faults.kinds import ForceFault
-from drivers.sim.instruments.force_board import CanFrame, ForceBoard
+from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.sim.faults.kinds import ForceFault
+from brushloop.drivers.sim.instruments.force_board import CanFrame, ForceBoard
 from tests.drivers.failing import fail_rounds
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolViolation
+from brushloop.drivers.errors import ProtocolViolation
 
 LEAST_INPUTS = 10_000
 """For each decoder, every time the suite runs."""

@@ -9,10 +9,10 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.rpc import RpcConnection
-from drivers.arcs.waiting import Messages
-from drivers.errors import DeviceError, MotionFailed, RpcError
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.waiting import Messages
+from brushloop.drivers.errors import DeviceError, MotionFailed, RpcError
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, mutated, noise, truncated
 
 SAID = [

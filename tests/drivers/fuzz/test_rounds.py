@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.force.rounds import FIRST_ID, RoundAssembler, encode_round
+from brushloop.drivers.force.rounds import FIRST_ID, RoundAssembler, encode_round
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS
 
 Frame = tuple[int, bytes, float]

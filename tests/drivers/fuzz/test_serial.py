@@ -10,9 +10,9 @@ from typing import TypeVar
 import pytest
 from hypothesis import given
 
-from drivers.errors import ProtocolViolation
-from drivers.ink import modbus
-from drivers.ink import station as line
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.ink import modbus
+from brushloop.drivers.ink import station as line
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, bytewise, mutated, noise, pieces, truncated
 
 T = TypeVar("T")

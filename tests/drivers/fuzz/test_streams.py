@@ -10,9 +10,9 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 
-from drivers.arcs.framing import BareDecoder, FrameDecoder, encode, encode_short
-from drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, encode_sample
-from drivers.errors import ProtocolViolation
+from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode, encode_short
+from brushloop.drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, encode_sample
+from brushloop.drivers.errors import ProtocolViolation
 from tests.drivers.fuzz.inputs import (
     EXAMPLES,
     LEAST_INPUTS,

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolViolation
-from drivers.ink.modbus import exception, find_reply, read_write, seal, unseal, write_register
-from drivers.sim.instruments.modbus_pump import PumpFirmware
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.ink.modbus import exception, find_reply, read_write, seal, unseal, write_register
+from brushloop.drivers.sim.instruments.modbus_pump import PumpFirmware
 
 THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)
 SOME = settings(max_examples=100, deadline=None)

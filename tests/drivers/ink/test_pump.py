@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
-from drivers.clock import HostClock
-from drivers.errors import (
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
@@ -18,12 +18,12 @@ from drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
-from drivers.ink.port import InkRefused
-from drivers.ink.pump import ModbusPump, PumpOptions
-from drivers.protocols import Ink
-from drivers.sim.faults.kinds import InkFault
-from drivers.sim.instruments.ink_station import PtyLine
-from drivers.sim.instruments.modbus_pump import PumpFirmware
+from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.ink.pump import ModbusPump, PumpOptions
+from brushloop.drivers.protocols import Ink
+from brushloop.drivers.sim.faults.kinds import InkFault
+from brushloop.drivers.sim.instruments.ink_station import PtyLine
+from brushloop.drivers.sim.instruments.modbus_pump import PumpFirmware
 from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3
@@ -237,7 +237,7 @@ async def test_a_host_that_was_held_up_reports_the_excess(
         time.sleep(0.25)  # the fault under test
 
     with monkeypatch.context() as holding_up:
-        holding_up.setattr("drivers.ink.pump.asyncio.sleep", sleep_and_be_held_up)
+        holding_up.setattr("brushloop.drivers.ink.pump.asyncio.sleep", sleep_and_be_held_up)
         with pytest.raises(DeviceError, match=r"instead of 0.10 s\. About .* too much.*is stopped"):
             await pump.dose(0.01)
     assert ran == [True]

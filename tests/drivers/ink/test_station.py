@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.clock import HostClock
-from drivers.errors import (
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
@@ -18,11 +18,11 @@ from drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
-from drivers.ink.port import InkRefused
-from drivers.ink.station import InkStation, StationOptions, seal, unseal
-from drivers.protocols import Ink
-from drivers.sim.faults.kinds import InkFault
-from drivers.sim.instruments.ink_station import PtyLine, StationFirmware
+from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.ink.station import InkStation, StationOptions, seal, unseal
+from brushloop.drivers.protocols import Ink
+from brushloop.drivers.sim.faults.kinds import InkFault
+from brushloop.drivers.sim.instruments.ink_station import PtyLine, StationFirmware
 from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.errors import DeviceTimeout
-from drivers.ink.port import SerialPort, SerialSettings
+from brushloop.drivers.errors import DeviceTimeout
+from brushloop.drivers.ink.port import SerialPort, SerialSettings
 
 
 async def ask(path: str, request: bytes) -> bytes:

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from drivers.geometry import distance, to_wire
-from drivers.samples import Pose
-from drivers.sim.arcs.cabinet import Cabinet
-from drivers.sim.arcs.methods import methods
-from drivers.sim.config import SimConfig
-from drivers.sim.world import World
+from brushloop.drivers.geometry import distance, to_wire
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arcs.cabinet import Cabinet
+from brushloop.drivers.sim.arcs.methods import methods
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import World
 
 TOOL = [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
 CABINETS_OWN = ("RuntimeMachine", "RegisterControl", "SystemInfo")

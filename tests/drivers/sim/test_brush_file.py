@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import brushloop
+import brushloop.__main__
 from bench.brushfit_brushes import FROZEN
-from collect.rig.config_quality import QualityConfig
-from drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from drivers.sim.brush_file import LOOPBACK, PAPER, load_brush
-from drivers.sim.config import SimConfig
-from drivers.sim.described import SimFileError
-from drivers.sim.rig_toml import Addresses, rig_toml
-from drivers.sim.serve import LabRefused
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
+from brushloop.drivers.sim.brush_file import LOOPBACK, PAPER, load_brush
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.described import SimFileError
+from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.serve import LabRefused
 
 PRESSED = (
     (3986.908, 3129.639, 3100.391),
@@ -116,13 +116,13 @@ def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -
     path = written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nradius_mm = 5.0\nlength_mm = 45.0\n')
     rig = tmp_path / "rig.toml"
     words = ["sim", "--brush", str(path), "--write-rig", str(rig), "--idle-exit", "0.1"]
-    assert CliRunner().invoke(brushloop.app, words).exit_code == 0
+    assert CliRunner().invoke(brushloop.__main__.app, words).exit_code == 0
     brush = tomllib.loads(rig.read_text())["brush"]
     assert (brush["name"], brush["radius_mm"], brush["length_mm"]) == ("our goat-hair brush", 5.0, 45.0)
 
 
 def test_a_lab_that_nobody_has_measured_has_a_brush_of_its_own(tmp_path: Path) -> None:
-    ran = CliRunner().invoke(brushloop.app, ["sim", "--unknown", "1", "--brush", str(tmp_path / "brush.toml")])
+    ran = CliRunner().invoke(brushloop.__main__.app, ["sim", "--unknown", "1", "--brush", str(tmp_path / "brush.toml")])
     assert isinstance(ran.exception, LabRefused)
 
 

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START
-from drivers.sim.instruments.force_board import FRAME_S, ForceBoard, SocketcandServer
+from brushloop.drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START
+from brushloop.drivers.sim.instruments.force_board import FRAME_S, ForceBoard, SocketcandServer
 
 
 async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatch: pytest.MonkeyPatch) -> None:

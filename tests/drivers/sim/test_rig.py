@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from drivers.arcs.framing import FrameDecoder, encode
-from drivers.camera import CameraOptions, OpenCvCamera
-from drivers.clock import HostClock
-from drivers.samples import Stamp
-from drivers.sim import rig as rig_module
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import HOST, LoopbackRig
-from drivers.sim.serve import serve
+from brushloop.drivers.arcs.framing import FrameDecoder, encode
+from brushloop.drivers.camera import CameraOptions, OpenCvCamera
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.samples import Stamp
+from brushloop.drivers.sim import rig as rig_module
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.sim.serve import serve
 
 
 @pytest.fixture

@@ -6,15 +6,15 @@ import asyncio
 
 import pytest
 
-from drivers.sim.arcs.rtde_server import RtdeServer
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.camera.mjpeg_server import MjpegServer
-from drivers.sim.config import SimConfig
-from drivers.sim.control import ControlServer
-from drivers.sim.instruments.force_board import SocketcandServer
-from drivers.sim.lab.lab import OlderSoftware
-from drivers.sim.server import LoopbackServer, NotLoopback
-from drivers.sim.world import World
+from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.control import ControlServer
+from brushloop.drivers.sim.instruments.force_board import SocketcandServer
+from brushloop.drivers.sim.lab.lab import OlderSoftware
+from brushloop.drivers.sim.server import LoopbackServer, NotLoopback
+from brushloop.drivers.sim.world import World
 
 ELSEWHERE = ["0.0.0.0", "::", "", "192.168.1.10", "10.0.0.1", "8.8.8.8", "example.org", "localhost", "fe80::1"]
 

@@ -8,12 +8,12 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
-from drivers.sim.brush.drag import INK_PER_MM
-from drivers.sim.brush.flaws import Flaw
-from drivers.sim.config import SimConfig, Table
-from drivers.sim.world import INK_PER_PRESS, Press, World
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.brush.drag import INK_PER_MM
+from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.sim.config import SimConfig, Table
+from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World
 
 TABLE = Table()
 SAFE_Z = TABLE.paper_z_mm + 40.0

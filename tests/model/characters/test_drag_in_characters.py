@@ -7,14 +7,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from model.brush import Brush
-from model.characters.brush import Reach, dragged_depth_of
-from model.characters.drag import dragged, trail
-from model.characters.ink import swept, written
-from model.characters.plan import Cell, Path, grid, trajectory, without_tilt
-from model.characters.refine import refine
-from model.drag import DragModel, distances, trails
-from model.strokes import stroke_model
+from brushloop.model.brush import Brush
+from brushloop.model.characters.brush import Reach, dragged_depth_of
+from brushloop.model.characters.drag import dragged, trail
+from brushloop.model.characters.ink import swept, written
+from brushloop.model.characters.plan import Cell, Path, grid, trajectory, without_tilt
+from brushloop.model.characters.refine import refine
+from brushloop.model.drag import DragModel, distances, trails
+from brushloop.model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
 SIDE_MM, SIZE = 60.0, 96

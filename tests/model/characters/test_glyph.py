@@ -10,16 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.characters.glyph import GlyphError, parse_glyph, parse_path
-from model.characters.hand import parse_csv, parse_json
-from model.characters.ink import reference
-from model.characters.plan import Cell, distance_to, paths_of, resampled, tangents
+from brushloop.model.characters.glyph import GlyphError, parse_glyph, parse_path
+from brushloop.model.characters.hand import parse_csv, parse_json
+from brushloop.model.characters.ink import reference
+from brushloop.model.characters.plan import Cell, distance_to, paths_of, resampled, tangents
 
 SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"
 
 
 def shipped(name: str) -> str:
-    return (files("model.characters") / "data" / f"{name}.json").read_text("utf-8")
+    return (files("brushloop.model.characters") / "data" / f"{name}.json").read_text("utf-8")
 
 
 def glyph_text(**changes: object) -> str:
@@ -36,7 +36,7 @@ def test_the_shipped_characters_can_be_read(name: str, strokes: int) -> None:
 
 
 def test_the_licence_is_shipped_with_them() -> None:
-    text = (files("model.characters") / "data" / "ARPHICPL.TXT").read_text("utf-8")
+    text = (files("brushloop.model.characters") / "data" / "ARPHICPL.TXT").read_text("utf-8")
     assert text.startswith("ARPHIC PUBLIC LICENSE")
     assert "retain this license file (ARPHICPL.TXT) unaltered" in text
 

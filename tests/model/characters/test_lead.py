@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.characters.brush import Reach
-from model.characters.ink import swept
-from model.characters.lead import PLUNGE, covered, drawn, first_lead, lead
-from model.characters.phases import Phase, phase_map, phases_of
-from model.characters.plan import Path
-from model.footprint import NAMES, START, Footprint, fit_each, fit_footprint, inked, marks, sampled
+from brushloop.model.characters.brush import Reach
+from brushloop.model.characters.ink import swept
+from brushloop.model.characters.lead import PLUNGE, covered, drawn, first_lead, lead
+from brushloop.model.characters.phases import Phase, phase_map, phases_of
+from brushloop.model.characters.plan import Path
+from brushloop.model.footprint import NAMES, START, Footprint, fit_each, fit_footprint, inked, marks, sampled
 
 SIDE_MM, SIZE_PX = 48.0, 96
 HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])
 
 
 def hook() -> Path:
-    from model.characters.plan import resampled
+    from brushloop.model.characters.plan import resampled
 
     points = resampled(HOOK, 2.0)
     half = np.full(len(points), 2.0)

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from model.brush import Brush
-from model.characters.brush import Reach, depth_of
-from model.characters.glyph import parse_glyph
-from model.characters.ink import dense, reference, stamped, swept, written
-from model.characters.plan import Cell, Path, paths_of, trajectory
-from model.characters.refine import refine
-from model.raster.exact import coverage_at
-from model.strokes import stroke_model
+from brushloop.model.brush import Brush
+from brushloop.model.characters.brush import Reach, depth_of
+from brushloop.model.characters.glyph import parse_glyph
+from brushloop.model.characters.ink import dense, reference, stamped, swept, written
+from brushloop.model.characters.plan import Cell, Path, paths_of, trajectory
+from brushloop.model.characters.refine import refine
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
 CELL = Cell(60.0, 3.0)
@@ -103,7 +103,7 @@ def test_dense_points_lie_on_the_way() -> None:
 
 
 def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
-    text = (files("model.characters") / "data" / "子.json").read_text("utf-8")
+    text = (files("brushloop.model.characters") / "data" / "子.json").read_text("utf-8")
     glyph = parse_glyph(text, "子")
     wanted = reference(glyph, CELL, 64)
     first = [trajectory(path, MODEL, REACH, CELL, 5.0) for path in paths_of(glyph, CELL, 2.5)]

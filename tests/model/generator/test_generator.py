@@ -7,15 +7,15 @@ import math
 import pytest
 import torch
 
-from model.brush import Brush, DomainError
-from model.ccdbsm import ccdbsm
-from model.generator.metrics import quality
-from model.generator.network import Generator, Inputs, Layers, chebyshev, covered, squared_error
-from model.generator.stroke import generator_model, traced
-from model.generator.targets import PRESETS, Placement, Target
-from model.raster.exact import coverage_at
-from model.raster.frame import centred_origin
-from model.strokes import stroke_model
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.generator.metrics import quality
+from brushloop.model.generator.network import Generator, Inputs, Layers, chebyshev, covered, squared_error
+from brushloop.model.generator.stroke import generator_model, traced
+from brushloop.model.generator.targets import PRESETS, Placement, Target
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import centred_origin
+from brushloop.model.strokes import stroke_model
 
 SMALL = Layers(width=16, channels=4, side=8, size_px=32)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from model.train import SHIPPED_GENERATOR
-from model.train.checkpoint import load_generator, load_weights, sha256
-from model.train.config import preset
-from model.train.data import exact_sets
+from brushloop.model.train import SHIPPED_GENERATOR
+from brushloop.model.train.checkpoint import load_generator, load_weights, sha256
+from brushloop.model.train.config import preset
+from brushloop.model.train.data import exact_sets
 
 MOST_BYTES = 10_000_000
 

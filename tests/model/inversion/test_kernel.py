@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from bench.inversion_autograd import Rendered
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
-from model.inversion.forward import PARAMETERS, Outlines
-from model.inversion.jets import analytic, of_model
-from model.outline import Outline
-from model.protocol import Basis
-from model.raster.exact import coverage_at
-from model.strokes import stroke_models
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.inversion.forward import PARAMETERS, Outlines
+from brushloop.model.inversion.jets import analytic, of_model
+from brushloop.model.outline import Outline
+from brushloop.model.protocol import Basis
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_models
 
 # torch's own forward mode compiles a part of itself with torch.jit, which it calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

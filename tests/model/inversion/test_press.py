@@ -12,14 +12,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bench.inversion_autograd import invert_rendered
-from model.brush import Brush
-from model.ccdbsm import ccdbsm
-from model.inversion.noise import Noise
-from model.inversion.press import Flag, Inverter, Known, Range
-from model.protocol import Basis
-from model.raster.compiled import coverage_numpy
-from model.raster.exact import coverage_at
-from model.strokes import stroke_models
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.inversion.noise import Noise
+from brushloop.model.inversion.press import Flag, Inverter, Known, Range
+from brushloop.model.protocol import Basis
+from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_models
 
 # torch's own forward mode compiles a part of itself with torch.jit, which it calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

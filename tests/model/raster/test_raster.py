@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from model.brush import Brush, DomainError
-from model.ccdbsm import CcdBsm, ccdbsm
-from model.outline import cross, loop
-from model.press_images import press_images
-from model.raster.compiled import coverage_numpy
-from model.raster.exact import coverage_at
-from model.raster.frame import centred_origin
-from model.strokes import stroke_models
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import CcdBsm, ccdbsm
+from brushloop.model.outline import cross, loop
+from brushloop.model.press_images import press_images
+from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.frame import centred_origin
+from brushloop.model.strokes import stroke_models
 
 Array = NDArray[np.floating]
 MODELS = stroke_models(Brush())

@@ -10,15 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model import strokes
-from model.brush import Brush, DomainError
-from model.ccdbsm import ccdbsm
-from model.outline import Outline
-from model.plane import fit_plane
-from model.raster.exact import coverage_at
-from model.regression import solve
-from model.strokes import UnknownModelError, stroke_model, stroke_models
-from model.sweep import swept
+from brushloop.model import strokes
+from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.outline import Outline
+from brushloop.model.plane import fit_plane
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.regression import solve
+from brushloop.model.strokes import UnknownModelError, stroke_model, stroke_models
+from brushloop.model.sweep import swept
 
 MODELS = stroke_models(Brush())
 NAMES = ["ccd-bsm", "bezier", "circle", "ellipse", "line", "line-tapered", "qbc"]
@@ -54,8 +54,8 @@ def test_a_model_is_a_file_of_at_most_60_lines(file: Path) -> None:
 
 def test_a_file_in_the_folder_is_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "square.py").write_text(
-        "from model import baselines\n"
-        "from model.protocol import ParameterSpec, Parametric\n"
+        "from brushloop.model import baselines\n"
+        "from brushloop.model.protocol import ParameterSpec, Parametric\n"
         "def models(basis):\n"
         "    side = ParameterSpec('radius_mm', 'mm', 0, 9, 1, 'size')\n"
         "    build = lambda v: baselines.Ellipse(v['radius_mm'] * 0, v['radius_mm'], v['radius_mm'])\n"
@@ -69,7 +69,7 @@ def test_a_file_in_the_folder_is_a_model(tmp_path: Path, monkeypatch: pytest.Mon
             math.pi * 1.869**2, rel=1e-3
         )
     finally:
-        sys.modules.pop("model.strokes.square", None)
+        sys.modules.pop("brushloop.model.strokes.square", None)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.train.checkpoint import State
-from model.train.config import TrainConfig, checked
-from model.train.loop import Validation
+from brushloop.model.train.checkpoint import State
+from brushloop.model.train.config import TrainConfig, checked
+from brushloop.model.train.loop import Validation
 
 TINY: dict[str, Any] = {
     "target": {"ranges": {"height_mm": [11, 20], "tilt_deg": [0, 10]}, "px_mm": 0.8, "size_px": 32},

@@ -2,10 +2,10 @@
 
 import io
 
-from rich.console import Console
+from rich.console import Console  # noqa: TID251
 from rich.progress import Progress
 
-from model.train.run import Bar
+from brushloop.model.train.run import Bar
 
 
 def test_without_a_terminal_each_tenth_is_a_line_with_the_time_that_is_left() -> None:

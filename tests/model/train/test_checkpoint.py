@@ -14,12 +14,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from model.train import checkpoint
-from model.train.checkpoint import load_checkpoint, load_weights, save_checkpoint, save_generator
-from model.train.config import TrainConfig
-from model.train.data import load_captures, save_captures, split
-from model.train.errors import TrainError
-from model.train.loop import new_state
+from brushloop.model.train import checkpoint
+from brushloop.model.train.checkpoint import load_checkpoint, load_weights, save_checkpoint, save_generator
+from brushloop.model.train.config import TrainConfig
+from brushloop.model.train.data import load_captures, save_captures, split
+from brushloop.model.train.errors import TrainError
+from brushloop.model.train.loop import new_state
 
 
 @pytest.fixture

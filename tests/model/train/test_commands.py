@@ -12,12 +12,12 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-import brushloop
-from model.train.checkpoint import load_generator
-from model.train.cli import app
-from model.train.data import save_captures
-from model.train.errors import TrainError
-from model.train.report import Samples, load_samples, save_samples
+import brushloop.__main__
+from brushloop.model.train.checkpoint import load_generator
+from brushloop.model.train.cli import app
+from brushloop.model.train.data import save_captures
+from brushloop.model.train.errors import TrainError
+from brushloop.model.train.report import Samples, load_samples, save_samples
 from tests.browser import BROWSER, content_widths_px
 
 
@@ -55,7 +55,7 @@ def test_fine_tuning_on_captures_is_marked_as_such(once: Path, tmp_path: Path) -
 def test_the_page_draws_held_out_strokes_and_says_that_there_is_no_ink(once: Path, tmp_path: Path) -> None:
     """The same command again trains nothing, and writes the page again."""
     words = ["train", "--config", str(once.parents[1] / "train.toml"), "--out", str(once.parent)]
-    ran = CliRunner().invoke(brushloop.app, words)
+    ran = CliRunner().invoke(brushloop.__main__.app, words)
     assert ran.exit_code == 0, ran.exception
     path = once.with_name("training.html")
     assert ran.output.splitlines()[-1] == f"Page: {path}"

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from bench import curves
-from model.train.config import preset
+from brushloop.model.train.config import preset
 
 
 def test_every_kind_of_stroke_is_learned_by_the_same_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

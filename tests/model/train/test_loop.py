@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.train.checkpoint import State
-from model.train.config import TrainConfig, differences
-from model.train.data import Exact, batch_numbers, batches, exact_sets
-from model.train.errors import BlankOutput, Diverged, TrainingStopped
-from model.train.loop import converged, learning_rate, new_state, train
+from brushloop.model.train.checkpoint import State
+from brushloop.model.train.config import TrainConfig, differences
+from brushloop.model.train.data import Exact, batch_numbers, batches, exact_sets
+from brushloop.model.train.errors import BlankOutput, Diverged, TrainingStopped
+from brushloop.model.train.loop import converged, learning_rate, new_state, train
 from tests.waiting import PATIENCE_S
 
 

@@ -13,14 +13,14 @@ import torch
 from filelock import FileLock
 from safetensors.torch import load_file
 
-from model.train.config import TrainConfig, load_config
-from model.train.errors import TrainError
-from model.train.run import run_training
+from brushloop.model.train.config import TrainConfig, load_config
+from brushloop.model.train.errors import TrainError
+from brushloop.model.train.run import run_training
 
 TELLING = """
 from pathlib import Path
-from model.train.config import load_config
-from model.train.run import run_training
+from brushloop.model.train.config import load_config
+from brushloop.model.train.run import run_training
 
 class Reporter:
     def stepped(self, step, loss):

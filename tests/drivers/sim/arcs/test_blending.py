@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.geometry import brush_pose, distance
-from drivers.samples import Pose
-from drivers.sim.arm.kinematics import HOME
-from drivers.sim.arm.motion import MotionQueue
-from drivers.sim.arm.queue import ArmQueue
-from drivers.sim.config import SimConfig
-from drivers.sim.world import World
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.arm.kinematics import HOME
+from brushloop.drivers.sim.arm.motion import MotionQueue
+from brushloop.drivers.sim.arm.queue import ArmQueue
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import World
 
 V, A = 100.0, 1000.0
 DT_S = 0.004

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.codes import SafetyMode
-from drivers.geometry import brush_pose, distance, from_wire
-from drivers.sim.arm.kinematics import HOME
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.geometry import brush_pose, distance, from_wire
+from brushloop.drivers.sim.arm.kinematics import HOME
 
 START = brush_pose(250.0, -230.0, 260.0)
 NEAR = brush_pose(350.0, -230.0, 260.0)

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.codes import SafetyMode
-from drivers.geometry import brush_pose
-from drivers.sim.arcs.power import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
-from drivers.sim.world import SimClock
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.arcs.power import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
+from brushloop.drivers.sim.world import SimClock
 
 NEAR = brush_pose(350.0, -230.0, 260.0)
 E_STOPS = [SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP]

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from drivers.geometry import brush_pose, distance, from_wire
-from drivers.sim.arm.kinematics import HOME
+from brushloop.drivers.geometry import brush_pose, distance, from_wire
+from brushloop.drivers.sim.arm.kinematics import HOME
 
 SHEET = brush_pose(460.0 - 80.0, -110.0 + 100.0, 160.0)
 

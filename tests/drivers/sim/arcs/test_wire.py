@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from drivers.arcs.framing import BareDecoder, FrameDecoder, encode
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.rig import HOST
+from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.rig import HOST
 
 Ask = Callable[[bytes, int], Awaitable[list[Any]]]
 STOP = "rob1.MotionControl.stopLine"

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.geometry import brush_pose, distance, from_wire, to_wire
-from drivers.sim.arm.kinematics import HOME, LIMITS_DEG, forward, inverse, matrix_of, pose_of
+from brushloop.drivers.geometry import brush_pose, distance, from_wire, to_wire
+from brushloop.drivers.sim.arm.kinematics import HOME, LIMITS_DEG, forward, inverse, matrix_of, pose_of
 
 TOOL = np.eye(4)
 TOOL[2, 3] = 0.18

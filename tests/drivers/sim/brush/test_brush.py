@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.footprint import grow_bristles
-from drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.footprint import grow_bristles
+from brushloop.drivers.sim.brush.paper import Footprint
 
 DEPTHS_MM = (5.0, 11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)

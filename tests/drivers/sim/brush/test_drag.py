@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
 
 
 @pytest.fixture(scope="module")

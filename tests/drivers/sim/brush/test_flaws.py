@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.sim.brush.brush import Brush, BrushSpec, Flaw
-from drivers.sim.brush.flaws import COHESIVE_LOAD, flaw_of_load, natural_split
-from drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw
+from brushloop.drivers.sim.brush.flaws import COHESIVE_LOAD, flaw_of_load, natural_split
+from brushloop.drivers.sim.brush.paper import Footprint
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
 CELLS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]

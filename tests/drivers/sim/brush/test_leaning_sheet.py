@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.geometry import brush_pose
-from drivers.samples import Pose
-from drivers.sim.brush.brush import Brush, BrushSpec
-from drivers.sim.brush.contact import bent_toward, leaning_with
-from drivers.sim.config import SimConfig, Table
-from drivers.sim.world import World
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.samples import Pose
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.contact import bent_toward, leaning_with
+from brushloop.drivers.sim.config import SimConfig, Table
+from brushloop.drivers.sim.world import World
 
 LEANING = replace(Table(), slope_deg=(0.6, -0.8))
 

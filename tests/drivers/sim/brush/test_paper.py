@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
 
 REACH_MM = (6.0, 2.0)
 """Where the middle of the test mark lies in the footprint's own frame."""

@@ -8,8 +8,8 @@ from typing import cast
 
 import pytest
 
-from drivers.sim.camera.mjpeg_server import _Line
-from drivers.sim.config import View
+from brushloop.drivers.sim.camera.mjpeg_server import _Line
+from brushloop.drivers.sim.config import View
 
 
 class Loop:

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.sim.camera.optics import Optics
-from drivers.sim.camera.scene import Scene, board
-from drivers.sim.config import SimConfig, View
-from drivers.sim.world import World
+from brushloop.drivers.sim.camera.optics import Optics
+from brushloop.drivers.sim.camera.scene import Scene, board
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.world import World
 
 BENT = View(k1=-0.08)
 

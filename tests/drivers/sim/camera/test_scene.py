@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.geometry import brush_pose
-from drivers.sim.camera.optics import homography
-from drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, read_strip
-from drivers.sim.config import SimConfig, View
-from drivers.sim.world import World
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.camera.optics import homography
+from brushloop.drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, read_strip
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.world import World
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
 

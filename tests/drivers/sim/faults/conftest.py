@@ -6,10 +6,10 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
-from drivers.arcs import stopping
-from drivers.arcs.rpc import RpcConnection
-from drivers.sim.config import SimConfig, View
-from drivers.sim.rig import LoopbackRig
+from brushloop.drivers.arcs import stopping
+from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
 
 RPC_TIMEOUT_S = 0.4
 

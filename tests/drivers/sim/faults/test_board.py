@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from drivers.sim.faults.board import MOST, FaultBoard
-from drivers.sim.faults.kinds import KINDS, REPLIES, STOPS, Device, Fault
-from drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults.board import MOST, FaultBoard
+from brushloop.drivers.sim.faults.kinds import KINDS, REPLIES, STOPS, Device, Fault
+from brushloop.drivers.sim.faults.phases import Phase
 
 
 @dataclass

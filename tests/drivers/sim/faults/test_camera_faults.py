@@ -11,15 +11,15 @@ from collections.abc import AsyncIterator
 import numpy as np
 import pytest
 
-from drivers.camera import CameraOptions, OpenCvCamera
-from drivers.camera.health import Fault as Judgement
-from drivers.camera.health import FrameHealth
-from drivers.clock import HostClock
-from drivers.errors import DeviceTimeout
-from drivers.samples import Stamp
-from drivers.sim.camera.scene import read_strip
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.camera import CameraOptions, OpenCvCamera
+from brushloop.drivers.camera.health import Fault as Judgement
+from brushloop.drivers.camera.health import FrameHealth
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import DeviceTimeout
+from brushloop.drivers.samples import Stamp
+from brushloop.drivers.sim.camera.scene import read_strip
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from tests.waiting import wait_until
 
 CLOCK = HostClock()

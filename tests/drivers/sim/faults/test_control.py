@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.arcs.codes import SafetyMode
-from drivers.sim.config import SimConfig
-from drivers.sim.control import MAX_LINE_BYTES, ControlServer, live_control
-from drivers.sim.described import SimFileError
-from drivers.sim.rig import LoopbackRig
+from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.control import MAX_LINE_BYTES, ControlServer, live_control
+from brushloop.drivers.sim.described import SimFileError
+from brushloop.drivers.sim.rig import LoopbackRig
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]
 

@@ -8,13 +8,13 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from drivers.clock import HostClock
-from drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
-from drivers.force.rounds import LOOPBACK_CHANNEL
-from drivers.force.sri_m8123 import SriM8123, SriOptions
-from drivers.ink.station import InkStation, StationOptions, unseal
-from drivers.sim.faults.kinds import Device, Fault
-from drivers.sim.rig import HOST, Faults, LoopbackRig
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.ink.station import InkStation, StationOptions, unseal
+from brushloop.drivers.sim.faults.kinds import Device, Fault
+from brushloop.drivers.sim.rig import HOST, Faults, LoopbackRig
 
 
 async def begun(rig: LoopbackRig) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.geometry import brush_pose
-from drivers.sim.config import SimConfig, Table
-from drivers.sim.faults.phases import Phase, Spot, Truth, phase_of
-from drivers.sim.world import World
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.config import SimConfig, Table
+from brushloop.drivers.sim.faults.phases import Phase, Spot, Truth, phase_of
+from brushloop.drivers.sim.world import World
 
 TABLE = Table()
 HOME = Spot(-100.0, 200.0, 140.0)

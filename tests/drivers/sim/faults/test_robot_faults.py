@@ -7,11 +7,11 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from drivers.arcs.codes import RobotMode, SafetyMode
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.settings import ArcsOptions
-from drivers.clock import HostClock
-from drivers.errors import (
+from brushloop.drivers.arcs.codes import RobotMode, SafetyMode
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.settings import ArcsOptions
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
@@ -19,11 +19,11 @@ from drivers.errors import (
     ProtocolViolation,
     RobotNotSafe,
 )
-from drivers.geometry import brush_pose, distance
-from drivers.limits import Limits
-from drivers.sim.arcs.server import ArcsServer
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.rig import HOST, LoopbackRig
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}  # two real seconds

@@ -9,14 +9,14 @@ import asyncio
 
 import pytest
 
-from drivers.arcs.robot import AuboArcs
-from drivers.arcs.settings import ArcsOptions
-from drivers.clock import HostClock
-from drivers.errors import Stale
-from drivers.limits import Limits
-from drivers.samples import PoseSample
-from drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.settings import ArcsOptions
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.errors import Stale
+from brushloop.drivers.limits import Limits
+from brushloop.drivers.samples import PoseSample
+from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.rig import HOST, LoopbackRig
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-import brushloop
-from drivers.sim.control import live_control
-from drivers.sim.fault_client import FaultRefused
-from drivers.sim.lab.lab import UnknownLab
-from drivers.sim.serve import LabRefused
+import brushloop.__main__
+from brushloop.drivers.sim.control import live_control
+from brushloop.drivers.sim.fault_client import FaultRefused
+from brushloop.drivers.sim.lab.lab import UnknownLab
+from brushloop.drivers.sim.serve import LabRefused
 
 
 def run(*arguments: str) -> str:
-    result = CliRunner().invoke(brushloop.app, arguments, catch_exceptions=False)
+    result = CliRunner().invoke(brushloop.__main__.app, arguments, catch_exceptions=False)
     return result.output
 
 

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.robot import AUBOPE_PORT
-from drivers.arcs.rpc import RpcConnection, open_arcs
-from drivers.errors import DeviceTimeout, WrongGeneration
-from drivers.sim.camera.scene import board
-from drivers.sim.lab.facts import draw, in_picture
-from drivers.sim.lab.lab import ARCS_PORT, CAMERA_PORTS, UnknownLab
-from drivers.sim.lab.places import CORNERS, corner
-from drivers.sim.lab.traps import Trap, mended, spring
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.arcs.rpc import RpcConnection, open_arcs
+from brushloop.drivers.errors import DeviceTimeout, WrongGeneration
+from brushloop.drivers.sim.camera.scene import board
+from brushloop.drivers.sim.lab.facts import draw, in_picture
+from brushloop.drivers.sim.lab.lab import ARCS_PORT, CAMERA_PORTS, UnknownLab
+from brushloop.drivers.sim.lab.places import CORNERS, corner
+from brushloop.drivers.sim.lab.traps import Trap, mended, spring
 
 FAST = 500.0
 SMALL_PX = (640, 480)

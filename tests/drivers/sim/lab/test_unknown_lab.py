@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.arcs.controller import Controller
-from drivers.arcs.robot import AUBOPE_PORT
-from drivers.arcs.rpc import RpcConnection, open_arcs
-from drivers.geometry import from_wire, lean
-from drivers.sim.arm.kinematics import forward, inverted, matrix_of, pose_of
-from drivers.sim.camera.scene import board
-from drivers.sim.config import SimConfig
-from drivers.sim.lab.facts import draw, in_picture
-from drivers.sim.lab.lab import ARCS_PORT, UnknownLab
-from drivers.sim.lab.places import CORNERS, corner
-from drivers.sim.lab.seen import truth, truth_text
-from drivers.sim.rig import _at_sensor
-from drivers.sim.world import tool_of
+from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.arcs.rpc import RpcConnection, open_arcs
+from brushloop.drivers.geometry import from_wire, lean
+from brushloop.drivers.sim.arm.kinematics import forward, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.camera.scene import board
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.lab.facts import draw, in_picture
+from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab
+from brushloop.drivers.sim.lab.places import CORNERS, corner
+from brushloop.drivers.sim.lab.seen import truth, truth_text
+from brushloop.drivers.sim.rig import _at_sensor
+from brushloop.drivers.sim.world import tool_of
 
 SMALL_PX = (640, 480)
 FAST = 500.0
@@ -179,7 +179,7 @@ def test_a_push_is_felt_in_the_sensors_axes():
 
 
 async def test_a_finger_pushes_for_a_second(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("drivers.sim.lab.hand.PUSH_S", 0.0)
+    monkeypatch.setattr("brushloop.drivers.sim.lab.hand.PUSH_S", 0.0)
     lab, felt = lab_of(2), list[tuple[float, ...]]()
     before = np.array(lab.world.wrench()[:3])
     monkeypatch.setattr("asyncio.sleep", lambda _s: _now(felt, lab))

@@ -12,20 +12,20 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
-import calibrate.cli
-import calibrate.cli_camera
-import calibrate.fit.cli
-import calibrate.invert.cli
-import calibrate.loop.cli
-import calibrate.validate.cli
-import calibrate.writing.cli
-import collect.cli
-import collect.cli_rig
-import model.train.cli
-import sessions.cli
-import twin.cli
-from calibrate.path_or_command import PathOrCommand
-from sessions.terminal import plain, say
+import brushloop.calibrate.cli
+import brushloop.calibrate.cli_camera
+import brushloop.calibrate.fit.cli
+import brushloop.calibrate.invert.cli
+import brushloop.calibrate.loop.cli
+import brushloop.calibrate.validate.cli
+import brushloop.calibrate.writing.cli
+import brushloop.collect.cli
+import brushloop.collect.cli_rig
+import brushloop.model.train.cli
+import brushloop.sessions.cli
+import brushloop.twin.cli
+from brushloop.calibrate.path_or_command import PathOrCommand
+from brushloop.sessions.terminal import plain, say
 
 EXIT_CODES = {
     0: "done",
@@ -105,36 +105,36 @@ def options(
     """Take the options of brushloop itself."""
 
 
-app.add_typer(collect.cli.app, name="collect")
-app.command("doctor")(collect.cli.doctor)
-app.add_typer(collect.cli_rig.app, name="rig")
-app.add_typer(calibrate.cli.app, name="calibrate")
-app.add_typer(calibrate.cli_camera.app, name="camera")
-app.add_typer(calibrate.validate.cli.app, name="validate")
-app.command("fit")(calibrate.fit.cli.fit)
-app.command("twin")(twin.cli.twin)
-app.command("invert")(calibrate.invert.cli.invert)
+app.add_typer(brushloop.collect.cli.app, name="collect")
+app.command("doctor")(brushloop.collect.cli.doctor)
+app.add_typer(brushloop.collect.cli_rig.app, name="rig")
+app.add_typer(brushloop.calibrate.cli.app, name="calibrate")
+app.add_typer(brushloop.calibrate.cli_camera.app, name="camera")
+app.add_typer(brushloop.calibrate.validate.cli.app, name="validate")
+app.command("fit")(brushloop.calibrate.fit.cli.fit)
+app.command("twin")(brushloop.twin.cli.twin)
+app.command("invert")(brushloop.calibrate.invert.cli.invert)
 loop = typer.Typer(
     cls=PathOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
-loop.command("session")(collect.cli.loop)
-loop.command("compare")(calibrate.loop.cli.compare)
+loop.command("session")(brushloop.collect.cli.loop)
+loop.command("compare")(brushloop.calibrate.loop.cli.compare)
 app.add_typer(loop, name="loop")
-sessions.cli.app.command("export")(calibrate.cli.export)
-app.add_typer(sessions.cli.app, name="sessions")
+brushloop.sessions.cli.app.command("export")(brushloop.calibrate.cli.export)
+app.add_typer(brushloop.sessions.cli.app, name="sessions")
 write = typer.Typer(
     cls=PathOrCommand,
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
-write.command("characters")(collect.cli.write)
-write.command("plan")(calibrate.writing.cli.plan)
-write.command("compare")(calibrate.writing.cli.compare)
-write.command("learn")(calibrate.writing.cli.learn)
-write.command("practice")(calibrate.writing.cli.practice)
-write.command("fit")(calibrate.writing.cli.fit)
+write.command("characters")(brushloop.collect.cli.write)
+write.command("plan")(brushloop.calibrate.writing.cli.plan)
+write.command("compare")(brushloop.calibrate.writing.cli.compare)
+write.command("learn")(brushloop.calibrate.writing.cli.learn)
+write.command("practice")(brushloop.calibrate.writing.cli.practice)
+write.command("fit")(brushloop.calibrate.writing.cli.fit)
 app.add_typer(write, name="write")
-app.add_typer(model.train.cli.app, name="train", result_callback=calibrate.cli.training_page)
+app.add_typer(brushloop.model.train.cli.app, name="train", result_callback=brushloop.calibrate.cli.training_page)
 
 
 @app.command()
@@ -163,9 +163,9 @@ def sim(
     Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own and no rig.toml,
     which `brushloop rig new` has to find out.
     """
-    from drivers.sim.brush_file import load_brush
-    from drivers.sim.config import SimConfig, View
-    from drivers.sim.serve import LabRefused, serve, serve_unknown
+    from brushloop.drivers.sim.brush_file import load_brush
+    from brushloop.drivers.sim.config import SimConfig, View
+    from brushloop.drivers.sim.serve import LabRefused, serve, serve_unknown
 
     if unknown is not None:
         if write_rig is not None or brush != Path("loopback") or arcs_port or camera_port:
@@ -206,7 +206,7 @@ def fault(
     """Break a device of a running loopback rig, list its faults, or act as the person at its pendant."""
     from json import dumps
 
-    from drivers.sim.fault_client import ask, request_of
+    from brushloop.drivers.sim.fault_client import ask, request_of
 
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
@@ -222,7 +222,7 @@ def hand(
     corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
 ) -> None:
     """Act as the person in an unknown lab: guide the arm by hand, hold the printed board, correct mistakes."""
-    from drivers.sim.fault_client import ask
+    from brushloop.drivers.sim.fault_client import ask
 
     wanted = {"act": act, "to": to, "index": index or None, "corner": corner}
     say(ask(control, {"do": "hand", **{name: value for name, value in wanted.items() if value is not None}})["says"])
@@ -242,7 +242,7 @@ def demo(
     ] = Path("paper"),
 ) -> None:
     """Press, calibrate, press again and validate on the loopback rig. Run it again to continue where it stopped."""
-    from collect.chains.demo import FULL, QUICK, Demo
+    from brushloop.collect.chains.demo import FULL, QUICK, Demo
 
     if code := Demo(out, FULL if full else QUICK, repeats, rate, seed, brush).run():
         raise typer.Exit(code)
@@ -256,7 +256,7 @@ def main() -> None:
     try:
         _check_names()
         if len(sys.argv) == 1 and sys.stdin.isatty() and sys.stdout.isatty():
-            collect.cli.browse()
+            brushloop.collect.cli.browse()
         else:
             app(prog_name="brushloop")
     except Exception as error:
