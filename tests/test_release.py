@@ -122,6 +122,44 @@ def read_until(terminal: int, words: bytes) -> None:
             shown += os.read(terminal, 4096)
 
 
+FOLDERS = ("calibrate", "collect", "drivers", "model", "sessions", "twin")
+OF_ANOTHER_PROJECT = """
+import model
+from brushloop.model import ccdbsm
+from drivers import ours
+
+def test_the_two_names_are_two_packages(brushloop_rig):
+    assert (model.OURS, ours.OURS) == ("model", "drivers")
+    assert brushloop_rig.is_file() and ccdbsm.__name__ == "brushloop.model.ccdbsm"
+"""
+
+
+def another_project(folder: Path) -> Path:
+    """A project with folders of our names, and a test that uses both."""
+    for name in FOLDERS:
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text(f"OURS = {name!r}\n")
+        (folder / name / "ours.py").write_text(f"OURS = {name!r}\n")
+    (folder / "test_both.py").write_text(OF_ANOTHER_PROJECT)
+    return folder
+
+
+def test_a_project_with_folders_of_our_names_works_beside_an_editable_installation(
+    command: Path, tmp_path: Path
+) -> None:
+    project = another_project(tmp_path)
+    assert "1 passed" in run(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", project, cwd=project)
+    assert run(sys.executable, "-m", "brushloop", "--version", cwd=project) == "brushloop 0.1.0\n"
+    assert "collect" in run(command, "--help", cwd=project)
+
+
+@pytest.mark.soak  # builds and installs
+def test_a_project_with_folders_of_our_names_works_beside_the_wheel(brushloop: Path, tmp_path: Path) -> None:
+    project, python = another_project(tmp_path), brushloop.with_name("python")
+    assert "1 passed" in run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", project, cwd=project)
+    assert run(brushloop, "demo", "--repeats", "1", "--out", tmp_path / "demo", cwd=project)
+
+
 DOCUMENTED = re.compile(r"<!-- tested by tests/test_release\.py -->\n```(\w+)\n(.*?)```", re.DOTALL)
 OF_A_TWIN = """
 import tomllib
