@@ -48,7 +48,7 @@ def _templates() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     return Environment(
-        loader=PackageLoader("calibrate"),
+        loader=PackageLoader("brushloop.calibrate"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

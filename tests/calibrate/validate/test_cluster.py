@@ -112,9 +112,9 @@ def two_workers_one_of_them_lost(cluster: Cluster, make_session: object, tmp_pat
 def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> None:
     environment = os.environ | {"DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "1s"}
     program = (
-        "import sys, brushloop, calibrate.validate.pool as pool; pool.CONNECT_S = 1.0; "
+        "import sys, brushloop.__main__, brushloop.calibrate.validate.pool as pool; pool.CONNECT_S = 1.0; "
         f"sys.argv = ['brushloop', 'validate', {str(session)!r}, '--out', {str(tmp_path / 'out')!r}, "
-        "'--scheduler', 'tcp://127.0.0.1:9']; brushloop.main()"
+        "'--scheduler', 'tcp://127.0.0.1:9']; brushloop.__main__.main()"
     )
     ran = subprocess.run(
         [sys.executable, "-c", program],

@@ -29,7 +29,7 @@ def test_these_are_all_the_servers_there_are():
     def below(kind: type[LoopbackServer]) -> set[type[LoopbackServer]]:
         return {kind, *(b for k in kind.__subclasses__() for b in below(k))}
 
-    ours = {k for k in below(LoopbackServer) if k.__module__.startswith("drivers.")} - {LoopbackServer}
+    ours = {k for k in below(LoopbackServer) if k.__module__.startswith("brushloop.drivers.")} - {LoopbackServer}
     assert ours == {ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer, OlderSoftware}
     assert all(k.start is LoopbackServer.start for k in ours), "a server that listens in its own way must refuse too"
 

@@ -83,9 +83,8 @@ def test_samples_that_are_not_of_this_generator_are_refused(tmp_path: Path) -> N
 
 
 def test_help_loads_nothing_heavy() -> None:
-    code = (
-        "import sys, model.train.cli; assert not {'torch', 'numpy', 'pydantic', 'rich.progress'} & sys.modules.keys()"
-    )
+    heavy = {"torch", "numpy", "pydantic", "rich.progress"}
+    code = f"import sys, brushloop.model.train.cli; assert not {heavy} & sys.modules.keys()"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -36,7 +36,7 @@ run_training(load_config(Path(toml)), Path(out), Reporter(), lambda: False)
 def processes() -> ForkServerContext:
     """Makes processes that begin with everything imported: imports would be most of what they do."""
     context = multiprocessing.get_context("forkserver")
-    needed = "pytest torch._dynamo matplotlib.figure skimage.metrics numba model.train.run"
+    needed = "pytest torch._dynamo matplotlib.figure skimage.metrics numba brushloop.model.train.run"
     context.set_forkserver_preload(needed.split())
     return context
 
