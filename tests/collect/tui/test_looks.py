@@ -58,9 +58,9 @@ def pressing(*keys: str) -> Press:
 
 
 async def settled(pilot: Pilot[None]) -> None:
-    """Two polls, and every worker's work."""
+    """As many polls as all parts of the screen take turns in, once it is laid out, and every worker's work."""
     engine = pilot.app.engine
-    enough = engine.looks + 3 if engine is not None else 0
+    enough = engine.looks + 5 if engine is not None else 0
     while engine is not None and engine.looks < enough:
         await pilot.pause(0.02)
     await pilot.app.workers.wait_for_complete()

@@ -198,6 +198,7 @@ def test_an_impossible_brush_is_refused():
 
 
 def test_the_brush_knows_neither_model_nor_torch():
-    probe = "import sys, brushloop.drivers.sim.world; print(sorted({'brushloop.model', 'torch', 'brushloop.collect'} & set(sys.modules)))"
+    unwanted = {"brushloop.model", "torch", "brushloop.collect"}
+    probe = f"import sys, brushloop.drivers.sim.world; print(sorted({unwanted} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
