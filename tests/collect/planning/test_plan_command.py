@@ -11,7 +11,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-import brushloop.collect.cli
+from brushloop.collect.cli import app
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.planning.limit_check import _for_tool, all_poses, ask_reach
 from brushloop.collect.planning.picture import draw_plan
@@ -55,7 +55,7 @@ def at(rig_path: Path, port: int) -> RigConfig:
 
 def plan(rig_path: Path, name: str, *options: str) -> str:
     arguments = ["plan", "--config", str(rig_path), "--protocol", str(EXAMPLES / name), *options]
-    ran = CliRunner().invoke(brushloop.collect.cli.app, arguments, catch_exceptions=False)
+    ran = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert ran.exit_code == 0
     return ran.stdout
 
