@@ -21,6 +21,8 @@ from brushloop.model.fitted import NAMES, PARAMETERS, FittedPress, chance_within
 Floats = NDArray[np.float64]
 
 ALL = tuple(range(len(NAMES)))
+SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
+"""Size and place of the marks. With these free first, a descent of all parameters does not end far from the marks."""
 ROUNDS = 40
 DAMPING = Damping(1e-2, 6.0, 8.0, 1e-7, 1e5, floor=0.0)
 STEP = 1e-4
@@ -39,12 +41,12 @@ def fit_presses(
     *,
     residual: bool = True,
     prior: Prior | None = None,
-    stages: Sequence[Sequence[int]] = (ALL,),
+    stages: Sequence[Sequence[int]] = (SCALE, ALL),
 ) -> FittedPress:
     """Fit the parameters, then the residual that they cannot express. By default the prior is `learned`.
 
     Parameters that the strokes do not determine have the values that the prior expects. `stages` are the numbers of the
-    parameters that are free at first, then, and so on, where the prior is far from any brush.
+    parameters that are free at first, then, and so on.
     Raises ValueError without a stroke.
     """
     prior = learned() if prior is None else prior

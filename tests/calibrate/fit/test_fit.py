@@ -7,6 +7,7 @@ from brushloop.calibrate.compare.ceiling import CEILING
 from brushloop.calibrate.fit.captures import Grid, Pressed
 from brushloop.calibrate.fit.fit import draw, fit_presses, touch_errors, zero_touches
 from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
+from brushloop.calibrate.fit.prior import learned, spreads
 from brushloop.calibrate.fit.run import touch_estimates
 from brushloop.calibrate.fit.sizes import FEWEST_CELLS, sizes_of
 from brushloop.model.fitted import NAMES, PARAMETERS, FittedPress, published
@@ -44,6 +45,19 @@ def test_a_brush_of_the_family_is_found_again() -> None:
         seen, wanted = (np.maximum(b.half_width(height, tilt, GRID.x_mm), 0.0) for b in (fit, truth))
         assert seen.max() == pytest.approx(wanted.max(), rel=0.03)
         assert np.abs(seen - wanted).mean() < 0.05
+
+
+@pytest.mark.parametrize("seed", [0, 10])
+def test_a_brush_far_from_all_known_ones_does_not_end_the_fit_far_from_its_marks(seed: int) -> None:
+    """With all parameters free at once, these two fits ended .7 and .35 mm from the marks of the left-out cell."""
+    cells = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
+    known, rng = learned(), np.random.default_rng(seed)
+    far = spreads() * np.linalg.cholesky(np.linalg.inv(known.precision)) @ rng.normal(size=len(NAMES))
+    low, high = (np.array([getattr(spec, end) for spec in PARAMETERS]) for end in ("low", "high"))
+    truth = FittedPress(6.0, 48.0, np.clip(known.values + 1.5 * far, low, high))
+    fit = fit_presses(presses(truth, cells[:-1], noise=0.2, seed=seed), GRID, 6.0, 48.0, residual=False)
+    seen, wanted = (np.maximum(b.half_width(*cells[-1], GRID.x_mm), 0.0) for b in (fit, truth))
+    assert np.abs(seen - wanted).mean() < 0.15
 
 
 def test_a_zero_touch_that_moved_is_distinguished_from_an_earlier_fit() -> None:
