@@ -153,7 +153,8 @@ def test_a_project_with_folders_of_our_names_works_beside_an_editable_installati
     assert "collect" in run(command, "--help", cwd=project)
 
 
-@pytest.mark.soak  # builds and installs
+@pytest.mark.soak  # builds, installs, and takes as long as `make demo`
+@pytest.mark.timeout(1800)
 def test_a_project_with_folders_of_our_names_works_beside_the_wheel(brushloop: Path, tmp_path: Path) -> None:
     project, python = another_project(tmp_path), brushloop.with_name("python")
     assert "1 passed" in run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", project, cwd=project)
