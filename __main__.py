@@ -55,7 +55,7 @@ class NameRefused(Exception):
 
 
 class OutputClosed(Exception):
-    """Whoever read the output, such as `head`, has ended; there is nobody left to tell."""
+    """Whoever read the output, such as `head`, has ended, so no message can be shown."""
 
     exit_code = 4
 

@@ -156,7 +156,7 @@ class SessionStore:
         self._log({"event": "sheet", "sheet": self.state.sheet})
 
     def ended(self, why: str) -> None:
-        """Journal how a run ended before its time: whoever resumes the session is told so."""
+        """Journal how a run ended before its time: it is shown to whoever resumes the session."""
         self._log({"event": "ended", "why": why})
 
     def verify(self) -> None:
