@@ -10,26 +10,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 
-import numpy as np
-
 from bench.brushfit_families import BRUSHES, FAMILIES, made_up
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, bristles, grid
 from brushloop.calibrate.fit.captures import Grid, Pressed
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, about
-from brushloop.model.fitted import NAMES, published
+from brushloop.model.fitted import published
 
 BRISTLE = "bristle simulation"
-STAGES = (
-    ("lam", "tip_gain", "origin_mm"),
-    ("heel_gain",),
-    ("h0_mm", "origin_gain"),
-    ("heel_power", "heel_round", "tip_power", "tip_round", "core_mm"),
-    ("width_power", "length_power"),
-    ("width_tilt", "length_tilt"),
-    ("lean", "heel_tilt"),
-)
-"""Parameters that are freed one set after the other, because the published model is far from any brush."""
 
 
 def known() -> Iterator[KnownBrush]:
@@ -53,11 +41,7 @@ def main() -> None:
 
 
 def _fitted(name: str, family: str, strokes: list[Pressed], on: Grid, radius_mm: float, length_mm: float) -> KnownBrush:
-    names = [name for stage in STAGES for name in stage]
-    free, ends = [NAMES.index(name) for name in names], np.cumsum([len(stage) for stage in STAGES])
-    stages = [free[:end] for end in ends]
-    prior = about(published())
-    press = fit_presses(strokes, on, radius_mm, length_mm, residual=False, prior=prior, stages=stages)
+    press = fit_presses(strokes, on, radius_mm, length_mm, residual=False, prior=about(published()))
     return KnownBrush(name=name, family=family, values=tuple(round(float(v), 5) for v in press.values))
 
 

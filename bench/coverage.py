@@ -19,7 +19,8 @@ from bench.brushfit_presses import BRISTLE_SETS, CELLS, REPEATS, BrushPresses, C
 from bench.brushfit_prior import BRISTLE
 from bench.harness import Result
 from brushloop.calibrate.fit.captures import Pressed
-from brushloop.calibrate.fit.fit import fit_presses, touch_errors, zero_touches
+from brushloop.calibrate.fit.fit import fit_presses, zero_touches
+from brushloop.calibrate.fit.heldout import leave_cell_out
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.fit.run import touch_estimates
 from brushloop.calibrate.fit.sizes import Estimate, measure, middle, plane_at, sizes_of
@@ -104,7 +105,7 @@ def _touch(
 ) -> Iterator[tuple[str, Estimate, float]]:
     deeper, moved = float(rng.choice(DEEPER_MM)), int(rng.choice(MOVED_PX))
     strokes, of_brush = brush.strokes(chosen), (brush.grid, brush.radius_mm, brush.length_mm)
-    errors = touch_errors(strokes, *of_brush, prior=prior)
+    _, errors = leave_cell_out(strokes, *of_brush, prior)
     now = [
         Pressed(one.height_mm - deeper, one.tilt_deg, np.roll(one.ink, moved, axis=1)) for one in brush.strokes(later)
     ]

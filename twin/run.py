@@ -15,13 +15,12 @@ from typing import ClassVar
 import numpy as np
 
 from brushloop.calibrate.compare.ceiling import CEILING
-from brushloop.calibrate.fit.captures import Grid, Pressed
+from brushloop.calibrate.fit.captures import Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import (
     BEZIER,
     HeldOut,
     Images,
     Scores,
-    by_cell,
     image_of,
     refit_bezier,
 )

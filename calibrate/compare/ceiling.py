@@ -24,8 +24,8 @@ CEILING = "ceiling"
 NEAR_POINTS = 1.5
 """Distance from the ceiling that counts as near, in points of average CSIM."""
 MAX_OTHERS = 9
-"""Most presses that one is compared with: all others of a cell of ten, as in the paper, or the next nine of a larger
-one."""
+"""Most others that a press or a writing is compared with: all those of ten, as in the paper, or the next nine of
+more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Average:
 
 
 def others_of(press: int, count: int) -> list[int]:
-    """Numbers of the presses of a cell of `count` that one of them is compared with."""
+    """Numbers of the presses of a cell, or writings of a character, that one of `count` is compared with."""
     return [(press + step) % count for step in range(1, min(MAX_OTHERS, count - 1) + 1)]
 
 

@@ -20,6 +20,8 @@ from brushloop.sessions.reader import Recording
 from brushloop.sessions.recording.schemas import Header
 
 Floats = NDArray[np.float64]
+Cell = tuple[float, float]
+"""H and alpha."""
 
 SPREAD_MM = 0.15
 """Variation of an edge from press to press (scale of a logistic)."""
@@ -46,6 +48,14 @@ class Pressed:
     height_mm: float
     tilt_deg: float
     ink: NDArray[np.floating]
+
+
+def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
+    """The strokes of each (H, alpha)."""
+    cells: dict[Cell, list[Pressed]] = {}
+    for stroke in strokes:
+        cells.setdefault((stroke.height_mm, stroke.tilt_deg), []).append(stroke)
+    return dict(sorted(cells.items()))
 
 
 @dataclass(frozen=True, slots=True)

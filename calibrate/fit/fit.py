@@ -6,13 +6,14 @@ These differences (`STRAYS`) are integrated out of the likelihood, linearised at
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed
+from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.prior import Prior, about, learned, spreads
 from brushloop.calibrate.fit.residual import fit_residual
 from brushloop.model.damped import Damping, Equations, descend
@@ -22,7 +23,7 @@ Floats = NDArray[np.float64]
 
 ALL = tuple(range(len(NAMES)))
 SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
-"""Size and place of the marks. With these free first, a descent of all parameters does not end far from the marks."""
+"""Size and place of the marks."""
 ROUNDS = 40
 DAMPING = Damping(1e-2, 6.0, 8.0, 1e-7, 1e5, floor=0.0)
 STEP = 1e-4
@@ -41,18 +42,18 @@ def fit_presses(
     *,
     residual: bool = True,
     prior: Prior | None = None,
-    stages: Sequence[Sequence[int]] = (SCALE, ALL),
 ) -> FittedPress:
     """Fit the parameters, then the residual that they cannot express. By default the prior is `learned`.
 
-    Parameters that the strokes do not determine have the values that the prior expects. `stages` are the numbers of the
-    parameters that are free at first, then, and so on.
+    The cost has several minima. Of two descents, one from the prior and one that fits size and place of the marks
+    first, the lower one counts. Parameters that the strokes do not determine have the values that the prior expects.
     Raises ValueError without a stroke.
     """
     prior = learned() if prior is None else prior
-    press = FittedPress(radius_mm, length_mm, prior.values)
-    for free in stages:
-        press = _minimise(press, free, strokes, grid, prior)
+    expected = FittedPress(radius_mm, length_mm, prior.values)
+    sized, _ = _minimise(expected, SCALE, strokes, grid, prior)
+    descents = [_minimise(start, ALL, strokes, grid, prior) for start in (expected, sized)]
+    press, _ = min(descents, key=itemgetter(1))
     return fit_residual(press, strokes, grid) if residual else press
 
 
@@ -62,32 +63,10 @@ def zero_touches(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> 
     (cells, 2) mm, for each depth and tilt of the strokes on its own.
     """
     touches: list[Floats] = []
-    for held, _ in _by_cell(strokes):
-        moved = _minimise(press, TOUCH, held, grid, about(press.values))
+    for held in by_cell(strokes).values():
+        moved, _ = _minimise(press, TOUCH, held, grid, about(press.values))
         touches.append((moved.values - press.values)[list(TOUCH)])
     return np.array(touches)
-
-
-def touch_errors(
-    strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, prior: Prior | None = None
-) -> Floats:
-    """`zero_touches` of each cell for a fit to all others, (cells, 2) mm; (0, 2) for a single cell.
-
-    Nothing moved between these presses, so every difference is an error of the model or of a press.
-    """
-    errors = [
-        zero_touches(fit_presses(others, grid, radius_mm, length_mm, prior=prior), held, grid)
-        for held, others in _by_cell(strokes)
-        if others
-    ]
-    return np.concatenate([np.empty((0, 2)), *errors])
-
-
-def _by_cell(strokes: Sequence[Pressed]) -> Iterator[tuple[list[Pressed], list[Pressed]]]:
-    """The strokes of each cell, and those of all others."""
-    for cell in sorted({(stroke.height_mm, stroke.tilt_deg) for stroke in strokes}):
-        held = [stroke for stroke in strokes if (stroke.height_mm, stroke.tilt_deg) == cell]
-        yield held, [stroke for stroke in strokes if (stroke.height_mm, stroke.tilt_deg) != cell]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +112,9 @@ def draw(press: FittedPress, height_mm: float, tilt_deg: float, grid: Grid) -> D
 
 def _minimise(
     press: FittedPress, free: Sequence[int], strokes: Sequence[Pressed], grid: Grid, prior: Prior
-) -> FittedPress:
-    """Levenberg-Marquardt from `press`; a parameter one standard deviation off the prior costs as much as a pixel of
-    wrong ink."""
+) -> tuple[FittedPress, float]:
+    """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
+    costs as much as a pixel of wrong ink."""
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
     at = list(free)
@@ -151,8 +130,13 @@ def _minimise(
         squares, gradients, cost = _normal(trial, strokes, grid)
         pull = prior.precision @ prior.off(trial.values)
         cost += 0.5 * float(prior.off(trial.values) @ pull)
-        square = squares.sum(axis=0) + prior.precision
-        return Equations(cost, square[np.ix_(at, at)], (gradients.sum(axis=0) + pull)[at])
+        square = (squares.sum(axis=0) + prior.precision)[np.ix_(at, at)]
+        gradient = (gradients.sum(axis=0) + pull)[at]
+        # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
+        held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
+        square[held], square[:, held], gradient[held] = 0.0, 0.0, 0.0
+        square[held, held] = 1.0
+        return Equations(cost, square, gradient)
 
     def feasible(vector: Floats) -> Floats | None:
         """Within the bounds; None if a press would not reach the paper."""
@@ -170,7 +154,7 @@ def _minimise(
         damping=DAMPING,
         feasible=feasible,
     )
-    return at_values(found.vector)
+    return at_values(found.vector), found.at.cost
 
 
 def _normal(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[Floats, Floats, float]:

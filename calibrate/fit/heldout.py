@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from brushloop.calibrate.compare.ceiling import CEILING, Average, average, ceiling_values, pair_means
 from brushloop.calibrate.compare.field import SIZE_PX
 from brushloop.calibrate.compare.images import draw_loop, to_pixels
-from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed, inked_rows
-from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Floats, Grid, Pressed, by_cell, inked_rows
+from brushloop.calibrate.fit.fit import fit_presses, zero_touches
+from brushloop.calibrate.fit.prior import Prior
 from brushloop.model.brush import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.loops import BEZIER_PIECES, Loop, bezier_side, closed
@@ -22,7 +23,6 @@ from brushloop.model.plane import Plane, fit_plane
 from brushloop.sessions.progress import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
-Cell = tuple[float, float]
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
 Predict = Callable[[float, float], Images]
@@ -47,14 +47,6 @@ class HeldOut:
     """Points of CSIM below the ceiling; None for the ceiling itself, and where no cell was pressed twice."""
 
 
-def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
-    """The strokes of each (H, alpha)."""
-    cells: dict[Cell, list[Pressed]] = {}
-    for stroke in strokes:
-        cells.setdefault((stroke.height_mm, stroke.tilt_deg), []).append(stroke)
-    return dict(sorted(cells.items()))
-
-
 def predictor(press: FittedPress, grid: Grid) -> Predict:
     """A function that draws the presses of a fitted brush, without torch."""
     return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
@@ -73,34 +65,43 @@ def without(cells: Mapping[Cell, Sequence[One]], fold: Sequence[Cell]) -> list[O
     return others[:: max(1, -(-len(others) // MAX_STROKES))]
 
 
-def fit_held_out(strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float) -> FittedPress:
+def fit_held_out(
+    strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, prior: Prior | None = None
+) -> FittedPress:
     """Fit these strokes, cut to the inked rows, from the prior: it knows no other stroke of their session."""
     rows = inked_rows([one.ink for one in strokes], grid.px_mm)
     cut = [replace(one, ink=one.ink[rows]) for one in strokes]
-    return fit_presses(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm)
+    return fit_presses(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior=prior)
 
 
 def leave_cell_out(
-    strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, progress: Progress = unseen
-) -> list[HeldOut]:
-    """Score each cell as predicted by fits to other cells; empty for a single cell.
+    strokes: Sequence[Pressed],
+    grid: Grid,
+    radius_mm: float,
+    length_mm: float,
+    prior: Prior | None = None,
+    progress: Progress = unseen,
+) -> tuple[list[HeldOut], Floats]:
+    """Score each cell as predicted by fits to other cells, and find its `zero_touches` for them, (cells, 2) mm.
 
-    `brushloop validate` uses the same fits. Models without enough data are left out: the ceiling needs two strokes of
-    a cell, a regressed Bezier two depths and two tilts among the others.
+    `brushloop validate` uses the same fits. Both are empty for a single cell. Models without enough data are left out:
+    the ceiling needs two strokes of a cell, a regressed Bezier two depths and two tilts among the others. Nothing moved
+    between these presses, so every difference of a zero touch is an error of the model or of a press.
     """
     cells = by_cell(strokes)
     published = FittedPress(radius_mm, length_mm)
-    scores, left = Scores(), folds(list(cells))
+    scores, errors, left = Scores(), [np.empty((0, 2))], folds(list(cells))
     for fold in counted(left, "cells left out in turn", len(left), progress):
         # In 256 levels, as validation stores them: the numbers of both are equal.
         others = [replace(one, ink=to_pixels(np.asarray(one.ink, np.float32)) / 255.0) for one in without(cells, fold)]
-        press = fit_held_out(others, grid, radius_mm, length_mm)
+        press = fit_held_out(others, grid, radius_mm, length_mm, prior)
         models: dict[str, Outline] = {FITTED: press.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
             models[BEZIER] = refit_bezier(others, grid).outline
         for cell in fold:
             scores.add(cells[cell], dict(_images(models, cell, grid)))
-    return scores.rows((CEILING, FITTED, BEZIER, UNCALIBRATED))
+            errors.append(zero_touches(press, cells[cell], grid))
+    return scores.rows((CEILING, FITTED, BEZIER, UNCALIBRATED)), np.concatenate(errors)
 
 
 def _images(

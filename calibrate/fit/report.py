@@ -11,8 +11,8 @@ import numpy as np
 from brushloop.calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
 from brushloop.calibrate.compare.similarity import csim
 from brushloop.calibrate.files import write_whole
-from brushloop.calibrate.fit.captures import Captures, Floats, Grid, Pressed
-from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, Cell, by_cell, predictor
+from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, by_cell
+from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, predictor
 from brushloop.calibrate.fit.run import Fitted
 from brushloop.calibrate.fit.sizes import measure, middle
 from brushloop.calibrate.report import (

@@ -10,9 +10,9 @@ from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import BrushFit
-from brushloop.calibrate.fit.captures import Captures, Floats
-from brushloop.calibrate.fit.fit import fit_presses, touch_errors, zero_touches
-from brushloop.calibrate.fit.heldout import HeldOut, by_cell, leave_cell_out
+from brushloop.calibrate.fit.captures import Captures, Floats, by_cell
+from brushloop.calibrate.fit.fit import fit_presses, zero_touches
+from brushloop.calibrate.fit.heldout import HeldOut, leave_cell_out
 from brushloop.calibrate.fit.sizes import FEWEST_CELLS, Estimate, Size, sizes_of
 from brushloop.calibrate.line import student_95
 from brushloop.model.fitted import NAMES, FittedPress
@@ -50,8 +50,7 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
     """Fit, leave each cell out in turn, and make the artefact."""
     grid, strokes = captures.grid, captures.strokes
     press = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm)
-    held_out = leave_cell_out(strokes, grid, captures.radius_mm, captures.length_mm, progress)
-    errors = touch_errors(strokes, grid, captures.radius_mm, captures.length_mm)
+    held_out, errors = leave_cell_out(strokes, grid, captures.radius_mm, captures.length_mm, progress=progress)
     artefact = BrushFit(
         session_id=captures.header.session_id,
         source=captures.header.source,

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brushloop.calibrate.fit.captures import Floats, Grid, Pressed
-from brushloop.calibrate.fit.heldout import by_cell
+from brushloop.calibrate.fit.captures import Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.line import student_95
 from brushloop.model.plane import fit_plane
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from brushloop.calibrate.compare.ceiling import others_of
 from brushloop.calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, to_tone
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
 from brushloop.calibrate.compare.similarity import Polarity, similarity
@@ -35,8 +36,6 @@ PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
 PAPER_ROWS = {SIMULATED: TABLE_3["ccd-bsmg"], REFERENCE: TABLE_3[ROBOT_WRITING]}
 """The paper's row shown with a comparison: our reading, see `TABLE_3`."""
 NORMAL_SIDE_PX = 100
-MAX_OTHERS = 12
-"""Most other writings that one is compared with; a hundred writings would make ten thousand pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,10 +134,11 @@ def score_character(one: Character) -> Iterator[WrittenScore]:
     """Score every writing in every alignment, tone and polarity; another writing is the mean over the others."""
     for key in KEYS:
         yield _score(one, "", PLANNED, key, one.reference, [one.simulated])
-        for stroke_id, ink in one.captured.items():
+        inks = list(one.captured.values())
+        for k, (stroke_id, ink) in enumerate(one.captured.items()):
             yield _score(one, stroke_id, SIMULATED, key, ink, [one.simulated])
             yield _score(one, stroke_id, REFERENCE, key, one.reference, [ink])
-            if others := _others(one, stroke_id):
+            if others := [inks[j] for j in others_of(k, len(inks))]:
                 yield _score(one, stroke_id, ANOTHER, key, ink, others)
 
 
@@ -162,14 +162,6 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
     # cv2 puts pixel centres on integers, a pixel here covers [j, j + 1).
     move = np.array([[scale, 0.0, middle - 0.5 - scale * (x - 0.5)], [0.0, scale, middle - 0.5 - scale * (y - 0.5)]])
     return cast("Image", cv2.warpAffine(ink, move, (SIZE_PX, SIZE_PX), flags=cv2.INTER_LINEAR).clip(0.0, 1.0))
-
-
-def _others(one: Character, stroke_id: str) -> list[Ink]:
-    """The next `MAX_OTHERS` writings, the last followed by the first."""
-    names = list(one.captured)
-    place = names.index(stroke_id)
-    following = (names[place + 1 :] + names[:place])[:MAX_OTHERS]
-    return [one.captured[name] for name in following]
 
 
 def _score(one: Character, stroke_id: str, pair: str, key: Key, fixed: Ink, others: Sequence[Ink]) -> WrittenScore:

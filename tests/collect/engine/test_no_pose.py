@@ -21,7 +21,7 @@ from brushloop.drivers.samples import Identity
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from tests.collect.tui.fake import SET_UP, FakeEngine, picture
-from tests.collect.tui.test_app import look
+from tests.collect.tui.screen_text import look
 
 WHO = Identity("robot", "aubo_i5", "", True)
 

@@ -7,6 +7,10 @@ from unittest.mock import patch
 from rich.cells import cell_len
 from rich.console import Console  # noqa: TID251
 from textual.app import App
+from textual.pilot import Pilot
+
+from brushloop.collect.tui.app import OperatorApp
+from tests.collect.tui.fake import FakeEngine
 
 
 def has_picture(text: str) -> bool:
@@ -24,3 +28,14 @@ def shown(app: App[None]) -> str:
     assert len(lines) <= app.size.height
     assert all(cell_len(line) <= app.size.width for line in lines)
     return "\n".join(lines)
+
+
+async def look(app: OperatorApp, pilot: Pilot[None]) -> str:
+    """The screen after two polls: the first may come before the layout has its sizes."""
+    engine = app.engine
+    assert isinstance(engine, FakeEngine)
+    enough = engine.looks + 2
+    while engine.looks < enough:
+        await pilot.pause(0.02)
+    await pilot.pause()
+    return shown(app)

@@ -12,8 +12,7 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.question_screens import AskScreen, Confirm
 from brushloop.collect.tui.set_up_screen import SetUpScreen
 from tests.collect.tui.fake import SET_UP, SPLIT, TOUCHED, FakeEngine, picture
-from tests.collect.tui.screen_text import has_picture
-from tests.collect.tui.test_app import look
+from tests.collect.tui.screen_text import has_picture, look
 
 PROMPT = Prompt(
     "Sheet 1 is full. Put a fresh one in, then go on.",

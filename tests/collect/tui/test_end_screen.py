@@ -14,8 +14,7 @@ from brushloop.collect.tui.finish_screen import FinishScreen
 from brushloop.sessions.repair.verify import Verdict
 from tests.collect.tui.fake import DONE, FakeEngine, marked_grid, picture
 from tests.collect.tui.fake_browser import FakeReview
-from tests.collect.tui.screen_text import has_picture
-from tests.collect.tui.test_app import look
+from tests.collect.tui.screen_text import has_picture, look
 
 
 async def test_a_finished_session_is_shown_on_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

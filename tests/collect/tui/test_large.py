@@ -14,8 +14,7 @@ from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.text import age_text
 from brushloop.collect.tui.widgets import KeyBar
 from tests.collect.tui.fake import FakeEngine, capture, full_picture
-from tests.collect.tui.screen_text import has_picture
-from tests.collect.tui.test_app import look
+from tests.collect.tui.screen_text import has_picture, look
 
 
 async def test_enter_shows_the_last_capture_large_with_the_missed_check_first() -> None:

@@ -29,8 +29,7 @@ from brushloop.sessions.remarks import remarks_of
 from brushloop.sessions.repair.verify import Finding, Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
-from tests.collect.tui.screen_text import has_picture, shown
-from tests.collect.tui.test_app import look
+from tests.collect.tui.screen_text import has_picture, look, shown
 
 
 class Beginning(FakeBrowser):
