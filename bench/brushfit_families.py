@@ -47,19 +47,19 @@ class MadeUp:
     length_tilt: float
     heel_tilt: float
 
-    def press(self, height_mm: float, tilt_deg: float, grid: Grid) -> Pressed:
+    def press(self, depth_mm: float, tilt_deg: float, grid: Grid) -> Pressed:
         """The press, without any variation."""
-        reach = self.reach_mm * ((height_mm + self.reach_offset_mm) / 15.0) ** self.reach_power
+        reach = self.reach_mm * ((depth_mm + self.reach_offset_mm) / 15.0) ** self.reach_power
         reach *= 1.0 + self.length_tilt * tilt_deg
-        half = self.half_mm * ((height_mm + self.half_offset_mm) / 15.0) ** self.half_power
+        half = self.half_mm * ((depth_mm + self.half_offset_mm) / 15.0) ** self.half_power
         half *= 1.0 + self.width_tilt * tilt_deg
-        widest = self.place_mm - self.place_gain * height_mm + self.lean * height_mm * math.tan(math.radians(tilt_deg))
+        widest = self.place_mm - self.place_gain * depth_mm + self.lean * depth_mm * math.tan(math.radians(tilt_deg))
         heel = reach * self.heel_share * max(0.3, 1.0 + self.heel_tilt * tilt_deg)
         tip = reach * (1.0 - self.heel_share)
         u = grid.x_mm - widest
         share = np.where(u > 0.0, u / heel, u / tip)
         edge = np.where(np.abs(share) < 1.0, half * self.shape(np.clip(share, -1.0, 1.0)), -1.0)
-        return Pressed(height_mm, tilt_deg, chance_within(np.stack([edge, edge]), grid.y_mm, EDGE_MM))
+        return Pressed(depth_mm, tilt_deg, chance_within(np.stack([edge, edge]), grid.y_mm, EDGE_MM))
 
 
 def made_up(family: str, number: int, seed: int = 0) -> MadeUp:

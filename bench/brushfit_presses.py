@@ -102,7 +102,7 @@ def bristles(name: str) -> BrushPresses:
         options = ImportOptions(kind="press", simulated=True)
         import_photographs(photos, photos / "strokes.csv", session, options, "bench", lambda: 1)
         captures = read_presses(session, Field())
-    by_cell = [[s.ink for s in captures.strokes if (s.height_mm, s.tilt_deg) == cell] for cell in CELLS]
+    by_cell = [[s.ink for s in captures.strokes if (s.depth_mm, s.tilt_deg) == cell] for cell in CELLS]
     return BrushPresses(name, captures.radius_mm, captures.length_mm, captures.grid, np.array(by_cell, np.float32))
 
 

@@ -131,7 +131,7 @@ def _planned(spec: BrushSpec, footprint: Footprint) -> PlanRecord:
         radius_mm=spec.radius_mm,
         length_mm=spec.length_mm,
         lam=None,
-        height_range_mm=reach.height_mm,
+        depth_range_mm=reach.depth_mm,
         tilt_range_deg=reach.tilt_deg,
         turn_deg_mm=reach.turn_deg_mm,
         speed_mm_s=15.0,

@@ -107,7 +107,7 @@ def _touch(
     strokes, of_brush = brush.strokes(chosen), (brush.grid, brush.radius_mm, brush.length_mm)
     _, errors = leave_cell_out(strokes, *of_brush, prior)
     now = [
-        Pressed(one.height_mm - deeper, one.tilt_deg, np.roll(one.ink, moved, axis=1)) for one in brush.strokes(later)
+        Pressed(one.depth_mm - deeper, one.tilt_deg, np.roll(one.ink, moved, axis=1)) for one in brush.strokes(later)
     ]
     touches = zero_touches(fit_presses(strokes, *of_brush, prior=prior), now, brush.grid)
     lift, along = touch_estimates(touches, errors)

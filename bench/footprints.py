@@ -39,12 +39,12 @@ def draw(path: Path) -> None:
     from matplotlib.figure import Figure
 
     cell_mm = LEFT_MM + RIGHT_MM
-    width_mm = SIDE_MM + cell_mm * len(TILTS_DEG) + 2.0
-    height_mm = HEAD_MM + ROW_MM * len(HEIGHTS_MM) + FOOT_MM
-    figure = Figure((width_mm / MM_PER_INCH, height_mm / MM_PER_INCH), dpi=DPI, facecolor=PAPER)
+    size_x_mm = SIDE_MM + cell_mm * len(TILTS_DEG) + 2.0
+    size_y_mm = HEAD_MM + ROW_MM * len(HEIGHTS_MM) + FOOT_MM
+    figure = Figure((size_x_mm / MM_PER_INCH, size_y_mm / MM_PER_INCH), dpi=DPI, facecolor=PAPER)
     FigureCanvasAgg(figure)
     axes: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, width_mm), ylim=(height_mm, 0.0), aspect="equal")
+    axes.set(xlim=(0.0, size_x_mm), ylim=(size_y_mm, 0.0), aspect="equal")
     axes.axis("off")
     ink = LinearSegmentedColormap.from_list("ink", [PAPER, INK])
     brush = Brush(BrushSpec())
@@ -58,7 +58,7 @@ def draw(path: Path) -> None:
             for side in (-1.0, 1.0):
                 _outline(axes, float(height), tilt_deg, x_mm, y_mm, side)
             axes.plot([x_mm], [y_mm], marker="+", color=MODEL, markersize=5, markeredgewidth=0.7)
-    _words(axes, width_mm, height_mm, cell_mm)
+    _words(axes, size_x_mm, size_y_mm, cell_mm)
     figure.savefig(path, dpi=DPI, metadata={"Software": None})
 
 
@@ -70,18 +70,18 @@ def _footprint(axes: Any, mark: Footprint, x_mm: float, y_mm: float, ink: Any) -
     axes.imshow(mark.density, cmap=ink, vmin=0.0, vmax=1.0, extent=extent, interpolation="antialiased")
 
 
-def _outline(axes: Any, height_mm: float, tilt_deg: float, x_mm: float, y_mm: float, side: float) -> None:
+def _outline(axes: Any, depth_mm: float, tilt_deg: float, x_mm: float, y_mm: float, side: float) -> None:
     """One side of CCD-BSM's mark; its origin lies H tan(alpha) from the zero-touch point, as in `validate`."""
-    mark = ccdbsm(ModelBrush(), height_mm, tilt_deg)
+    mark = ccdbsm(ModelBrush(), depth_mm, tilt_deg)
     # Points crowd at both ends, where the outline turns fastest.
     share = 0.5 - 0.5 * torch.cos(torch.linspace(0.0, math.pi, POINTS, dtype=torch.float64))
     along = mark.x_min_mm[:, None] + share * mark.length_mm[:, None]
     across = side * mark.half_width(along)[0]
-    shift_mm = x_mm + height_mm * math.tan(math.radians(tilt_deg))
+    shift_mm = x_mm + depth_mm * math.tan(math.radians(tilt_deg))
     axes.plot((along[0] + shift_mm).tolist(), (across + y_mm).tolist(), color=MODEL, linewidth=1.1)
 
 
-def _words(axes: Any, width_mm: float, height_mm: float, cell_mm: float) -> None:
+def _words(axes: Any, size_x_mm: float, size_y_mm: float, cell_mm: float) -> None:
     """Label, headings, legend and scale."""
     axes.text(SIDE_MM, 5.0, LABEL, fontsize=13, fontweight="bold", va="center", color=INK)
     axes.text(
@@ -94,8 +94,8 @@ def _words(axes: Any, width_mm: float, height_mm: float, cell_mm: float) -> None
     axes.text(SIDE_MM - 1.5, HEAD_MM - 3.0, "H mm", ha="right", va="center", fontsize=8, color=FAINT)
     for row in range(len(HEIGHTS_MM) + 1):
         y_mm = HEAD_MM + ROW_MM * row
-        axes.plot([SIDE_MM, width_mm - 2.0], [y_mm, y_mm], color=FAINT, linewidth=0.3, alpha=0.5)
-    foot_mm = height_mm - FOOT_MM / 2
+        axes.plot([SIDE_MM, size_x_mm - 2.0], [y_mm, y_mm], color=FAINT, linewidth=0.3, alpha=0.5)
+    foot_mm = size_y_mm - FOOT_MM / 2
     axes.plot([SIDE_MM, SIDE_MM + 10.0], [foot_mm, foot_mm], color=INK, linewidth=2.0, solid_capstyle="butt")
     axes.text(SIDE_MM + 11.5, foot_mm, "10 mm", va="center", fontsize=8, color=INK)
     axes.plot([SIDE_MM + 30.0, SIDE_MM + 36.0], [foot_mm, foot_mm], color=MODEL, linewidth=1.1)

@@ -34,7 +34,7 @@ HEIGHT_MM, ALPHA_DEG, BINARY_MM, NOMINAL, MS = 0.001, 0.05, 0.02, 95.0, 2.0
 class Presses:
     """Drawn presses: what they were and their clean images."""
 
-    height_mm: Floats
+    depth_mm: Floats
     tilt_deg: Floats
     place_mm: Floats
     heading_deg: Floats
@@ -144,7 +144,7 @@ class Labelled:
 
 def _errors(labelled: Labelled, name: str, found: Recovered, drawn: Presses, *, worst: bool) -> Sequence[Result]:
     kind = "worst" if worst else "mean"
-    off_mm, off_deg = np.abs(found.height_mm - drawn.height_mm), np.abs(found.tilt_deg - drawn.tilt_deg)
+    off_mm, off_deg = np.abs(found.depth_mm - drawn.depth_mm), np.abs(found.tilt_deg - drawn.tilt_deg)
     mm, deg = (float(off.max() if worst else off.mean()) for off in (off_mm, off_deg))
     asked_mm = HEIGHT_MM if worst else BINARY_MM
     out = [labelled(f"{name}-H-{kind}", mm, "mm", f"the {asked_mm:g} mm asked for", asked_mm / max(mm, 1e-12))]
@@ -166,10 +166,10 @@ def _guessed(drawn: Presses) -> float:
 
 def _coverages(labelled: Labelled, name: str, found: Recovered, drawn: Presses) -> Sequence[Result]:
     out: list[Result] = []
-    for parameter, true in (("height_mm", drawn.height_mm), ("tilt_deg", drawn.tilt_deg)):
+    for parameter, true in (("depth_mm", drawn.depth_mm), ("tilt_deg", drawn.tilt_deg)):
         low, high = found.interval(parameter)
         share = 100 * float(((low <= true) & (true <= high)).mean())
-        letter = "H" if parameter == "height_mm" else "alpha"
+        letter = "H" if parameter == "depth_mm" else "alpha"
         out.append(labelled(f"{name}-coverage-{letter}", share, "%", "the nominal 95 %", share / NOMINAL))
     return out
 
@@ -191,10 +191,10 @@ def _autograd(drawn: Presses, few: int) -> None:
         return coverage_at(ccdbsm(Brush(), height, tilt), origin, px_mm=PX_MM)
 
     with torch.no_grad():
-        pressed = torch.from_numpy(np.column_stack((drawn.height_mm, drawn.tilt_deg))[:few])
+        pressed = torch.from_numpy(np.column_stack((drawn.depth_mm, drawn.tilt_deg))[:few])
         images = render(pressed).float().numpy()
     found = invert_rendered(render, images, Range((10.0, 21.0), (0.0, 12.0)), anchored=True, px_mm=PX_MM)
-    assert np.abs(found.height_mm - drawn.height_mm[:few]).max() < HEIGHT_MM
+    assert np.abs(found.depth_mm - drawn.depth_mm[:few]).max() < HEIGHT_MM
 
 
 def _rounded(images: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -92,10 +92,10 @@ def invert_rendered(
     target = np.ascontiguousarray(images, np.float32)
     seen = moments_of(target, px_mm)
     forward = Rendered(render)
-    heights = np.linspace(*within.height_mm, TABLE_DEPTHS)
+    heights = np.linspace(*within.depth_mm, TABLE_DEPTHS)
     table = Table.of(forward, heights, np.linspace(*within.tilt_deg, TABLE_TILTS), (0.0, 0.0), px_mm)
     none = np.zeros(len(target))
     start = table.nearest(seen, np.zeros((len(target), 2)), none)[:, :2]
     full = np.column_stack((start, np.zeros((len(target), 3))))
-    limits = limits_of(PARAMETERS[:2], {"height_mm": within.height_mm, "tilt_deg": within.tilt_deg})
+    limits = limits_of(PARAMETERS[:2], {"depth_mm": within.depth_mm, "tilt_deg": within.tilt_deg})
     return recover(forward, target, full, limits, noise, seen.area < MIN_INK_MM2, alpha_known=anchored, near_mm=px_mm)

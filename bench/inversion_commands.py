@@ -54,13 +54,13 @@ def intervals(seed: int) -> Iterator[Result]:
     every: list[Row] = []
     for brush, prior in _brushes():
         found = recover(brush, prior, seed)
-        others = [row for row in found.rows if (row.commanded_height_mm, row.commanded_tilt_deg) not in fitted]
-        alone = [row for row in found.alone if (row.commanded_height_mm, row.commanded_tilt_deg) not in fitted]
+        others = [row for row in found.rows if (row.commanded_depth_mm, row.commanded_tilt_deg) not in fitted]
+        alone = [row for row in found.alone if (row.commanded_depth_mm, row.commanded_tilt_deg) not in fitted]
         every += others
         flagged = Counter(flag for row in others for flag in row.flags) + found.refused
         reasons = ", ".join(f"{count} {flag}" for flag, count in sorted(flagged.items())) or "none"
         for letter, unit in (("H", "mm"), ("alpha", "deg")):
-            sd = np.median([row.height_sd_mm if letter == "H" else row.tilt_sd_deg or np.nan for row in found.rows])
+            sd = np.median([row.depth_sd_mm if letter == "H" else row.tilt_sd_deg or np.nan for row in found.rows])
             where = (
                 f"all {len(found.rows)} presses: {held(found.rows, letter):.0f} %; left-out ones by the image alone "
                 f"{held(alone, letter):.0f} %; median sd {sd:.2f} {unit}; flagged: {reasons}"
@@ -107,7 +107,7 @@ def recover(brush: BrushPresses, prior: Prior, seed: int) -> Recovery:
 def held(rows: Sequence[Row], letter: str) -> float:
     """Percent of the rows whose interval holds the command."""
     if letter == "H":
-        off = [abs(r.height_mm - (r.commanded_height_mm or 0.0)) / r.height_sd_mm for r in rows]
+        off = [abs(r.depth_mm - (r.commanded_depth_mm or 0.0)) / r.depth_sd_mm for r in rows]
     else:
         off = [abs(r.tilt_deg - (r.commanded_tilt_deg or 0.0)) / (r.tilt_sd_deg or np.nan) for r in rows]
     return 100.0 * float(np.mean(np.array(off) <= NORMAL_95))

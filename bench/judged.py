@@ -30,7 +30,7 @@ MOST_STARTS_WITH_STOPS = 40
 BETWEEN_STOPS_S = (8.0, 20.0)
 LONGEST_S = 1200.0
 PROTOCOL = """kind = "grid"
-heights_mm = [11.0, 13.0, 15.0, 17.0, 20.0]
+depths_mm = [11.0, 13.0, 15.0, 17.0, 20.0]
 tilts_deg = [0.0, 5.0, 10.0]
 repeats = 2
 seed = {seed}

@@ -53,7 +53,7 @@ def run(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
 def close_the_loop(folder: Path, brush: int, seed: int) -> dict[str, Any]:
     """Collect a grid, run `brushloop loop`; returns its loop.json."""
     rig, protocol, sessions = folder / "rig.toml", folder / "protocol.toml", folder / "sessions"
-    grid = f'kind = "grid"\nheights_mm = {HEIGHTS_MM}\ntilts_deg = {TILTS_DEG}\nrepeats = {REPEATS}\nseed = {seed}\n'
+    grid = f'kind = "grid"\ndepths_mm = {HEIGHTS_MM}\ntilts_deg = {TILTS_DEG}\nrepeats = {REPEATS}\nseed = {seed}\n'
     protocol.write_text(grid, encoding="utf-8")
     with started("bench.loop_rig", str(rig), str(brush), str(RATE)) as process:
         brushloop("collect", "--config", rig, "--protocol", protocol, "--out", sessions, "--no-tui", ends=ENDS)

@@ -206,7 +206,7 @@ def _write_protocol(path: Path, strokes: int, seed: int) -> None:
     repeats = -(-strokes // len(heights))
     if repeats * len(heights) != strokes:
         raise ValueError(f"n = {strokes}: up to {len(HEIGHTS_MM)}, or a multiple of it")
-    text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = [5.0]\nrepeats = {repeats}\n'
+    text = f'kind = "grid"\ndepths_mm = {heights}\ntilts_deg = [5.0]\nrepeats = {repeats}\n'
     path.write_text(f"{text}dwell_s = {DWELL_S}\nseed = {seed}\n", encoding="utf-8")
 
 

@@ -108,7 +108,7 @@ async def photograph(path: Path, seed: int) -> None:
                 break
             try:
                 if procedures.photographer.delay is not None:
-                    cell = cells.cell(rng.randrange(cells.capacity))
+                    cell = cells.patch(rng.randrange(cells.capacity))
                     down, up = press_moves(config, procedures.plane, cell, rng.uniform(11.0, 20.0), 0.0)
                     for move in [*down, *up]:
                         await procedures.go(move)

@@ -100,10 +100,10 @@ def sheet(rig: int, presses: int, seed: int = 0) -> Shot:
     cells = [(h, a) for h in HEIGHTS_MM for a in TILTS_DEG]
     anchors: list[tuple[float, float]] = []
     for index, cell in enumerate(rng.permutation(len(cells))[:presses]):
-        height_mm, tilt_deg = cells[cell]
+        depth_mm, tilt_deg = cells[cell]
         # 40 x 34 mm apart: no mark reaches into the window of another.
         place = (36.0 + 40.0 * (index % 5) + rng.uniform(-1, 1), 30.0 + 44.0 * (index // 5) + rng.uniform(-1, 1))
-        mark = world.brush.press(height_mm, tilt_deg, ink_load=rng.uniform(0.85, 1.0), press_seed=1000 * rig + index)
+        mark = world.brush.press(depth_mm, tilt_deg, ink_load=rng.uniform(0.85, 1.0), press_seed=1000 * rig + index)
         world.paper.lay(mark, *place, 0.0)
         anchors.append(place)
     return _photographed(world, tuple(anchors))

@@ -74,7 +74,7 @@ def photographs(photos: Path, presses: Presses) -> Path:
 
 def write_table(photos: Path, presses: Presses) -> None:
     """Write `strokes.csv`, the table for an import of the first `presses.strokes` photographs."""
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k in range(presses.strokes):
         height, tilt = CELLS[k % presses.distinct % len(CELLS)]
         lines.append(f"{k:06d}.png,{height},{tilt},{PX_MM},{presses.view.touch_px[0]},{presses.view.touch_px[1]}")
@@ -87,7 +87,7 @@ def pressed(cell: tuple[float, float], repeats: int, seed: int) -> list[Press]:
         photos = Path(folder) / "photos"
         photos.mkdir()
         brush = Brush(BrushSpec(seed=1 + seed))
-        lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+        lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
         for k in range(repeats):
             cv2.imwrite(str(photos / f"{k:03d}.png"), photograph(brush, *cell, seed + k))
             lines.append(f"{k:03d}.png,{cell[0]},{cell[1]},{PX_MM},{CLOSE.touch_px[0]},{CLOSE.touch_px[1]}")
@@ -97,9 +97,9 @@ def pressed(cell: tuple[float, float], repeats: int, seed: int) -> list[Press]:
         return [prepare_job(PrepareJob(capture, None, Field())) for capture in Recording(out).captures()]
 
 
-def photograph(brush: Brush, height_mm: float, tilt_deg: float, seed: int, view: View = CLOSE) -> NDArray[np.uint8]:
+def photograph(brush: Brush, depth_mm: float, tilt_deg: float, seed: int, view: View = CLOSE) -> NDArray[np.uint8]:
     """A press on white paper, its tip touching at the view's place."""
-    mark = brush.press(height_mm, tilt_deg, ink_load=1.0, press_seed=seed)
+    mark = brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=seed)
     page = np.full((view.height_px, view.width_px), 235, np.uint8)
     rows, columns = mark.density.shape
     left, top = view.touch_px[0] - round(mark.origin_px[0]), view.touch_px[1] - round(mark.origin_px[1])

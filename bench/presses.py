@@ -44,14 +44,14 @@ async def measure(rig: RigConfig, controller: Process, rate: float, n: int, seed
         await robot.enable()
         # The first press at each depth and tilt solves the spine; neither side is timed for that.
         for measured in (False, True):
-            for index, (height_mm, tilt_deg) in enumerate(wanted if measured else sorted(set(wanted))):
+            for index, (depth_mm, tilt_deg) in enumerate(wanted if measured else sorted(set(wanted))):
                 if index % PRESSES_PER_DIP == 0:
                     await _carry_out(robot, dip(rig), rig)
-                moves = press(rig, height_mm, tilt_deg)
+                moves = press(rig, depth_mm, tilt_deg)
                 began_s = time.perf_counter()
                 await _carry_out(robot, moves, rig)
                 pressed_s = time.perf_counter()
-                brush.press(height_mm, tilt_deg, ink_load=1.0, press_seed=index)
+                brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=index)
                 if measured:
                     ours_s += pressed_s - began_s
                     brush_s += time.perf_counter() - pressed_s
@@ -66,7 +66,7 @@ async def measure(rig: RigConfig, controller: Process, rate: float, n: int, seed
     return [Result("presses", n / ours_s, "presses/s", peer, brush_s / ours_s, n, seed, conditions)]
 
 
-def press(rig: RigConfig, height_mm: float, tilt_deg: float) -> Moves:
+def press(rig: RigConfig, depth_mm: float, tilt_deg: float) -> Moves:
     """The moves of a press in a protocol: over the place, down, tilt, touch, press, lift, up."""
     motion, touch_mm = rig.motion, rig.paper.touch_z_mm
     x_mm, y_mm = to_base(rig.paper, *PLACE_MM)
@@ -80,7 +80,7 @@ def press(rig: RigConfig, height_mm: float, tilt_deg: float) -> Moves:
         (pose(touch_mm + CLEARANCE_MM, 0.0), fast),
         (pose(touch_mm + CLEARANCE_MM, tilt_deg), slow),
         (pose(touch_mm, tilt_deg), slow),
-        (pose(touch_mm - height_mm, tilt_deg), slow),
+        (pose(touch_mm - depth_mm, tilt_deg), slow),
         (pose(touch_mm + CLEARANCE_MM, tilt_deg), slow),
         (pose(motion.safe_z_mm, 0.0), fast),
     ]

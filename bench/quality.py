@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from bench.harness import BenchError, Result, percentile
-from bench.quality_set import Patch, Sample, draw_set
-from brushloop.collect.quality.checks import cell_is_blank, check_capture
+from bench.quality_set import Blank, Sample, draw_set
+from brushloop.collect.quality.checks import check_capture, patch_is_blank
 from brushloop.collect.quality.verdict import Failure
 from brushloop.collect.rig.config_quality import QualityConfig
 
@@ -28,7 +28,7 @@ class Score:
     """What was, and what it was called."""
 
     counts: Counter[tuple[Called, Called]] = field(default_factory=Counter[tuple[Called, Called]])
-    patches: Counter[tuple[bool, bool]] = field(default_factory=Counter[tuple[bool, bool]])
+    blanks_seen: Counter[tuple[bool, bool]] = field(default_factory=Counter[tuple[bool, bool]])
     """(blank by the sheet, called blank)."""
     seconds: list[float] = field(default_factory=list[float])
 
@@ -59,20 +59,20 @@ class Score:
         return ", ".join(wrong) or "nothing else"
 
 
-def score(samples: Iterable[Sample | Patch], limits: QualityConfig, *, with_previous: bool = True) -> Score:
-    """Judge every capture and every patch; the still before a press is withheld where `with_previous` is false."""
+def score(samples: Iterable[Sample | Blank], limits: QualityConfig, *, with_previous: bool = True) -> Score:
+    """Judge every capture and every blank patch; without `with_previous` the still before a press is withheld."""
     scores = Score()
     for sample in samples:
-        if isinstance(sample, Patch):
-            seen = cell_is_blank(sample.image, sample.plane, sample.cell, limits=limits)
-            scores.patches[sample.blank, seen.passed] += 1
+        if isinstance(sample, Blank):
+            seen = patch_is_blank(sample.image, sample.plane, sample.patch, limits=limits)
+            scores.blanks_seen[sample.blank, seen.passed] += 1
             continue
         began = time.perf_counter()
         verdict = check_capture(
             sample.image,
             sample.plane,
-            sample.cell,
-            height_mm=sample.height_mm,
+            sample.patch,
+            depth_mm=sample.depth_mm,
             limits=limits,
             previous=sample.before if with_previous else None,
             sheet_mm=sample.sheet_mm,
@@ -125,8 +125,8 @@ def table(scores: Score) -> str:
         counts = " | ".join(str(scores.counts[label, called] or "") for called in LABELS)
         figures = f"{scores.of(label)} | {scores.recall(label):.3f} | {scores.precision(label):.3f}"
         lines.append(f"| **{_word(label)}** | {counts} | {figures} |")
-    blank, inked = scores.patches[True, True], scores.patches[False, False]
-    blanks, inkeds = blank + scores.patches[True, False], inked + scores.patches[False, True]
+    blank, inked = scores.blanks_seen[True, True], scores.blanks_seen[False, False]
+    blanks, inkeds = blank + scores.blanks_seen[True, False], inked + scores.blanks_seen[False, True]
     lines += [
         "",
         f"False alarms on sound strokes: {100.0 * scores.false_alarms:.1f} %. "

@@ -20,7 +20,7 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.collect.quality.checks import check_capture
 from brushloop.collect.quality.verdict import Failure, Verdict
 from brushloop.collect.rig.config_quality import QualityConfig
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 
 WHITENED = QualityConfig(bright_level=256.0, glare_mm2=1e6)
 """For paper that whoever published it has set to 255: neither exposure nor glare can be judged."""
@@ -37,13 +37,13 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def judge(folder: Path, row: dict[str, str], limits: QualityConfig) -> Verdict:
-    """The verdict on one photograph as a whole, as if it were a cell. Raises BenchError where it cannot be read."""
+    """The verdict on one photograph as a whole, as if it were a patch. Raises BenchError where it cannot be read."""
     image = cv2.imread(str(folder / row["file"]), cv2.IMREAD_GRAYSCALE)
     if image is None:  # pyright: ignore[reportUnnecessaryComparison]
         raise BenchError(f"{folder / row['file']} is no picture")
     x_mm, y_mm = 1.0 / float(row["px_per_mm_x"]), 1.0 / float(row["px_per_mm_y"])
-    width_mm, height_mm = image.shape[1] * x_mm, image.shape[0] * y_mm
-    to_paper = np.array([[x_mm, 0.0, 0.5 * x_mm], [0.0, -y_mm, height_mm - 0.5 * y_mm], [0.0, 0.0, 1.0]])
+    size_x_mm, size_y_mm = image.shape[1] * x_mm, image.shape[0] * y_mm
+    to_paper = np.array([[x_mm, 0.0, 0.5 * x_mm], [0.0, -y_mm, size_y_mm - 0.5 * y_mm], [0.0, 0.0, 1.0]])
     scale = float(np.sqrt(x_mm * y_mm))
     return check_capture(
         image.astype(np.uint8),
@@ -58,11 +58,11 @@ def judge(folder: Path, row: dict[str, str], limits: QualityConfig) -> Verdict:
             corners=0,
             dropped=(),
         ),
-        Cell(0, 0.0, 0.0, width_mm, height_mm),
-        height_mm=max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0),
+        Patch(0, 0.0, 0.0, size_x_mm, size_y_mm),
+        depth_mm=max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0),
         limits=limits,
-        sheet_mm=(width_mm, height_mm),
-        anchor_mm=(float(row["start_x_px"]) * x_mm, height_mm - float(row["start_y_px"]) * y_mm),
+        sheet_mm=(size_x_mm, size_y_mm),
+        anchor_mm=(float(row["start_x_px"]) * x_mm, size_y_mm - float(row["start_y_px"]) * y_mm),
     )
 
 

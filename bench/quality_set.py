@@ -20,7 +20,7 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import see_board
 from brushloop.collect.quality.verdict import Failure
 from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.paper import Cell, Sheet
+from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec, Flaw
 from brushloop.drivers.sim.brush.drag import Waypoint
@@ -35,9 +35,9 @@ GOOD_SHARE = 0.4
 INK = 0.3
 """Ink per area above which a patch of the sheet counts as inked, for the labels."""
 FOREIGN_MM2 = 4.0
-"""Somebody else's ink in the cell from which a capture is labelled `neighbour`."""
+"""Somebody else's ink in the patch from which a capture is labelled `neighbour`."""
 SPOTLESS_MM2 = 0.2
-"""Ink up to which a cell is labelled blank; between the two it has no label."""
+"""Ink up to which a patch is labelled blank; between the two it has no label."""
 DRIP_MM = 3.5
 """Drops closer to the stroke than this are not drawn: they may as well be taken for a part of it."""
 HIDDEN_MM = 1.5
@@ -56,20 +56,20 @@ class Sample:
     before: Gray
     """The still before this press."""
     plane: Plane
-    cell: Cell
-    height_mm: float
+    patch: Patch
+    depth_mm: float
     tilt_deg: float
     sheet_mm: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
-    """A cell before a press, and whether there is ink in it."""
+class Blank:
+    """A patch before a press, and whether there is ink in it."""
 
     blank: bool
     image: Gray
     plane: Plane
-    cell: Cell
+    patch: Patch
 
 
 class Bench:
@@ -93,29 +93,29 @@ class Bench:
         self.plane = see_board(self.still, self._board)
         self._presses = 0
 
-    def samples(self) -> Iterator[Sample | Patch]:
-        """A patch, then the press on it, cell by cell; cells that hold ink are passed over, as a session would."""
+    def samples(self) -> Iterator[Sample | Blank]:
+        """A patch, then the press on it, patch by patch; patches that hold ink are passed over, as a session would."""
         for index in range(self.sheet.capacity):
-            cell = self.sheet.cell(index)
-            there = self.ink_mm2(cell)
+            patch = self.sheet.patch(index)
+            there = self.ink_mm2(patch)
             if there >= FOREIGN_MM2 or there <= SPOTLESS_MM2:
-                yield Patch(there <= SPOTLESS_MM2, self.still, self.plane, cell)
+                yield Blank(there <= SPOTLESS_MM2, self.still, self.plane, patch)
             if there > SPOTLESS_MM2:
                 continue
             good = self.rng.random() < GOOD_SHARE
             label = None if good else list(Failure)[int(self.rng.integers(len(Failure)))]
-            sample = self.capture(cell, label)
+            sample = self.capture(patch, label)
             if sample is not None:
                 yield sample
-            if self.rng.random() < 0.2 and self.ink_mm2(cell) >= FOREIGN_MM2:
-                yield Patch(False, self.still, self.plane, cell)
+            if self.rng.random() < 0.2 and self.ink_mm2(patch) >= FOREIGN_MM2:
+                yield Blank(False, self.still, self.plane, patch)
 
-    def capture(self, cell: Cell, label: Failure | None) -> Sample | None:
-        """Press on the cell and photograph it with that failure; None where this draw did not bring it about."""
+    def capture(self, patch: Patch, label: Failure | None) -> Sample | None:
+        """Press on the patch and photograph it with that failure; None where this draw did not bring it about."""
         rng = self.rng
-        height_mm, tilt_deg = round(rng.uniform(11.0, 20.0), 1), round(rng.uniform(0.0, 10.0), 1)
+        depth_mm, tilt_deg = round(rng.uniform(11.0, 20.0), 1), round(rng.uniform(0.0, 10.0), 1)
         load, flaw, severity = rng.uniform(0.8, 1.0), None, 0.0
-        aside_mm = off_mm = np.array(cell.anchor_mm) + np.clip(rng.normal(0.0, 0.2, 2), -0.5, 0.5)
+        aside_mm = off_mm = np.array(patch.anchor_mm) + np.clip(rng.normal(0.0, 0.2, 2), -0.5, 0.5)
         pressed = True
         match label:
             case Failure.BLANK:
@@ -146,30 +146,30 @@ class Bench:
                 if not self._on_sheet(aside_mm):
                     return None
             case Failure.NEIGHBOUR if rng.random() < 0.5:
-                self._overrun(cell)
+                self._overrun(patch)
                 self.still = self._render()
             case _:
                 pass
         already = self.world.paper.density.copy()
         if label is Failure.SMEARED:
-            deep = Waypoint(float(off_mm[0]), float(off_mm[1]), height_mm)
-            away = Waypoint(float(aside_mm[0]), float(aside_mm[1]), height_mm * rng.uniform(0.3, 1.0))
+            deep = Waypoint(float(off_mm[0]), float(off_mm[1]), depth_mm)
+            away = Waypoint(float(aside_mm[0]), float(aside_mm[1]), depth_mm * rng.uniform(0.3, 1.0))
             path = (dataclasses.replace(deep, depth_mm=0.0), deep, away, deep, dataclasses.replace(deep, depth_mm=0.0))
             mark = self.world.brush.drag(path, tilt_deg, 0.0, ink_load=load, press_seed=self._next_seed())
             self.world.paper.lay(mark, deep.x_mm, deep.y_mm, 0.0)
         elif pressed:
-            mark = self._press(height_mm, tilt_deg, load, flaw, severity if flaw else 1.0)
+            mark = self._press(depth_mm, tilt_deg, load, flaw, severity if flaw else 1.0)
             self.world.paper.lay(mark, float(off_mm[0]), float(off_mm[1]), 0.0)
         own = self.world.paper.density - already
-        if label is Failure.NEIGHBOUR and self._foreign(cell, already) < FOREIGN_MM2 and not self._drip(cell, own):
+        if label is Failure.NEIGHBOUR and self._foreign(patch, already) < FOREIGN_MM2 and not self._drip(patch, own):
             label = None
         before, self.still = self.still, self._render()
-        sample = Sample(label, severity, self.still, before, self.plane, cell, height_mm, tilt_deg, self.table.sheet_mm)
+        sample = Sample(label, severity, self.still, before, self.plane, patch, depth_mm, tilt_deg, self.table.sheet_mm)
         return self._photographed(sample, own, already)
 
-    def ink_mm2(self, cell: Cell) -> float:
-        """How much of the cell is inked, by the sheet itself."""
-        return self._foreign(cell, self.world.paper.density)
+    def ink_mm2(self, patch: Patch) -> float:
+        """How much of the patch is inked, by the sheet itself."""
+        return self._foreign(patch, self.world.paper.density)
 
     def _photographed(self, sample: Sample, own: NDArray[np.float32], already: NDArray[np.float32]) -> Sample | None:
         """The same capture with the camera at fault, where the label says so."""
@@ -234,29 +234,29 @@ class Bench:
         width, height = columns.max() / PX_PER_MM - left, rows.max() / PX_PER_MM - top
         return left, self.table.sheet_mm[1] - top - height, width, height
 
-    def _overrun(self, cell: Cell) -> None:
-        """A press in a neighbouring cell whose mark reaches into this one."""
+    def _overrun(self, patch: Patch) -> None:
+        """A press in a neighbouring patch whose mark reaches into this one."""
         rng = self.rng
         for _ in range(20):
             aside = rng.choice([-1.0, 1.0]) * rng.uniform(10.0, 16.0)
-            place = np.array(cell.anchor_mm) + np.array([rng.uniform(-14.0, 4.0), aside])
+            place = np.array(patch.anchor_mm) + np.array([rng.uniform(-14.0, 4.0), aside])
             if not self._on_sheet(place):
                 continue
             before = self.world.paper.density.copy()
             mark = self._press(rng.uniform(11.0, 20.0), rng.uniform(0.0, 10.0), rng.uniform(0.8, 1.0), None, 1.0)
             self.world.paper.lay(mark, float(place[0]), float(place[1]), 0.0)
-            if self.ink_mm2(cell) >= FOREIGN_MM2:
+            if self.ink_mm2(patch) >= FOREIGN_MM2:
                 return
             self.world.paper.density = before
 
-    def _drip(self, cell: Cell, own: NDArray[np.float32]) -> bool:
-        """A drop of ink in the cell, well away from the stroke, that fell during the press."""
+    def _drip(self, patch: Patch, own: NDArray[np.float32]) -> bool:
+        """A drop of ink in the patch, well away from the stroke, that fell during the press."""
         rng = self.rng
         away = cv2.distanceTransform((own <= INK).astype(np.uint8), cv2.DIST_L2, 5) / PX_PER_MM
         for _ in range(50):
             radius = rng.uniform(1.3, 3.0)
-            x = cell.x_mm + rng.uniform(radius, cell.width_mm - radius)
-            y = cell.y_mm + rng.uniform(radius, cell.height_mm - radius)
+            x = patch.x_mm + rng.uniform(radius, patch.size_x_mm - radius)
+            y = patch.y_mm + rng.uniform(radius, patch.size_y_mm - radius)
             at = away[int((self.table.sheet_mm[1] - y) * PX_PER_MM), int(x * PX_PER_MM)]
             if at < radius + DRIP_MM:
                 continue
@@ -268,16 +268,16 @@ class Bench:
             return True
         return False
 
-    def _foreign(self, cell: Cell, density: NDArray[np.float32]) -> float:
-        top = round((self.table.sheet_mm[1] - cell.y_mm - cell.height_mm) * PX_PER_MM)
-        left = round(cell.x_mm * PX_PER_MM)
-        rows = slice(max(top, 0), top + round(cell.height_mm * PX_PER_MM))
-        columns = slice(max(left, 0), left + round(cell.width_mm * PX_PER_MM))
+    def _foreign(self, patch: Patch, density: NDArray[np.float32]) -> float:
+        top = round((self.table.sheet_mm[1] - patch.y_mm - patch.size_y_mm) * PX_PER_MM)
+        left = round(patch.x_mm * PX_PER_MM)
+        rows = slice(max(top, 0), top + round(patch.size_y_mm * PX_PER_MM))
+        columns = slice(max(left, 0), left + round(patch.size_x_mm * PX_PER_MM))
         return float(np.count_nonzero(density[rows, columns] > INK)) / PX_PER_MM**2
 
-    def _press(self, height_mm: float, tilt_deg: float, load: float, flaw: Flaw | None, severity: float) -> Footprint:
+    def _press(self, depth_mm: float, tilt_deg: float, load: float, flaw: Flaw | None, severity: float) -> Footprint:
         seed = self._next_seed()
-        return self.world.brush.press(height_mm, tilt_deg, ink_load=load, press_seed=seed, flaw=flaw, severity=severity)
+        return self.world.brush.press(depth_mm, tilt_deg, ink_load=load, press_seed=seed, flaw=flaw, severity=severity)
 
     def _next_seed(self) -> int:
         self._presses += 1
@@ -320,7 +320,7 @@ def draw_rig(rng: np.random.Generator) -> SimConfig:
     return SimConfig(seed=int(rng.integers(1, 2**20)), brush=brush, view=view, table=Table())
 
 
-def draw_set(seed: int, captures: int) -> Iterator[Sample | Patch]:
+def draw_set(seed: int, captures: int) -> Iterator[Sample | Blank]:
     """At least `captures` captures, sheet after sheet, with the patches before them; equal seeds give equal sets."""
     count, sheet = 0, 0
     while count < captures:

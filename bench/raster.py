@@ -36,13 +36,13 @@ Work = Callable[[], object]
 class Presses:
     """What is drawn: presses at any heading, each in the middle of its image."""
 
-    height_mm: Tensor
+    depth_mm: Tensor
     tilt_deg: Tensor
     heading_deg: Tensor
 
     def mark(self, count: int) -> CcdBsm:
         """The first `count` marks."""
-        return ccdbsm(Brush(), self.height_mm[:count], self.tilt_deg[:count])
+        return ccdbsm(Brush(), self.depth_mm[:count], self.tilt_deg[:count])
 
     def origin(self, mark: CcdBsm) -> Tensor:
         """The `origin_mm` that puts the marks' middles in the middle of the image, (B, 2)."""
@@ -74,7 +74,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     )
     images = np.empty((BULK, SIZE_PX, SIZE_PX), np.float32)
     cores, brush = os.cpu_count() or 1, Brush()
-    height_mm, tilt_deg = (values.double().numpy() for values in (drawn.height_mm, drawn.tilt_deg))
+    depth_mm, tilt_deg = (values.double().numpy() for values in (drawn.depth_mm, drawn.tilt_deg))
     level_polygons = outlines(drawn.mark(BATCH))
     polygons = outlines(drawn.mark(BATCH), drawn.origin(drawn.mark(BATCH)), drawn.heading_deg[:BATCH])
 
@@ -83,7 +83,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         return coverage_at(mark, drawn.origin(mark), drawn.heading_deg[:BATCH])
 
     def presses(count: int, threads: int) -> object:
-        return press_images(brush, height_mm[:count], tilt_deg[:count], threads=threads, out=images[:count])
+        return press_images(brush, depth_mm[:count], tilt_deg[:count], threads=threads, out=images[:count])
 
     def compiled(count: int, threads: int) -> object:
         mark = drawn.mark(count)

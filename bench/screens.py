@@ -40,7 +40,7 @@ SIZE = (120, 40)
 SMALL = (80, 24)
 RATE = 20.0
 WAIT_S = 120.0
-PROTOCOL = 'kind = "grid"\nheights_mm = [11.0, 13.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\nseed = 1\n'
+PROTOCOL = 'kind = "grid"\ndepths_mm = [11.0, 13.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\nseed = 1\n'
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -31,7 +31,7 @@ PACKAGES = ("collect", "calibrate", "drivers", "sessions", "model", "twin")
 LONG, SHORT = 300, 40
 IMAGE_PX = 64 * 64
 """An array of two dimensions and as many values is taken for an image."""
-PROTOCOL = 'kind = "grid"\nheights_mm = [15.0]\ntilts_deg = [5.0]\nrepeats = 1\nseed = 0\n'
+PROTOCOL = 'kind = "grid"\ndepths_mm = [15.0]\ntilts_deg = [5.0]\nrepeats = 1\nseed = 0\n'
 
 
 def run(*, n: int | None = None, seed: int = 0) -> list[Result]:

@@ -27,13 +27,13 @@ def farthest_first(places: NDArray[np.float64], first: int, count: int) -> list[
     return order
 
 
-def spread_out(heights_mm: list[float], tilts_deg: list[float]) -> list[Cell]:
+def spread_out(depths_mm: list[float], tilts_deg: list[float]) -> list[Cell]:
     """Every cell once, each as far as possible from those before it: the first few already describe any brush well.
 
     Both axes are scaled to the range of the grid. The first cell is the shallowest at the least tilt.
     """
-    cells = [(height, tilt) for height in heights_mm for tilt in tilts_deg]
-    places = np.array([(_share(height, heights_mm), _share(tilt, tilts_deg)) for height, tilt in cells])
+    cells = [(height, tilt) for height in depths_mm for tilt in tilts_deg]
+    places = np.array([(_share(height, depths_mm), _share(tilt, tilts_deg)) for height, tilt in cells])
     return [cells[k] for k in farthest_first(places, cells.index(min(cells)), len(cells))]
 
 

@@ -131,7 +131,7 @@ def plan(
     if ask:
         from brushloop.collect.planning.limit_check import ask_reach
 
-        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_cell=True)
+        poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
         asked = asyncio.run(ask_reach(config, rig, poses))
     if picture is not None:
         from brushloop.collect.planning.picture import draw_plan

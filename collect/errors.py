@@ -2,7 +2,7 @@
 
 ConfigError            a user's file or option cannot be used: file, field, allowed range
 StepError              a step failed in a defined way; says what state it leaves and what must come next
- +-- StepVoid          the press was cut short: its paper cell stays used, press again on a new one
+ +-- StepVoid          the press was cut short: its paper patch stays used, press again on a new one
  +-- BadPicture        the photograph cannot be used: take it again
  |    +-- ArmInPicture something hides the sheet: the photograph says nothing about ink
  +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
@@ -10,7 +10,7 @@ StepError              a step failed in a defined way; says what state it leaves
  |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
  |    +-- PosesLate    the controller's poses come too late
  +-- JogGivenUp        the operator did not find the paper by jog: its known height stays
- +-- SheetFull         no free cell is left on the sheet
+ +-- SheetFull         no free patch is left on the sheet
 CannotTeach            what was taught on the first day contradicts itself or cannot be used
 CollectAborted         the session stopped before its protocol was finished; it can be resumed
  +-- Parked            ended between two steps on request, with the arm parked
@@ -56,7 +56,7 @@ class StepError(Exception):
 
 
 class StepVoid(StepError):
-    """A press did not go as planned. Leaves ink that must not count: never press that cell again."""
+    """A press did not go as planned. Leaves ink that must not count: never press that patch again."""
 
 
 class BadPicture(StepError):
@@ -118,13 +118,13 @@ class JogGivenUp(StepError):
 
 
 class SheetFull(StepError):
-    """No free cell is left. Leaves the arm parked; a fresh sheet must be put in before the next press."""
+    """No free patch is left. Leaves the arm parked; a fresh sheet must be put in before the next press."""
 
     def __init__(self, capacity: int, sheet: int) -> None:
         self.capacity = capacity
         self.sheet = sheet
         super().__init__(
-            f"all {capacity} cells of sheet {sheet} are used. "
+            f"all {capacity} patches of sheet {sheet} are used. "
             f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}."
         )
 

@@ -84,10 +84,10 @@ def start(
     return now.given_up
 
 
-def dry_run(config: Path, protocol: Path, height_mm: float, *, armed: bool, on_screen: bool) -> None:
+def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_screen: bool) -> None:
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
-        opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=height_mm)
+        opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=depth_mm)
         _run(
             engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine),
             "auto",

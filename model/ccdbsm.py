@@ -91,7 +91,7 @@ class CcdBsm:
 
 def ccdbsm(
     brush: Brush,
-    height_mm: float | Tensor,
+    depth_mm: float | Tensor,
     tilt_deg: float | Tensor,
     lam: float | Tensor = math.pi,
     *,
@@ -106,7 +106,7 @@ def ccdbsm(
     """
     require_positive("lam", lam)
     height, tilt, radius, length, dilation = as_batch(
-        height_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam, dtype=dtype
+        depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam, dtype=dtype
     )
     alpha = torch.deg2rad(tilt)
     theta = torch.atan(radius / length)
@@ -150,4 +150,4 @@ def _check_domain(height: Tensor, tilt: Tensor, theta: Tensor, length: Tensor) -
     if bad.any():
         index = int(bad.nonzero()[0])
         allowed = f"(0, {float(deepest[index]):g}] mm"
-        raise DomainError("height_mm", float(height[index]), allowed, "H is at most L cos(alpha)")
+        raise DomainError("depth_mm", float(height[index]), allowed, "H is at most L cos(alpha)")

@@ -102,13 +102,13 @@ class FittedPress:
     edges: Floats = field(default_factory=lambda: np.zeros((2, MODES, TERMS)))
     ends: Floats = field(default_factory=lambda: np.zeros((2, TERMS)))
 
-    def sizes(self, height_mm: float, tilt_deg: float) -> Sizes:
+    def sizes(self, depth_mm: float, tilt_deg: float) -> Sizes:
         """The mark's sizes. Raises DomainError outside the domain: h <= 0, or a tilt outside [0, 80) deg."""
         p = dict(zip(NAMES, np.moveaxis(self.values, -1, 0), strict=True))
-        h = height_mm + p["h0_mm"]
-        if not (np.all(h > 0.0) and height_mm > 0.0):
+        h = depth_mm + p["h0_mm"]
+        if not (np.all(h > 0.0) and depth_mm > 0.0):
             starts_mm = max(0.0, -float(np.min(p["h0_mm"])))
-            raise DomainError("height_mm", height_mm, f"({starts_mm:g}, inf)", "the fitted brush starts to mark there")
+            raise DomainError("depth_mm", depth_mm, f"({starts_mm:g}, inf)", "the fitted brush starts to mark there")
         if not 0.0 <= tilt_deg < 80.0:
             raise DomainError("tilt_deg", tilt_deg, "[0, 80)")
         alpha, theta = math.radians(tilt_deg), math.atan(self.radius_mm / self.length_mm)
@@ -118,17 +118,17 @@ class FittedPress:
         share = h / DEPTH_MM
         long = share ** (p["length_power"] - 1.0) * np.maximum(0.05, 1.0 + p["length_tilt"] * tilt_deg)
         wide = share ** (p["width_power"] - 1.0) * np.maximum(0.05, 1.0 + p["width_tilt"] * tilt_deg)
-        widest = p["lean"] * height_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
+        widest = p["lean"] * depth_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
         heel = p["heel_gain"] * o3a * long * np.maximum(0.05, 1.0 + p["heel_tilt"] * tilt_deg)
         tip = p["tip_gain"] * o4o3 * long
         if self.ends.any():
-            further = self.ends @ command_terms(height_mm, tilt_deg)
+            further = self.ends @ command_terms(depth_mm, tilt_deg)
             tip, heel = (np.maximum(side + add, 0.3 * side) for side, add in zip((tip, heel), further, strict=True))
         return Sizes(widest, tip, heel, p["lam"] * o3c * wide)
 
-    def half_width(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
+    def half_width(self, depth_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
         """Half width of the profile at x (N,) from the point of touch, mm; beyond an end, minus the distance to it."""
-        s = self.sizes(height_mm, tilt_deg)
+        s = self.sizes(depth_mm, tilt_deg)
         heel_power, heel_round, tip_power, tip_round, core = np.moveaxis(self.values[..., 6:11, None], -2, 0)
         u = x_mm - s.widest[..., None]
         at_heel = u > 0.0
@@ -138,26 +138,26 @@ class FittedPress:
         width = s.half[..., None] * fall ** np.where(at_heel, heel_power, tip_power)
         return width + core * np.sqrt(1.0 - (share * share) ** 3) - np.maximum(np.abs(u) - long, 0.0)
 
-    def edges_at(self, height_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
+    def edges_at(self, depth_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
         """Distance of the upper and the lower edge from the axis at x (N,), (2, N) mm, as `half_width`."""
-        width = self.half_width(height_mm, tilt_deg, x_mm)[..., None, :]
+        width = self.half_width(depth_mm, tilt_deg, x_mm)[..., None, :]
         if not self.edges.any():
             return width.repeat(2, axis=-2)
-        s = self.sizes(height_mm, tilt_deg)
+        s = self.sizes(depth_mm, tilt_deg)
         waves = modes((x_mm - (s.widest - s.tip)[..., None]) / (s.tip + s.heel)[..., None])
-        return width + np.moveaxis(waves @ (self.edges @ command_terms(height_mm, tilt_deg)).T, -1, -2)
+        return width + np.moveaxis(waves @ (self.edges @ command_terms(depth_mm, tilt_deg)).T, -1, -2)
 
-    def chance(self, height_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
+    def chance(self, depth_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
-        return chance_within(self.edges_at(height_mm, tilt_deg, x_mm), y_mm, spread_mm)
+        return chance_within(self.edges_at(depth_mm, tilt_deg, x_mm), y_mm, spread_mm)
 
-    def outline(self, height_mm: float, tilt_deg: float, points: int = 97) -> Loop:
+    def outline(self, depth_mm: float, tilt_deg: float, points: int = 97) -> Loop:
         """The boundary through `points` points of each edge (an odd number), x from the point of touch, y upward."""
-        s = self.sizes(height_mm, tilt_deg)
+        s = self.sizes(depth_mm, tilt_deg)
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
         x = s.widest - s.tip + share * (s.tip + s.heel)
-        top, bottom = np.maximum(self.edges_at(height_mm, tilt_deg, x), 0.0)
+        top, bottom = np.maximum(self.edges_at(depth_mm, tilt_deg, x), 0.0)
         return closed(np.column_stack([x, -bottom]), np.column_stack([x, top])[::-1])
 
 
@@ -173,7 +173,7 @@ def modes(share: Floats) -> Floats:
     return np.sin(np.pi * np.clip(share, 0.0, 1.0)[..., None] * np.arange(1, MODES + 1))
 
 
-def command_terms(height_mm: float, tilt_deg: float) -> Floats:
+def command_terms(depth_mm: float, tilt_deg: float) -> Floats:
     """The terms of a residual, (TERMS,): 1, depth, tilt, their product and their squares, centred on their middles."""
-    h, a = (height_mm - DEPTH_MM) / DEPTH_SPAN_MM, (tilt_deg - TILT_DEG) / TILT_DEG
+    h, a = (depth_mm - DEPTH_MM) / DEPTH_SPAN_MM, (tilt_deg - TILT_DEG) / TILT_DEG
     return np.array([1.0, h, a, h * a, h * h, a * a])

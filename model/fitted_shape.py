@@ -13,7 +13,7 @@ from brushloop.model.outline import Outline
 from brushloop.model.protocol import Number, ParameterSpec, Parametric, StrokeModel, Values
 
 PARAMETERS = (
-    ParameterSpec("height_mm", "mm", 0.01, 200, 15, "H, how far the tip is pressed below the paper"),
+    ParameterSpec("depth_mm", "mm", 0.01, 200, 15, "H, how far the tip is pressed below the paper"),
     ParameterSpec("tilt_deg", "deg", 0, 79.9, 5, "alpha, the brush axis from the vertical"),
 )
 
@@ -24,11 +24,11 @@ def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeMod
     The shapes' origin is where the brush axis meets the paper, as in every model.
     """
 
-    def of_press(height_mm: Number, tilt_deg: Number) -> Values:
-        height, tilt = as_batch(height_mm, tilt_deg, dtype=torch.float64)
+    def of_press(depth_mm: Number, tilt_deg: Number) -> Values:
+        height, tilt = as_batch(depth_mm, tilt_deg, dtype=torch.float64)
         for h, a in zip(height.tolist(), tilt.tolist(), strict=True):
             press.sizes(h, a)  # raises DomainError
-        return {"height_mm": height, "tilt_deg": tilt}
+        return {"depth_mm": height, "tilt_deg": tilt}
 
     definition = "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes."
     return Parametric(NAME, label, definition, PARAMETERS, lambda v: outlines(press, v), of_press, fitted=True)
@@ -36,7 +36,7 @@ def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeMod
 
 def outlines(press: FittedPress, values: Values) -> Outline:
     """The outlines of presses, (B,) each."""
-    height, tilt = values["height_mm"], values["tilt_deg"]
+    height, tilt = values["depth_mm"], values["tilt_deg"]
     loops: list[np.ndarray] = []
     for h, a in zip(height.tolist(), tilt.tolist(), strict=True):
         loops.append(press.outline(h, a).points - [h * math.tan(math.radians(a)), 0.0])

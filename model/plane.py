@@ -17,18 +17,18 @@ class Plane:
     names: tuple[str, ...]
     coefficients: NDArray[np.floating]
 
-    def at(self, height_mm: Any, tilt_deg: Any) -> dict[str, Any]:
+    def at(self, depth_mm: Any, tilt_deg: Any) -> dict[str, Any]:
         """The parameters at H and alpha: floats, arrays or tensors of one shape, which each parameter has too."""
         rows = zip(self.names, self.coefficients.tolist(), strict=True)
-        return {name: a + height_mm * (b + c * tilt_deg) for name, (a, b, c) in rows}
+        return {name: a + depth_mm * (b + c * tilt_deg) for name, (a, b, c) in rows}
 
 
-def fit_plane(height_mm: ArrayLike, tilt_deg: ArrayLike, values: Mapping[str, ArrayLike]) -> Plane:
+def fit_plane(depth_mm: ArrayLike, tilt_deg: ArrayLike, values: Mapping[str, ArrayLike]) -> Plane:
     """The least-squares fit to values (N,) at H and alpha (N,), for captures or marks alike.
 
     Raises ValueError if the cells do not span a plane: at least two depths and two tilts are needed.
     """
-    height, tilt = np.asarray(height_mm, np.float64), np.asarray(tilt_deg, np.float64)
+    height, tilt = np.asarray(depth_mm, np.float64), np.asarray(tilt_deg, np.float64)
     design = np.column_stack([np.ones_like(height), height, height * tilt])
     targets = np.column_stack([np.asarray(value, np.float64) for value in values.values()])
     coefficients, _, rank, _ = np.linalg.lstsq(design, targets)

@@ -18,7 +18,7 @@ Values = float | NDArray[np.floating[Any]]
 
 def press_images(
     brush: Brush,
-    height_mm: Values,
+    depth_mm: Values,
     tilt_deg: Values,
     lam: Values = math.pi,
     *,
@@ -30,7 +30,7 @@ def press_images(
 ) -> NDArray[np.float32]:
     """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for CCD-BSM's marks of B presses at heading 0.
 
-    The same as `coverage_numpy(ccdbsm(brush, height_mm, tilt_deg, lam), origin_mm)`, but several times as fast. Depth,
+    The same as `coverage_numpy(ccdbsm(brush, depth_mm, tilt_deg, lam), origin_mm)`, but several times as fast. Depth,
     tilt, lambda and the lengths of `brush` are broadcast to one (B,). `origin_mm`, (2,) or (B, 2), centres each mark's
     bounding box if it is left out; `threads` and `out` as for `coverage_numpy`, float32 only. Raises DomainError for a
     press outside the model's domain, and ValueError for an invalid size, origin or `out`.
@@ -38,7 +38,7 @@ def press_images(
     from brushloop.model.raster.level import draw, lengths
 
     check_raster(size_px, px_mm)
-    columns = (height_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)
+    columns = (depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)
     presses = np.empty((np.broadcast(*columns).size, len(columns)))
     for k, values in enumerate(columns):
         presses[:, k] = values

@@ -75,11 +75,11 @@ class StrokeModel(Protocol):
         """
         ...
 
-    def of_press(self, height_mm: Number, tilt_deg: Number) -> Values:
+    def of_press(self, depth_mm: Number, tilt_deg: Number) -> Values:
         """The model's parameters for a press to depth H at tilt alpha, each (B,); may raise DomainError."""
         ...
 
-    def profile(self, height_mm: Number, tilt_deg: Number) -> Shape:
+    def profile(self, depth_mm: Number, tilt_deg: Number) -> Shape:
         """The shapes of presses, `shape(of_press(...))`; may raise DomainError."""
         ...
 
@@ -95,9 +95,9 @@ class Basis:
     lam: float = math.pi
     fitted: bool = False
 
-    def mark(self, height_mm: Number, tilt_deg: Number) -> CcdBsm:
+    def mark(self, depth_mm: Number, tilt_deg: Number) -> CcdBsm:
         """The CCD-BSM mark of a press; raises DomainError outside its domain."""
-        return ccdbsm(self.brush, height_mm, tilt_deg, self.lam)
+        return ccdbsm(self.brush, depth_mm, tilt_deg, self.lam)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,10 +122,10 @@ class Parametric:
             spec.check(value.detach())
         return self.build({spec.name: value for spec, value in zip(self.parameters, batch, strict=True)})
 
-    def of_press(self, height_mm: Number, tilt_deg: Number) -> Values:
+    def of_press(self, depth_mm: Number, tilt_deg: Number) -> Values:
         """See `StrokeModel.of_press`."""
-        return self.press(height_mm, tilt_deg)
+        return self.press(depth_mm, tilt_deg)
 
-    def profile(self, height_mm: Number, tilt_deg: Number) -> Shape:
+    def profile(self, depth_mm: Number, tilt_deg: Number) -> Shape:
         """See `StrokeModel.profile`."""
-        return self.shape(self.of_press(height_mm, tilt_deg))
+        return self.shape(self.of_press(depth_mm, tilt_deg))

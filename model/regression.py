@@ -18,7 +18,7 @@ from brushloop.model.plane import Plane, fit_plane
 from brushloop.model.protocol import Basis, Number, Values
 
 # The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
-DEPTHS = tuple(height_mm / 48 for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
+DEPTHS = tuple(depth_mm / 48 for depth_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
 TILTS_DEG = (0.0, 5.0, 10.0)
 
 
@@ -29,8 +29,8 @@ def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Nu
     """
     planes: list[Plane] = []
 
-    def press(height_mm: Number, tilt_deg: Number) -> Values:
-        basis.mark(height_mm, tilt_deg)
+    def press(depth_mm: Number, tilt_deg: Number) -> Values:
+        basis.mark(depth_mm, tilt_deg)
         if not planes:
             length_mm = float(torch.as_tensor(basis.brush.length_mm).detach().reshape(-1)[0])
             cells = torch.cartesian_prod(
@@ -39,7 +39,7 @@ def regressed(basis: Basis, measure: Callable[[CcdBsm], Values]) -> Callable[[Nu
             height, tilt = cells.unbind(-1)
             values = measure(basis.mark(height, tilt))
             planes.append(fit_plane(height, tilt, {name: value.detach().cpu() for name, value in values.items()}))
-        return planes[0].at(*as_batch(height_mm, tilt_deg))
+        return planes[0].at(*as_batch(depth_mm, tilt_deg))
 
     return press
 

@@ -42,7 +42,7 @@ class History:
     photographed: int
     """Marks that were photographed and judged."""
     pressed_again: tuple[str, ...]
-    """Strokes of takes that did not count and were repeated on another cell."""
+    """Strokes of takes that did not count and were repeated on another patch."""
     left_out: tuple[str, ...]
     """Strokes that were given up, or skipped by the operator."""
     found: tuple[ZeroTouch, ...]

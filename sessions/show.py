@@ -44,14 +44,14 @@ class Sheet:
     """One sheet of paper, counted from 1, and the cells that were pressed on it or may have been."""
 
     sheet: int
-    used_cells: list[int]
+    used_patches: list[int]
 
 
 @dataclass(frozen=True, slots=True)
 class GridCell:
     """Number of strokes of one (H, alpha); `planned` is None if the protocol does not state it."""
 
-    height_mm: float | None
+    depth_mm: float | None
     tilt_deg: float | None
     strokes: int
     planned: int | None
@@ -127,8 +127,10 @@ def _read(folder: Path, state: Replay, lines: list[Line]) -> Details:
     found.void, found.next = _voids(lines, state)
     found.messages = state.counts()
     found.segments = [_segment(folder, line) for line in state.segments]
-    used = {sheet for sheet, _cell in state.used_cells} | {state.sheet}
-    found.sheets = [Sheet(n + 1, sorted(cell for sheet, cell in state.used_cells if sheet == n)) for n in sorted(used)]
+    used = {sheet for sheet, _cell in state.used_patches} | {state.sheet}
+    found.sheets = [
+        Sheet(n + 1, sorted(cell for sheet, cell in state.used_patches if sheet == n)) for n in sorted(used)
+    ]
     with_stroke = [line for line in state.segments if Topic.STROKE in line["counts"]]
     bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
     counted = [line for line in with_stroke if line["result"].get("still") not in bad]
@@ -186,8 +188,8 @@ def _commanded(line: Line, lines: list[Line]) -> Stroke:
         if begin["event"] == "begin" and begin["key"] == line["key"]:
             params = begin.get("params", {})
     values = {**params, **line["result"]}
-    height, tilt = (values.get(name) for name in ("height_mm", "tilt_deg"))
-    return Stroke(stroke_id=str(values.get("stroke_id", "")), kind="press", still=0, height_mm=height, tilt_deg=tilt)
+    height, tilt = (values.get(name) for name in ("depth_mm", "tilt_deg"))
+    return Stroke(stroke_id=str(values.get("stroke_id", "")), kind="press", still=0, depth_mm=height, tilt_deg=tilt)
 
 
 def _protocol(header: Header) -> dict[str, Any]:
@@ -198,16 +200,16 @@ def _protocol(header: Header) -> dict[str, Any]:
         return {}
     protocol: dict[str, Any] = dict(found) if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownArgumentType]
     # `few-strokes`, and `adaptive` of earlier versions, press only part of the grid that they name.
-    is_grid = protocol.get("kind", "grid") == "grid" and protocol.keys() >= {"heights_mm", "tilts_deg", "repeats"}
+    is_grid = protocol.get("kind", "grid") == "grid" and protocol.keys() >= {"depths_mm", "tilts_deg", "repeats"}
     return protocol if is_grid else {}
 
 
 def _grid(strokes: list[Stroke], header: Header) -> list[GridCell]:
-    have = Counter((stroke.height_mm, stroke.tilt_deg) for stroke in strokes)
+    have = Counter((stroke.depth_mm, stroke.tilt_deg) for stroke in strokes)
     protocol = _protocol(header)
     planned = {
         (float(h), float(a)): int(protocol["repeats"])
-        for h in protocol.get("heights_mm", ())
+        for h in protocol.get("depths_mm", ())
         for a in protocol["tilts_deg"]
     }
     cells = sorted({*have, *planned}, key=lambda cell: (cell[0] is None, cell[0] or 0.0, cell[1] or 0.0))

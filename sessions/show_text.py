@@ -36,7 +36,7 @@ def _facts(details: Details, *, files: bool) -> Table:
     if details.next:
         table.add_row("next", f"{details.next} (under way when the last process ended)")
     for sheet in details.sheets:
-        table.add_row(f"sheet {sheet.sheet}", f"{len(sheet.used_cells)} cells used: {ranges(sheet)}")
+        table.add_row(f"sheet {sheet.sheet}", f"{len(sheet.used_patches)} cells used: {ranges(sheet)}")
     for name, value in details.devices.items():
         table.add_row(name.replace("_", " "), value)
     processes = f", {details.processes} processes" if details.processes else ""
@@ -51,9 +51,9 @@ def _facts(details: Details, *, files: bool) -> Table:
 
 
 def _grid(details: Details) -> Table:
-    heights = sorted({cell.height_mm for cell in details.grid}, key=lambda h: (h is None, h or 0.0))
+    heights = sorted({cell.depth_mm for cell in details.grid}, key=lambda h: (h is None, h or 0.0))
     tilts = sorted({cell.tilt_deg for cell in details.grid}, key=lambda a: (a is None, a or 0.0))
-    counts = {(c.height_mm, c.tilt_deg): (c.strokes, c.planned) for c in details.grid}
+    counts = {(c.depth_mm, c.tilt_deg): (c.strokes, c.planned) for c in details.grid}
     table = Table("H \\ alpha", *(_number(tilt, "°") for tilt in tilts), title="Strokes per cell of the grid")
     for height in heights:
         row = [counts.get((height, tilt)) for tilt in tilts]
@@ -80,7 +80,7 @@ def _files(details: Details) -> str:
 def ranges(sheet: Sheet) -> str:
     """Cells as `0-3, 7`, with consecutive numbers joined."""
     parts: list[list[int]] = []
-    for cell in sheet.used_cells:
+    for cell in sheet.used_patches:
         if parts and cell == parts[-1][-1] + 1:
             parts[-1].append(cell)
         else:

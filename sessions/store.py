@@ -35,7 +35,7 @@ class Attempt:
     """Number of the attempt, unique in the session."""
     attempt: int
     writer: SegmentWriter
-    cell: int | None
+    patch: int | None
 
 
 class SessionStore:
@@ -97,18 +97,18 @@ class SessionStore:
         """Raise `DiskFull` unless the disk has that much room. `begin` checks this before it journals anything."""
         check_room(self.folder, need_bytes)
 
-    def begin(self, key: str, kind: str, *, cell: int | None, notes: Line) -> Attempt:
+    def begin(self, key: str, kind: str, *, patch: int | None, notes: Line) -> Attempt:
         """Journal that an attempt starts, then open its file.
 
         Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold an unrecorded one, before anything
         is written.
         """
         self.check_room()
-        if cell is not None and self.state.sheet in self.state.doubtful_sheets:
+        if patch is not None and self.state.sheet in self.state.doubtful_sheets:
             sheet = self.state.sheet + 1
             raise SessionError(
                 self.folder,
-                f"the record of a press on sheet {sheet} was lost, so any of its cells may already hold ink. "
+                f"the record of a press on sheet {sheet} was lost, so any of its patches may already hold ink. "
                 f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}",
             )
         attempt = self.state.attempts.get(key, 0) + 1
@@ -120,18 +120,18 @@ class SessionStore:
             "kind": kind,
             "attempt": attempt,
             "sheet": self.state.sheet,
-            "cell": cell,
+            "patch": patch,
             "file": name,
             **notes,
         }
         t_ns = self._log(line)
         self.state.attempts[key] = attempt
         self.state.begun += 1
-        if cell is not None:
-            self.state.used_cells |= {(self.state.sheet, one) for one in (cell, *notes.get("more_cells", ()))}
+        if patch is not None:
+            self.state.used_patches |= {(self.state.sheet, one) for one in (patch, *notes.get("more_patches", ()))}
         begun = {"t_ns": t_ns, "header": self.header.model_dump(mode="json"), "line": line}
         writer = SegmentWriter(self.folder / name, self.header, QUEUE_LIMIT, begun)
-        return Attempt(key, kind, serial, attempt, writer, cell)
+        return Attempt(key, kind, serial, attempt, writer, patch)
 
     def done(self, attempt: Attempt, result: dict[str, Any]) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""
@@ -145,13 +145,13 @@ class SessionStore:
         self.state.segments.append(line)
 
     def void(self, attempt: Attempt, why: str) -> None:
-        """Journal that an attempt was cut; its part file is kept as evidence, and its cell stays used."""
+        """Journal that an attempt was cut; its part file is kept as evidence, and its patch stays used."""
         attempt.writer.abandon()
         self._log({"event": "void", "key": attempt.key, "attempt": attempt.attempt, "why": why})
         self.state.voids += 1
 
     def fresh_sheet(self) -> None:
-        """Journal that the operator put a fresh sheet in: its cells are all free."""
+        """Journal that the operator put a fresh sheet in: its patches are all free."""
         self.state.sheet += 1
         self._log({"event": "sheet", "sheet": self.state.sheet})
 
@@ -198,7 +198,7 @@ class SessionStore:
         return t_ns
 
     def _check_serials(self) -> None:
-        """Raise `SessionDamaged` if the journal lost its last lines: their numbers and cells would be used again."""
+        """Raise `SessionDamaged` if the journal lost its last lines: their numbers and patches would be used again."""
         for path in sorted(self.folder.glob("*.mcap*")):
             serial = SEGMENT_NAME.fullmatch(path.name)
             if serial and int(serial[1]) >= self.state.begun:

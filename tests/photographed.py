@@ -39,7 +39,7 @@ def imported_presses(
     photos: Path, out: Path, cells: Sequence[tuple[float, float]], size_px: tuple[int, int], touch_px: tuple[int, int]
 ) -> Path:
     """The session of one press of the default brush for each (H, alpha), photographed at 10 px/mm."""
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(cells):
         mark = Brush(BrushSpec()).press(height, tilt, ink_load=1.0, press_seed=k)
         photograph(photos / f"{k}.png", mark, size_px, touch_px)

@@ -61,11 +61,11 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     session, again = sorted((out / "sessions").iterdir())
     for folder in (session, again):
         begun = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
-        cells = [(line["sheet"], line["cell"]) for line in begun if line["cell"] is not None]
+        cells = [(line["sheet"], line["patch"]) for line in begun if line["patch"] is not None]
         assert len(cells) == len(set(cells)), "no cell is ever pressed twice"
     strokes = [capture.stroke for capture in Recording(session).captures()]
     assert len(strokes) == 4
-    assert len({(s.height_mm, s.tilt_deg) for s in strokes}) == 4
+    assert len({(s.depth_mm, s.tilt_deg) for s in strokes}) == 4
     repeated = {stroke.again_of for stroke in Recording(again).stroke_records()}
     assert len(repeated) == 1
     assert repeated < {stroke.stroke_id for stroke in strokes}

@@ -41,9 +41,9 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("closed", "open", "damaged"):
         header = HEADER.model_copy(update={"session_id": name, "protocol": HOSTILE})
         store = SessionStore.create(folder / name, header, make.snapshots, make.clock())
-        make.perform(store, f"key{NAME}", cell=1)
-        store.void(store.begin("cut", f"press{NAME}", cell=2, notes={"params": {"stroke_id": HOSTILE}}), HOSTILE)
-        store.begin("begun", f"press{NAME}", cell=3, notes={"params": {"stroke_id": HOSTILE}}).writer.abandon()
+        make.perform(store, f"key{NAME}", patch=1)
+        store.void(store.begin("cut", f"press{NAME}", patch=2, notes={"params": {"stroke_id": HOSTILE}}), HOSTILE)
+        store.begin("begun", f"press{NAME}", patch=3, notes={"params": {"stroke_id": HOSTILE}}).writer.abandon()
         if name == "closed":
             store.close()
         store.release()

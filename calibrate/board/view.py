@@ -112,10 +112,10 @@ def preflight(
 
 def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:
     """(n, 2) corners of a view in the paper frame."""
-    height_mm = spec.squares[1] * spec.square_mm
+    depth_mm = spec.squares[1] * spec.square_mm
     # The board counts y downward from its upper left corner; the paper frame counts it upward.
     flip = np.array([1.0, -1.0])
-    return np.array([spec.origin_mm[0], spec.origin_mm[1] + height_mm]) + flip * view.board_mm
+    return np.array([spec.origin_mm[0], spec.origin_mm[1] + depth_mm]) + flip * view.board_mm
 
 
 def corners_beside(spec: BoardSpec, sheet_mm: tuple[float, float]) -> int:

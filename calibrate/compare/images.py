@@ -83,15 +83,15 @@ def captured_images(stroke_id: str, prepared: Prepared) -> dict[Key, Image]:
     return images
 
 
-def simulated(model: StrokeModel, height_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
+def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
     """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.brush.DomainError`."""
-    gray = drawn(loop_of(model.profile(height_mm, tilt_deg)), axis_mm(height_mm, tilt_deg), field)
+    gray = drawn(loop_of(model.profile(depth_mm, tilt_deg)), axis_mm(depth_mm, tilt_deg), field)
     return {(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS}
 
 
-def simulated_pixels(model: StrokeModel, height_mm: float, tilt_deg: float, field: Field) -> Pixels:
+def simulated_pixels(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> Pixels:
     """(len(KEYS), 128, 128) predictions of a press. May raise `model.brush.DomainError`."""
-    return key_pixels(simulated(model, height_mm, tilt_deg, field))
+    return key_pixels(simulated(model, depth_mm, tilt_deg, field))
 
 
 def loop_pixels(loop: Loop, field: Field) -> Pixels:
@@ -112,12 +112,12 @@ def loop_of(shape: Shape) -> Loop:
     return Loop(points, weights, *(float(end[0]) for end in ends))
 
 
-def axis_mm(height_mm: float, tilt_deg: float) -> float:
+def axis_mm(depth_mm: float, tilt_deg: float) -> float:
     """Distance from the zero-touch point to where the brush axis meets the paper, toward the side the ferrule leans to.
 
     The press tilts about the tip, then descends.
     """
-    return height_mm * math.tan(math.radians(tilt_deg))
+    return depth_mm * math.tan(math.radians(tilt_deg))
 
 
 def drawn(loop: Loop, origin_x_mm: float, field: Field) -> dict[Alignment, Image]:

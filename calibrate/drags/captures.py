@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.drags.measure import DEPTH_NAMES, FLAGGED_WEIGHT, LENGTH_NAME, prepare_drag
+from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, LENGTH_NAME, depth_of, prepare_drag
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
@@ -175,7 +175,7 @@ def command_of(stroke: Stroke, travel_mm: float | None) -> tuple[float, float, f
     Raises `CaptureRefused` without length or depth.
     """
     commanded = dict(stroke.commanded)
-    depth = next((commanded[name] for name in DEPTH_NAMES if name in commanded), stroke.height_mm)
+    depth = depth_of(stroke)
     if LENGTH_NAME not in commanded or depth is None:
         raise CaptureRefused(stroke.stroke_id, f"has no {LENGTH_NAME} or no depth")
     ends = commanded.get(ENDS)
@@ -190,9 +190,9 @@ def _ends(strokes: list[Stroke]) -> tuple[str, float | None]:
     if any(ENDS in dict(stroke.commanded) for stroke in strokes):
         return ENDS, None
     travels: list[float] = []
-    for commanded in (dict(stroke.commanded) for stroke in strokes):
-        depth = next((commanded[name] for name in DEPTH_NAMES if name in commanded), None)
-        share = commanded.get(SHARE_MID, 0.0)
+    for stroke in strokes:
+        commanded = dict(stroke.commanded)
+        depth, share = depth_of(stroke), commanded.get(SHARE_MID, 0.0)
         if depth is not None and share > 0.0 and SHARE_ENDS in commanded:
             travels.append(depth / share)
     return (SHARE_ENDS, float(np.median(travels))) if travels else ("", None)
@@ -243,10 +243,10 @@ def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Flo
     sizes = {stroke.cell_mm[2:] for stroke in strokes if stroke.cell_mm is not None}
     if len(sizes) != 1:
         raise CalibrationError(where, "its figures have no cells, or cells of several sizes")
-    [(width_mm, height_mm)] = sizes
-    columns, rows = round(width_mm / mm_per_px), round(height_mm / mm_per_px)
-    x_mm = (np.arange(columns) + 0.5) * width_mm / columns
-    return x_mm, height_mm - (np.arange(rows) + 0.5) * height_mm / rows
+    [(size_x_mm, size_y_mm)] = sizes
+    columns, rows = round(size_x_mm / mm_per_px), round(size_y_mm / mm_per_px)
+    x_mm = (np.arange(columns) + 0.5) * size_x_mm / columns
+    return x_mm, size_y_mm - (np.arange(rows) + 0.5) * size_y_mm / rows
 
 
 def _grid(strokes: list[Stroke], mm_per_px: float, travel_mm: float | None, where: str) -> tuple[Floats, Floats]:

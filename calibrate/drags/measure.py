@@ -25,9 +25,10 @@ from brushloop.calibrate.stroke.preprocess import Prepared, preprocess, touches_
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.reader import Capture
+from brushloop.sessions.recording.schemas import Stroke
 
 THUMB_PX = 160
-DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal", "height_mm")
+DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal")
 LENGTH_NAME = "length_mm"
 LEVEL_DEG = 20.0
 """Bent strokes along x have a rectangle that is a little tilted: only strokes of another direction are turned."""
@@ -92,7 +93,16 @@ class Drag:
     @property
     def depth_mm(self) -> float | None:
         """The commanded depth, under whichever name the source gives it."""
-        return next((self.commanded[name] for name in DEPTH_NAMES if name in self.commanded), None)
+        return _depth_in(self.commanded)
+
+
+def depth_of(stroke: Stroke) -> float | None:
+    """The commanded depth of an imported stroke, mm, under whichever name its table gives it."""
+    return _depth_in(dict(stroke.commanded)) if stroke.depth_mm is None else stroke.depth_mm
+
+
+def _depth_in(commanded: dict[str, float]) -> float | None:
+    return next((commanded[name] for name in DEPTH_NAMES if name in commanded), None)
 
 
 @dataclass(slots=True)
@@ -136,8 +146,8 @@ def _measure(capture: Capture, params: Params) -> Drag:
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
     prepared, _, flags = prepare_drag(raster, anchor, capture.where, params)
     commanded = dict(stroke.commanded)
-    if stroke.height_mm is not None:
-        commanded["height_mm"] = stroke.height_mm
+    if stroke.depth_mm is not None:
+        commanded["depth_mm"] = stroke.depth_mm
     if stroke.tilt_deg is not None:
         commanded["tilt_deg"] = stroke.tilt_deg
     # A start in the table means a commanded path, which runs along x. Scanned strokes have neither.

@@ -45,7 +45,7 @@ class Grid:
 class Pressed:
     """One captured press: its command and its ink, (len(y_mm), len(x_mm)) from 0 to 1."""
 
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     ink: NDArray[np.floating]
 
@@ -54,7 +54,7 @@ def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
     """The strokes of each (H, alpha)."""
     cells: dict[Cell, list[Pressed]] = {}
     for stroke in strokes:
-        cells.setdefault((stroke.height_mm, stroke.tilt_deg), []).append(stroke)
+        cells.setdefault((stroke.depth_mm, stroke.tilt_deg), []).append(stroke)
     return dict(sorted(cells.items()))
 
 
@@ -103,13 +103,13 @@ def read_presses(
         except (CaptureRefused, SessionDamaged) as error:
             refused.append((stroke.stroke_id, error.what))
             continue
-        if stroke.height_mm is None or stroke.tilt_deg is None:
+        if stroke.depth_mm is None or stroke.tilt_deg is None:
             refused.append((stroke.stroke_id, "has no depth or tilt"))
         elif prepared.cut:
             refused.append((stroke.stroke_id, "is cut by the edge of its photograph or cell"))
         else:
             ink = np.asarray(covered(prepared), np.float64)
-            pressed.append(Pressed(stroke.height_mm, stroke.tilt_deg, ink))
+            pressed.append(Pressed(stroke.depth_mm, stroke.tilt_deg, ink))
             names.append(stroke.stroke_id)
     if not pressed:
         raise CalibrationError(str(recording.path), "holds no press that can be used for a fit")
@@ -117,7 +117,7 @@ def read_presses(
     radius, length = float(brush.radius_mm), float(brush.length_mm)
     grid, rows = grid_of(view), inked_rows([one.ink for one in pressed], view.mm_per_px)
     grid = Grid(grid.x_mm, grid.y_mm[rows])
-    pressed = [Pressed(one.height_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
+    pressed = [Pressed(one.depth_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
     return Captures(recording.header, digest, calibration, radius, length, rows, grid, pressed, names, refused)
 
 

@@ -100,11 +100,11 @@ class Drawn:
         return np.concatenate([image[self.above].sum(axis=0), image[~self.above].sum(axis=0)])
 
 
-def draw(press: FittedPress, height_mm: float, tilt_deg: float, grid: Grid) -> Drawn:
+def draw(press: FittedPress, depth_mm: float, tilt_deg: float, grid: Grid) -> Drawn:
     """Draw a press with its derivatives; the edges are moved by a small step of each parameter."""
     values = press.values + STEP * np.diag(spreads())
     values = np.concatenate([press.values[None], values])
-    edges = replace(press, values=values).edges_at(height_mm, tilt_deg, grid.x_mm)
+    edges = replace(press, values=values).edges_at(depth_mm, tilt_deg, grid.x_mm)
     ink = chance_within(edges[0], grid.y_mm, SPREAD_MM)
     moved = (edges[1:] - edges[0]) / STEP
     return Drawn(ink, ink * (1.0 - ink) / SPREAD_MM, grid.y_mm > 0.0, moved.reshape(len(NAMES), -1))
@@ -142,7 +142,7 @@ def _minimise(
         """Within the bounds; None if a press would not reach the paper."""
         clipped = np.clip(vector, low, high)
         h0_mm = at_values(clipped).values[TOUCH[0]]
-        return None if any(s.height_mm + h0_mm <= 0.1 for s in strokes) else clipped
+        return None if any(s.depth_mm + h0_mm <= 0.1 for s in strokes) else clipped
 
     found = descend(
         equations,
@@ -169,7 +169,7 @@ def _normal(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple
     gradients: list[Floats] = []
     cost = 0.0
     for stroke in strokes:
-        cell = (stroke.height_mm, stroke.tilt_deg)
+        cell = (stroke.depth_mm, stroke.tilt_deg)
         if cell not in drawn:
             made = draw(press, *cell, grid)
             square = made.square()

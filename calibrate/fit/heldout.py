@@ -154,9 +154,9 @@ class RefittedBezier:
 
     plane: Plane
 
-    def outline(self, height_mm: float, tilt_deg: float) -> Loop:
+    def outline(self, depth_mm: float, tilt_deg: float) -> Loop:
         """The stroke, x from the point of touch."""
-        left, right, belly, shoulder = self.plane.at(height_mm, tilt_deg).values()
+        left, right, belly, shoulder = self.plane.at(depth_mm, tilt_deg).values()
         t = np.linspace(1.0, 0.0, 2 * BEZIER_PIECES + 1)
         right, belly, shoulder = max(right, left + 0.2), max(belly, 0.1), min(max(shoulder, 0.0), 1.0)
         x, y = bezier_side(t, -left, right, belly, shoulder)
@@ -184,7 +184,7 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
         # The enclosed area is belly length (4 - s) / 5, as in `model.strokes.bezier`.
         area = float(stroke.ink.sum()) * grid.px_mm**2
         rows.append((left, right, width, float(np.clip(4.0 - 5.0 * area / (width * (right - left)), 0.0, 1.0))))
-    height, tilt = [s.height_mm for s in strokes], [s.tilt_deg for s in strokes]
+    height, tilt = [s.depth_mm for s in strokes], [s.tilt_deg for s in strokes]
     return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
 
 

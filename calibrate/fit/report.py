@@ -87,7 +87,7 @@ def _cell(cell: Cell, strokes: list[Pressed], press: FittedPress, published: Fit
     left, top = float(grid.x_mm[0]) - 0.5 * grid.px_mm, -float(grid.y_mm[0]) - 0.5 * grid.px_mm
     across, down = len(grid.x_mm) * grid.px_mm, len(grid.y_mm) * grid.px_mm
     return {
-        "height_mm": f"{cell[0]:g}",
+        "depth_mm": f"{cell[0]:g}",
         "tilt_deg": f"{cell[1]:g}",
         "presses": len(strokes),
         "ink": ink_uri(mean),
@@ -132,11 +132,11 @@ def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
     """Length and width against depth: the ink of each press as a point, the fit as a line for each tilt."""
     figure, axes = plot(1, 2, (10.0, 3.6))
     strokes, grid = captures.strokes, captures.grid
-    heights = np.linspace(min(s.height_mm for s in strokes), max(s.height_mm for s in strokes), SMOOTH_POINTS)
+    heights = np.linspace(min(s.depth_mm for s in strokes), max(s.depth_mm for s in strokes), SMOOTH_POINTS)
     tilts = sorted({one.tilt_deg for one in strokes})
     shown = tilts if len(tilts) <= len(COLOURS) else [tilts[0], tilts[len(tilts) // 2], tilts[-1]]
     for tilt, colour in zip(shown, COLOURS, strict=False):
-        pressed = [(s.height_mm, *measure(s, grid)) for s in strokes if s.tilt_deg == tilt]
+        pressed = [(s.depth_mm, *measure(s, grid)) for s in strokes if s.tilt_deg == tilt]
         seen = np.array(
             [(height, toward_tip + toward_heel, width) for height, toward_tip, toward_heel, width in pressed]
         )
@@ -153,10 +153,10 @@ def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
     return plot_uri(figure)
 
 
-def _fitted_sizes(press: FittedPress, height_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:
+def _fitted_sizes(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Floats) -> tuple[float, float]:
     try:
-        sizes = press.sizes(height_mm, tilt_deg)
-        width = np.maximum(press.edges_at(height_mm, tilt_deg, x_mm), 0.0).sum(axis=0).max()
+        sizes = press.sizes(depth_mm, tilt_deg)
+        width = np.maximum(press.edges_at(depth_mm, tilt_deg, x_mm), 0.0).sum(axis=0).max()
     except DomainError:
         return float("nan"), float("nan")
     return float(sizes.tip + sizes.heel), float(width)

@@ -38,7 +38,7 @@ END_STEP_MM, END_ROUNDS = 0.05, 4
 
 def fit_residual(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
     """The brush with the residuals of its ends and edges; `press` has none."""
-    terms = np.array([command_terms(s.height_mm, s.tilt_deg) for s in strokes])
+    terms = np.array([command_terms(s.depth_mm, s.tilt_deg) for s in strokes])
     ends = np.array([_ends(press, s, grid) for s in strokes])
     sides = np.array([_sines(press, s, end, grid) for s, end in zip(strokes, ends, strict=True)])
     falling = 1.0 / np.arange(1, MODES + 1)
@@ -71,9 +71,9 @@ def _ends(press: FittedPress, stroke: Pressed, grid: Grid) -> Floats:
     """By how much the stroke's tip and heel reach beyond the lengths of the brush, (2,) mm, by Gauss-Newton."""
 
     def image(further: Floats) -> Floats:
-        return _stretched(press, further).chance(stroke.height_mm, stroke.tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM)
+        return _stretched(press, further).chance(stroke.depth_mm, stroke.tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM)
 
-    sizes = press.sizes(stroke.height_mm, stroke.tilt_deg)
+    sizes = press.sizes(stroke.depth_mm, stroke.tilt_deg)
     reach = np.array([float(sizes.tip), float(sizes.heel)])
     weight = END_NOISE / END_MM**2
     found = np.zeros(2)
@@ -89,11 +89,11 @@ def _ends(press: FittedPress, stroke: Pressed, grid: Grid) -> Floats:
 def _sines(press: FittedPress, stroke: Pressed, ends: Floats, grid: Grid) -> Floats:
     """The sines (2, MODES) by which the stroke's upper and lower edge differ from the profile between its ends, mm."""
     own = _stretched(press, ends)
-    sizes = own.sizes(stroke.height_mm, stroke.tilt_deg)
+    sizes = own.sizes(stroke.depth_mm, stroke.tilt_deg)
     share = (grid.x_mm - sizes.widest + sizes.tip) / (sizes.tip + sizes.heel)
     on = (share > 0.0) & (share < 1.0)
     waves = modes(share[on])
-    width = np.maximum(own.half_width(stroke.height_mm, stroke.tilt_deg, grid.x_mm[on]), 0.0)
+    width = np.maximum(own.half_width(stroke.depth_mm, stroke.tilt_deg, grid.x_mm[on]), 0.0)
     above = grid.y_mm > 0.0
     edges = np.array([stroke.ink[rows][:, on].sum(axis=0) * grid.px_mm - width for rows in (above, ~above)])
     little = 0.005 * len(waves) * np.eye(MODES)

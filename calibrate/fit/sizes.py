@@ -64,7 +64,7 @@ def measure(stroke: Pressed, grid: Grid) -> Floats:
 
 def middle(strokes: Sequence[Pressed]) -> tuple[float, float]:
     """The middle of the depths and of the tilts."""
-    depths, tilts = [s.height_mm for s in strokes], [s.tilt_deg for s in strokes]
+    depths, tilts = [s.depth_mm for s in strokes], [s.tilt_deg for s in strokes]
     return 0.5 * (min(depths) + max(depths)), 0.5 * (min(tilts) + max(tilts))
 
 
@@ -75,7 +75,7 @@ def sizes_of(strokes: Sequence[Pressed], grid: Grid) -> list[Size]:
     if len(cells) < FEWEST_CELLS:
         return []
     at, measured = middle(inked), np.array([measure(stroke, grid) for stroke in inked])
-    keys = np.array([cells.index((stroke.height_mm, stroke.tilt_deg)) for stroke in inked])
+    keys = np.array([cells.index((stroke.depth_mm, stroke.tilt_deg)) for stroke in inked])
     try:
         whole = plane_at(inked, measured, at)
         others = [np.flatnonzero(keys != k) for k in range(len(cells))]
@@ -96,7 +96,7 @@ def plane_at(strokes: Sequence[Pressed], measured: Floats, at: tuple[float, floa
     Raises ValueError if the cells do not span depth and tilt.
     """
     plane = fit_plane(
-        [s.height_mm for s in strokes], [s.tilt_deg for s in strokes], dict(zip(SIZES, measured.T, strict=True))
+        [s.depth_mm for s in strokes], [s.tilt_deg for s in strokes], dict(zip(SIZES, measured.T, strict=True))
     )
     depth, tilt = at
     rows = [list(plane.at(*command).values()) for command in ((depth, tilt), (depth + 1.0, tilt), (depth, tilt + 1.0))]

@@ -19,7 +19,7 @@ def invert(
     model: Annotated[str, typer.Option(help="The stroke model to invert.")] = "ccd-bsm",
     fit: Annotated[Path | None, typer.Option(help="A brush fitted to captures, instead of --model.")] = None,
     lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
-    height_range: Annotated[tuple[float, float], typer.Option(help="Depths to look for, mm.")] = (2.0, 30.0),
+    depth_range: Annotated[tuple[float, float], typer.Option(help="Depths to look for, mm.")] = (2.0, 30.0),
     tilt_range: Annotated[tuple[float, float], typer.Option(help="Tilts to look for, deg; at most 30.")] = (0.0, 30.0),
     anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="Standard deviation of the touch point, mm.")] = 0.1,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
@@ -52,11 +52,11 @@ def invert(
     from brushloop.sessions.progress import shown
 
     try:
-        within = Range(height_range, tilt_range)
+        within = Range(depth_range, tilt_range)
         if tilt_range[1] > 30:
             raise ValueError(f"tilt_deg = {tilt_range}: expected 0 to 30")
     except ValueError as error:
-        raise CalibrationError("--height-range, --tilt-range", str(error)) from None
+        raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
     fitted, cells = None, frozenset[tuple[float, float]]()
     if fit is not None:
         from brushloop.calibrate.artefact import load_artefact
@@ -69,10 +69,10 @@ def invert(
         fitted = fitted_model(press)
         model = fitted.name
         # A fitted brush marks nothing above its zero offset.
-        least = max(within.height_mm[0], 0.5 - float(press.values[NAMES.index("h0_mm")]))
-        if least >= within.height_mm[1]:
-            raise CalibrationError("--height-range", f"ends before the fitted brush marks, at {least:.2f} mm")
-        within = Range((least, within.height_mm[1]), within.tilt_deg)
+        least = max(within.depth_mm[0], 0.5 - float(press.values[NAMES.index("h0_mm")]))
+        if least >= within.depth_mm[1]:
+            raise CalibrationError("--depth-range", f"ends before the fitted brush marks, at {least:.2f} mm")
+        within = Range((least, within.depth_mm[1]), within.tilt_deg)
     settings = Settings(model, fitted, cells, lam, within, anchor_sd, Field(mm_per_px=mm_per_px))
     with shown() as progress:
         made = invert_recording(session, settings, calibration, presses, progress)

@@ -14,8 +14,8 @@ from brushloop.sessions.cells import CsvWriter
 PROTOCOL = "protocol-replay.toml"
 MAX_ROWS = 10_000
 COLUMNS = (
-    "stroke_id", "height_mm", "tilt_deg", "height_sd_mm", "tilt_sd_deg", "rms", "flags",
-    "commanded_height_mm", "commanded_tilt_deg", "source",
+    "stroke_id", "depth_mm", "tilt_deg", "depth_sd_mm", "tilt_sd_deg", "rms", "flags",
+    "commanded_depth_mm", "commanded_tilt_deg", "source",
 )  # fmt: skip
 
 
@@ -45,8 +45,8 @@ def recovered_csv(made: Inversion) -> str:
     writer = CsvWriter(out)
     writer.writerow(COLUMNS)
     for row in made.rows:
-        asked = ["" if v is None else f"{v:g}" for v in (row.commanded_height_mm, row.commanded_tilt_deg)]
-        numbers = [f"{row.height_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.height_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
+        asked = ["" if v is None else f"{v:g}" for v in (row.commanded_depth_mm, row.commanded_tilt_deg)]
+        numbers = [f"{row.depth_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.depth_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
         writer.writerow(
             [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, str(made.header.source)]
         )

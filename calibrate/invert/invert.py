@@ -34,7 +34,7 @@ from brushloop.sessions.recording.schemas import Header, Stroke
 _T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"
 """Flag of a press whose standard deviations leave out the error of the model."""
-NOT_INFORMATIVE = {"H": "height_not_informative", "alpha": "tilt_not_informative"}
+NOT_INFORMATIVE = {"H": "depth_not_informative", "alpha": "tilt_not_informative"}
 """Flags of a value whose 95 % interval covers most of the range that was commanded in the session."""
 MOST = 0.8
 """Share of that range from which on an interval is not informative."""
@@ -65,13 +65,13 @@ class Row:
     """One recovered stroke."""
 
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
-    height_sd_mm: float
+    depth_sd_mm: float
     tilt_sd_deg: float
     rms: float
     flags: tuple[str, ...]
-    commanded_height_mm: float | None
+    commanded_depth_mm: float | None
     commanded_tilt_deg: float | None
 
 
@@ -144,10 +144,10 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list
     `fitted` are the cells that the model was fitted to.
     """
     nan = float("nan")
-    cells = [(row.commanded_height_mm or 0.0, row.commanded_tilt_deg or 0.0) for row in rows]
-    deep = np.array([nan if (h := row.commanded_height_mm) is None else row.height_mm - h for row in rows])
+    cells = [(row.commanded_depth_mm or 0.0, row.commanded_tilt_deg or 0.0) for row in rows]
+    deep = np.array([nan if (h := row.commanded_depth_mm) is None else row.depth_mm - h for row in rows])
     tilted = np.array([nan if (a := row.commanded_tilt_deg) is None else row.tilt_deg - a for row in rows])
-    height_sd = np.array([row.height_sd_mm for row in rows])
+    height_sd = np.array([row.depth_sd_mm for row in rows])
     tilt_sd = np.array([row.tilt_sd_deg for row in rows])
     known = [
         cell for cell, one, other in zip(cells, deep, tilted, strict=True) if np.isfinite(one) and np.isfinite(other)
@@ -155,7 +155,7 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list
     more_mm = model_sd(deep, height_sd, cells, fitted)
     # alpha follows from the distance H tan(alpha), in which the model errs by so many mm whatever the depth. An upright
     # press that was recovered at 0, the end of the range, does not show its error.
-    depth = np.array([row.height_mm for row in rows])
+    depth = np.array([row.depth_mm for row in rows])
     shown = np.where(tilted == 0.0, nan, tilted)
     more_deg = model_sd(shown * depth, tilt_sd * depth, cells, fitted) / depth
     out: list[Row] = []
@@ -165,9 +165,9 @@ def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list
             flags.add(NO_MODEL_ERROR)
         else:
             wider = float(np.hypot(row.tilt_sd_deg, more_deg[k]))
-            row = replace(row, height_sd_mm=float(np.hypot(row.height_sd_mm, more_mm[k])), tilt_sd_deg=wider)
+            row = replace(row, depth_sd_mm=float(np.hypot(row.depth_sd_mm, more_mm[k])), tilt_sd_deg=wider)
         for name, (value, sd, among) in {
-            "H": (row.height_mm, row.height_sd_mm, [cell[0] for cell in known]),
+            "H": (row.depth_mm, row.depth_sd_mm, [cell[0] for cell in known]),
             "alpha": (row.tilt_deg, row.tilt_sd_deg, [cell[1] for cell in known]),
         }.items():
             if covers_most(value, sd, among):
@@ -219,7 +219,7 @@ def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> 
         made.rows.append(
             Row(
                 ident, float(found.values[k, 0]), float(found.values[k, 1]), float(found.sigma[k, 0]),
-                float(found.sigma[k, 1]), float(found.rms[k]), tuple(sorted(flags)), stroke.height_mm, stroke.tilt_deg,
+                float(found.sigma[k, 1]), float(found.rms[k]), tuple(sorted(flags)), stroke.depth_mm, stroke.tilt_deg,
             )
         )  # fmt: skip
 
@@ -246,7 +246,7 @@ def _inverter(header: Header, settings: Settings) -> Inverter:
     except UnknownModelError as error:
         raise CalibrationError("--model", str(error)) from None
     except DomainError as error:
-        raise CalibrationError("--height-range, --tilt-range", str(error)) from None
+        raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
 
 
 def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, float, int]]:
@@ -255,7 +255,7 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, flo
     A single press has no standard deviation: None.
     """
     pairs = {
-        "H": [(r.height_mm, r.height_sd_mm, r.commanded_height_mm) for r in rows],
+        "H": [(r.depth_mm, r.depth_sd_mm, r.commanded_depth_mm) for r in rows],
         "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows],
     }
     for name, found in pairs.items():

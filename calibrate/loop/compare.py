@@ -145,7 +145,7 @@ def pair_up(
             found.refused.append((press.stroke_id, why))
             continue
         try:
-            images = simulated(model, press.height_mm, press.tilt_deg, view)
+            images = simulated(model, press.depth_mm, press.tilt_deg, view)
         except DomainError as error:
             found.refused.append((press.stroke_id, f"the model does not predict it: {error}"))
             continue
@@ -161,7 +161,7 @@ def _presses(
     """(press, the stroke it repeats) of every capture that can be used; the others go to `refused`."""
     for capture in captures:
         stroke = capture.stroke
-        if stroke.height_mm is None or stroke.tilt_deg is None:
+        if stroke.depth_mm is None or stroke.tilt_deg is None:
             refused.append((stroke.stroke_id, "has no depth or tilt"))
             continue
         try:
@@ -171,7 +171,7 @@ def _presses(
             refused.append((stroke.stroke_id, error.what))
             continue
         measured = measure(prepared.mask)
-        yield CapturedPress(stroke.stroke_id, stroke.height_mm, stroke.tilt_deg, measured, images), stroke.again_of
+        yield CapturedPress(stroke.stroke_id, stroke.depth_mm, stroke.tilt_deg, measured, images), stroke.again_of
 
 
 def _opened(recording: Recording) -> ComparedSession:

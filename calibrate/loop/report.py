@@ -110,7 +110,7 @@ def summary(loop: LoopComparison) -> Iterator[str]:
 
 def loop_csv(scores: list[PairScore], source: str) -> str:
     """Return a CSV row for every comparison with every original."""
-    head = ["original", "again", "height_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
+    head = ["original", "again", "depth_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
     rows = (
         (s.original, s.again, *s.cell, s.what, s.alignment, s.tone, f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
         for s in scores
@@ -151,8 +151,8 @@ def draw(loop: LoopComparison, path: Path) -> None:
         original, again = pair.original, pair.again
         score = scores[again.stroke_id]
         titles = (
-            f"{original.stroke_id}: H {original.height_mm:g} mm, alpha {original.tilt_deg:g} deg",
-            f"recovered: H {again.height_mm:.2f} mm, alpha {again.tilt_deg:.1f} deg",
+            f"{original.stroke_id}: H {original.depth_mm:g} mm, alpha {original.tilt_deg:g} deg",
+            f"recovered: H {again.depth_mm:.2f} mm, alpha {again.tilt_deg:.1f} deg",
             f"re-pressed: CSIM {score.csim:.3f}, SSIM {score.ssim:.3f}",
             "gray both, orange original only, blue again only",
         )
@@ -246,7 +246,7 @@ def _recovered(loop: LoopComparison, label: str) -> str:
     figure, axes = plot(1, 2, (10.0, 3.8))
     pairs = loop.paired.pairs
     values = (
-        ("depth H, mm", [(p.original.height_mm, p.again.height_mm) for p in pairs]),
+        ("depth H, mm", [(p.original.depth_mm, p.again.depth_mm) for p in pairs]),
         ("tilt α, deg", [(p.original.tilt_deg, p.again.tilt_deg) for p in pairs]),
     )
     for axis, (name, points) in zip(axes, values, strict=True):

@@ -33,7 +33,7 @@ class CapturedPress:
     """A press that can be compared; depth and tilt as commanded."""
 
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     measured: Measured
     images: dict[Key, Image]
@@ -42,7 +42,7 @@ class CapturedPress:
     @property
     def cell(self) -> tuple[float, float]:
         """H and alpha as commanded."""
-        return self.height_mm, self.tilt_deg
+        return self.depth_mm, self.tilt_deg
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,13 +99,13 @@ def generators(session: LoadedSession, files: Sequence[Generator], view: Field) 
 def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
     """Models fitted without the cell they predict; `fits` holds the result of a `refit_job` for each cell."""
 
-    def predict_fitted(height_mm: float, tilt_deg: float) -> Pixels:
-        found = _of_cell(fits, height_mm, tilt_deg, "fitted")
+    def predict_fitted(depth_mm: float, tilt_deg: float) -> Pixels:
+        found = _of_cell(fits, depth_mm, tilt_deg, "fitted")
         press = fitted_press(found, float(brush.radius_mm), float(brush.length_mm))
-        return loop_pixels(press.outline(height_mm, tilt_deg), view)
+        return loop_pixels(press.outline(depth_mm, tilt_deg), view)
 
-    def predict_bezier(height_mm: float, tilt_deg: float) -> Pixels:
-        return bezier_pixels(_of_cell(fits, height_mm, tilt_deg, "bezier"), height_mm, tilt_deg, view)
+    def predict_bezier(depth_mm: float, tilt_deg: float) -> Pixels:
+        return bezier_pixels(_of_cell(fits, depth_mm, tilt_deg, "bezier"), depth_mm, tilt_deg, view)
 
     bezier = Candidate(
         BEZIER_REFITTED,
@@ -130,11 +130,11 @@ def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Ca
 
     loaded: dict[Path, StrokeModel] = {}
 
-    def predict(height_mm: float, tilt_deg: float) -> Pixels:
-        file = files[(height_mm, tilt_deg)]
+    def predict(depth_mm: float, tilt_deg: float) -> Pixels:
+        file = files[(depth_mm, tilt_deg)]
         if file not in loaded:
             loaded[file] = load_generator(file, brush)
-        return simulated_pixels(loaded[file], height_mm, tilt_deg, view)
+        return simulated_pixels(loaded[file], depth_mm, tilt_deg, view)
 
     return Candidate(
         GENERATOR_HELD_OUT if number == 0 else f"{GENERATOR_HELD_OUT}-{number + 1}",
@@ -152,12 +152,12 @@ def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label
         label or model.label,
         model.definition,
         basis,
-        lambda height_mm, tilt_deg: simulated_pixels(model, height_mm, tilt_deg, view),
+        lambda depth_mm, tilt_deg: simulated_pixels(model, depth_mm, tilt_deg, view),
     )
 
 
-def _of_cell(fits: dict[Cell, dict[str, Any]], height_mm: float, tilt_deg: float, what: str) -> Any:
-    found = fits.get((height_mm, tilt_deg), {}).get(what)
+def _of_cell(fits: dict[Cell, dict[str, Any]], depth_mm: float, tilt_deg: float, what: str) -> Any:
+    found = fits.get((depth_mm, tilt_deg), {}).get(what)
     if found is None:
-        raise DomainError("height_mm", height_mm, "other cells", "the other cells do not determine this press")
+        raise DomainError("depth_mm", depth_mm, "other cells", "the other cells do not determine this press")
     return found

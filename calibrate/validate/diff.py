@@ -125,7 +125,7 @@ def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, 
     sums: dict[Series, dict[tuple[str, ...], tuple[float, int]]] = {}
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            cell = (row["height_mm"], row["tilt_deg"])
+            cell = (row["depth_mm"], row["tilt_deg"])
             key = (*cell, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else cell
             for measure in MEASURES:
                 series = sums.setdefault((row["model"], row["alignment"], row["tone"], measure), {})

@@ -83,10 +83,10 @@ def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> Fi
     return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges, np.array(body["ends"]).reshape(2, TERMS))
 
 
-def bezier_pixels(coefficients: Sequence[float], height_mm: float, tilt_deg: float, view: Field) -> Pixels:
+def bezier_pixels(coefficients: Sequence[float], depth_mm: float, tilt_deg: float, view: Field) -> Pixels:
     """Images of a refitted Bezier, (len(KEYS), 128, 128)."""
     plane = Plane(BEZIER_SIZES, np.reshape(coefficients, (len(BEZIER_SIZES), 3)))
-    return loop_pixels(RefittedBezier(plane).outline(height_mm, tilt_deg), view)
+    return loop_pixels(RefittedBezier(plane).outline(depth_mm, tilt_deg), view)
 
 
 def refits_by_cell(

@@ -58,7 +58,7 @@ class Press:
     """A captured press after preparation; `pixels` is empty if it was refused."""
 
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     again_of: str
     pixels: bytes
@@ -83,7 +83,7 @@ def press_of(body: dict[str, Any]) -> Press:
 def prepare_job(job: PrepareJob) -> Press:
     """Prepare a capture; one that cannot be used comes back with the reason."""
     stroke = job.capture.stroke
-    height, tilt = stroke.height_mm, stroke.tilt_deg
+    height, tilt = stroke.depth_mm, stroke.tilt_deg
 
     def refused(why: str) -> Press:
         depth, lean = (0.0 if value is None else value for value in (height, tilt))

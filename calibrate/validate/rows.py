@@ -17,7 +17,7 @@ Cell = tuple[float, float]
 """(H, alpha) as commanded."""
 Entry = tuple[int, int, float, float, bool]
 INDEX = np.dtype(
-    [("session", "i4"), ("number", "i4"), ("height_mm", "f8"), ("tilt_deg", "f8"), ("cut", "?")],
+    [("session", "i4"), ("number", "i4"), ("depth_mm", "f8"), ("tilt_deg", "f8"), ("cut", "?")],
 )
 """A row: number of its session, of its stroke in order of capture, its cell, whether the photograph cuts it."""
 CHUNK = 16
@@ -36,7 +36,7 @@ class Row:
     @property
     def cell(self) -> Cell:
         """(H, alpha) as commanded."""
-        return self.press.height_mm, self.press.tilt_deg
+        return self.press.depth_mm, self.press.tilt_deg
 
 
 class Rows:
@@ -48,7 +48,7 @@ class Rows:
         self._keys = keys
         self.index: NDArray[Any] = np.fromiter(entries, INDEX)
         """(rows,) of `INDEX`."""
-        cells = np.stack([self.index[name].astype(np.float64) for name in ("session", "height_mm", "tilt_deg")], axis=1)
+        cells = np.stack([self.index[name].astype(np.float64) for name in ("session", "depth_mm", "tilt_deg")], axis=1)
         _, stratum = np.unique(cells, axis=0, return_inverse=True)
         self.stratum: Numbers = stratum.reshape(-1)
         """(rows,) number of each row's cell and session, in their order."""
@@ -70,7 +70,7 @@ class Rows:
 
     def cell(self, row: int) -> Cell:
         """(H, alpha) of a row."""
-        return float(self.index[row]["height_mm"]), float(self.index[row]["tilt_deg"])
+        return float(self.index[row]["depth_mm"]), float(self.index[row]["tilt_deg"])
 
     def session(self, row: int) -> int:
         """Number of a row's session."""
@@ -87,7 +87,7 @@ class Rows:
 
     def of_cell(self, cell: Cell) -> Numbers:
         """Rows of a cell in any session, by session and order of capture."""
-        return np.flatnonzero((self.index["height_mm"] == cell[0]) & (self.index["tilt_deg"] == cell[1]))
+        return np.flatnonzero((self.index["depth_mm"] == cell[0]) & (self.index["tilt_deg"] == cell[1]))
 
     def first_of_cells(self) -> dict[Cell, int]:
         """The first row of each cell, sorted by cell."""

@@ -96,7 +96,7 @@ def _validate(
                 if press.refused:
                     refused.append((session.header.session_id, press.stroke_id, press.refused))
                 else:
-                    yield number, k, press.height_mm, press.tilt_deg, press.cut
+                    yield number, k, press.depth_mm, press.tilt_deg, press.cut
 
     rows = Rows(store, [key_of(session, options.view) for session in sessions], used())
     known = known or _known(sessions, options)

@@ -76,15 +76,15 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
         model = load_generator(generator, brush_of(session.header))
         for capture in session.recording.captures():
             stroke = capture.stroke
-            if stroke.height_mm is None or stroke.tilt_deg is None:
+            if stroke.depth_mm is None or stroke.tilt_deg is None:
                 aligned.left_out.append((stroke.stroke_id, "has no depth or tilt"))
                 continue
             try:
-                values = _inputs_of(model, stroke.height_mm, stroke.tilt_deg)
+                values = _inputs_of(model, stroke.depth_mm, stroke.tilt_deg)
                 prepared = prepare_press(capture, session.calibration, Field())
                 if prepared.cut:
                     raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
-                aligned.images.append(_placed(prepared, model, values, stroke.height_mm, stroke.tilt_deg))
+                aligned.images.append(_placed(prepared, model, values, stroke.depth_mm, stroke.tilt_deg))
             except (CaptureRefused, SessionDamaged) as error:
                 aligned.left_out.append((stroke.stroke_id, error.what))
                 continue
@@ -92,7 +92,7 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
                 aligned.left_out.append((stroke.stroke_id, f"the generator does not draw it: {error}"))
                 continue
             aligned.inputs.append(values)
-            aligned.cells.append((stroke.height_mm, stroke.tilt_deg))
+            aligned.cells.append((stroke.depth_mm, stroke.tilt_deg))
             if len(aligned.cells) > MAX_STROKES:
                 raise CalibrationError(str(session.recording.path), f"more than {MAX_STROKES} strokes to tune on")
     return aligned
@@ -208,7 +208,7 @@ def _with_images(
     brush = brush_of(session.header)
     target = load_generator(generator.path, brush).target
     ranges = {spec.name: (spec.low, spec.high) for spec in target.inputs}
-    if fit is None or set(ranges) != {"height_mm", "tilt_deg"} or target.placement is Placement.BASE:
+    if fit is None or set(ranges) != {"depth_mm", "tilt_deg"} or target.placement is Placement.BASE:
         return aligned
     fitted = fitted_model(fitted_press(fit, float(brush.radius_mm), float(brush.length_mm)))
     drawn = Target(fitted, ranges, {}, target.placement, target.px_mm, target.size_px)
@@ -222,9 +222,9 @@ def _with_images(
     )
 
 
-def _inputs_of(model: GeneratorModel, height_mm: float, tilt_deg: float) -> dict[str, float]:
+def _inputs_of(model: GeneratorModel, depth_mm: float, tilt_deg: float) -> dict[str, float]:
     """The generator's inputs for a press of its brush. Raises DomainError outside its training range."""
-    values = {name: float(value[0]) for name, value in model.of_press(height_mm, tilt_deg).items()}
+    values = {name: float(value[0]) for name, value in model.of_press(depth_mm, tilt_deg).items()}
     out: dict[str, float] = {}
     for spec in model.target.inputs:
         value = values.get(spec.name, spec.default)
@@ -235,7 +235,7 @@ def _inputs_of(model: GeneratorModel, height_mm: float, tilt_deg: float) -> dict
 
 
 def _placed(
-    prepared: Prepared, model: GeneratorModel, values: dict[str, float], height_mm: float, tilt_deg: float
+    prepared: Prepared, model: GeneratorModel, values: dict[str, float], depth_mm: float, tilt_deg: float
 ) -> Image:
     """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` if the stroke does not fit."""
     from brushloop.model.generator.targets import ANCHOR_SHARE, Placement
@@ -254,7 +254,7 @@ def _placed(
         case Placement.BASE:
             fixed = target.fixed
             base = tuple(values.get(name, fixed.get(name, 0.0)) for name in ("base_x_mm", "base_y_mm"))
-            corner = anchor[0] + axis_mm(height_mm, tilt_deg) - base[0], anchor[1] - base[1]
+            corner = anchor[0] + axis_mm(depth_mm, tilt_deg) - base[0], anchor[1] - base[1]
     image = _resampled(prepared.mask, corner, target.px_mm, target.size_px)
     inked = float(np.count_nonzero(prepared.mask)) / PX_PER_MM**2
     if abs(float(image.sum()) * target.px_mm**2 - inked) > 0.01 * inked:

@@ -31,7 +31,7 @@ def plan(
     lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="Lambda of CCD-BSM; pi by default.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
     margin_mm: Annotated[float, typer.Option(min=0, max=200, help="Margin around the font's square.")] = 6.0,
-    height_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
+    depth_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
     tilt_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest tilt, deg; at most 30.")] = (
         0.0,
         10.0,
@@ -66,15 +66,15 @@ def plan(
     if lagging is not None and fitted is not None:
         raise CalibrationError("write plan", "give --drag or --footprint, not both")
     try:
-        if tilt_range[1] > 30 or height_range[0] <= 0:
+        if tilt_range[1] > 30 or depth_range[0] <= 0:
             raise ValueError("tilts end at 30 deg, depths begin above 0 mm")
-        reach = Reach(height_range, tilt_range, turn_deg_mm=wrist_deg_s / speed_mm_s)
+        reach = Reach(depth_range, tilt_range, turn_deg_mm=wrist_deg_s / speed_mm_s)
         seen = lagging.model() if lagging is not None else None
         settings = Settings(Cell(cell_mm, margin_mm), reach, tilt, steps=steps, drag=seen)
         if fitted is not None:
             settings = replace(settings, footprint=fitted.footprint())
         of = stroke_model(model, Brush(radius_mm, length_mm), math.pi if lam is None else lam)
-        of.profile(height_range[1], tilt_range[1])
+        of.profile(depth_range[1], tilt_range[1])
     except (ValueError, UnknownModelError, DomainError) as error:
         raise CalibrationError("write plan", str(error)) from None
     figures = planned(what, data, of, settings)
@@ -83,7 +83,7 @@ def plan(
         radius_mm=radius_mm,
         length_mm=length_mm,
         lam=lam,
-        height_range_mm=height_range,
+        depth_range_mm=depth_range,
         tilt_range_deg=tilt_range,
         turn_deg_mm=reach.turn_deg_mm,
         speed_mm_s=speed_mm_s,
@@ -183,7 +183,7 @@ def practice(
     ] = 48.0,
     radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
     cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of each paper cell.")] = 70.0,
-    height_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
+    depth_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
     speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
     wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the strokes.")] = 1,
@@ -198,7 +198,7 @@ def practice(
     check_folder(out)
     turn_deg_mm = wrist_deg_s / speed_mm_s
     try:
-        Reach(height_range, turn_deg_mm=turn_deg_mm)
+        Reach(depth_range, turn_deg_mm=turn_deg_mm)
     except ValueError as error:
         raise CalibrationError("write practice", str(error)) from None
     by = PlannedBy(
@@ -206,7 +206,7 @@ def practice(
         radius_mm=radius_mm,
         length_mm=length_mm,
         lam=None,
-        height_range_mm=height_range,
+        depth_range_mm=depth_range,
         tilt_range_deg=(0.0, 2.0 * TILT_DEG),
         turn_deg_mm=turn_deg_mm,
         speed_mm_s=speed_mm_s,

@@ -139,11 +139,11 @@ def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
     stroke = capture.stroke
     if stroke.cell_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has no paper cell")
-    _, _, width_mm, height_mm = stroke.cell_mm
-    if not math.isclose(width_mm, height_mm):
-        raise CaptureRefused(stroke.stroke_id, f"its cell is {width_mm:g} x {height_mm:g} mm, but must be square")
+    _, _, size_x_mm, size_y_mm = stroke.cell_mm
+    if not math.isclose(size_x_mm, size_y_mm):
+        raise CaptureRefused(stroke.stroke_id, f"its cell is {size_x_mm:g} x {size_y_mm:g} mm, but must be square")
     raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
-    prepared = _whole_cell(raster, capture.where, calibration, math.hypot(width_mm, height_mm))
+    prepared = _whole_cell(raster, capture.where, calibration, math.hypot(size_x_mm, size_y_mm))
     return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
 
 

@@ -83,7 +83,7 @@ def learned(written: WritingComparison, gain: float = 0.7) -> tuple[PlanRecord, 
 
 def reach_of(by: PlannedBy) -> Reach:
     """The reach that a plan was made with."""
-    return Reach(by.height_range_mm, by.tilt_range_deg, turn_deg_mm=by.turn_deg_mm)
+    return Reach(by.depth_range_mm, by.tilt_range_deg, turn_deg_mm=by.turn_deg_mm)
 
 
 def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:

@@ -44,7 +44,7 @@ class PlannedBy(BaseModel):
     length_mm: Number
     lam: Number | None
     """None means pi."""
-    height_range_mm: tuple[Number, Number]
+    depth_range_mm: tuple[Number, Number]
     tilt_range_deg: tuple[Number, Number]
     turn_deg_mm: Number
     speed_mm_s: Number

@@ -35,7 +35,7 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float, seed:
     None is deeper than `DEEPEST` of the brush's length.
     """
     rng = np.random.default_rng(seed)
-    deepest_mm = min(reach.height_mm[1], math.floor(DEEPEST * brush_length_mm))
+    deepest_mm = min(reach.depth_mm[1], math.floor(DEEPEST * brush_length_mm))
     room_mm = (1.0 - 2.0 * MARGIN) * side_mm
     out: list[Floats] = []
     while len(out) < FIGURES * PER_FIGURE:
@@ -58,7 +58,7 @@ def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float, seed:
 
 def write_practice(out: Path, cell_mm: float, by: PlannedBy, seed: int) -> Path:
     """Write the protocol of a practice sheet, each stroke on a cell of its own; returns its path. Raises OSError."""
-    reach = Reach(by.height_range_mm, by.tilt_range_deg, turn_deg_mm=by.turn_deg_mm)
+    reach = Reach(by.depth_range_mm, by.tilt_range_deg, turn_deg_mm=by.turn_deg_mm)
     blank = np.zeros((SIZE_PX, SIZE_PX), np.float32)
     figures: list[FigureRecord] = []
     strokes = practice_strokes(cell_mm, reach, by.length_mm, seed)

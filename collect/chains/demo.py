@@ -32,7 +32,7 @@ CHARACTER = "字"
 class Size:
     """How much a demo does."""
 
-    heights_mm: tuple[float, ...]
+    depths_mm: tuple[float, ...]
     tilts_deg: tuple[float, ...]
     again: int
     """Presses that are recovered from their images and made again."""
@@ -42,7 +42,7 @@ class Size:
     @property
     def cells(self) -> int:
         """Number of combinations of H and alpha."""
-        return len(self.heights_mm) * len(self.tilts_deg)
+        return len(self.depths_mm) * len(self.tilts_deg)
 
 
 QUICK = Size((11.0, 15.0, 20.0), (0.0, 5.0, 10.0), again=6, writings=0)
@@ -126,7 +126,7 @@ class Demo:
     def _write_protocol(self) -> None:
         size = self._size
         protocol = (
-            f'kind = "grid"\nheights_mm = {list(size.heights_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
+            f'kind = "grid"\ndepths_mm = {list(size.depths_mm)}\ntilts_deg = {list(size.tilts_deg)}\n'
             f"repeats = {self._repeats}\nseed = {self._seed}\n"
         )
         if not self._protocol.exists() or self._protocol.read_text(encoding="utf-8") != protocol:

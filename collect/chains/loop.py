@@ -62,7 +62,7 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
         original=recording.header.session_id,
         original_sha256=recording.sha256,
         fit=fit.stem,
-        height_range_mm=(LEAST_HEIGHT_MM, rig.brush.max_depth_mm),
+        depth_range_mm=(LEAST_HEIGHT_MM, rig.brush.max_depth_mm),
         tilt_range_deg=(0.0, rig.robot.limits.tilt_deg),
         presses=request.presses,
         repeats=request.repeats,
@@ -102,8 +102,8 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, 
     """Recover depth and tilt; the protocol is written last, so where it exists this stage is done."""
     protocol = request.out / PROTOCOL
     if not protocol.exists():
-        low, high = map(str, settings.height_range_mm)
-        options: list[str | Path] = ["--fit", fit, "--height-range", low, high]
+        low, high = map(str, settings.depth_range_mm)
+        options: list[str | Path] = ["--fit", fit, "--depth-range", low, high]
         options += ["--tilt-range", *map(str, settings.tilt_range_deg)]
         options += ["--repeats", str(settings.repeats), "--seed", str(settings.seed)]
         options += [] if settings.presses is None else ["--presses", str(settings.presses)]
@@ -131,7 +131,7 @@ class Settings(BaseModel):
     original_sha256: str
     fit: BareName
     """Digest of the brush fit that recovers depth and tilt."""
-    height_range_mm: tuple[float, float]
+    depth_range_mm: tuple[float, float]
     tilt_range_deg: tuple[float, float]
     presses: int | None = None
     """None: all, as in loops begun before this could be chosen."""

@@ -14,7 +14,7 @@ from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.quality.verdict import Verdict
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 from brushloop.model.fitted import FittedPress
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class LastCapture:
     """One capture, as a screen shows it."""
 
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     still: int
     kept: bool
@@ -59,19 +59,17 @@ def likeness(captured: NDArray[np.bool_] | None, predicted: NDArray[np.bool_] | 
     return csim(captured.astype(float), predicted.astype(float))
 
 
-def published_mark(
-    height_mm: float, tilt_deg: float, *, radius_mm: float, length_mm: float
-) -> NDArray[np.bool_] | None:
+def published_mark(depth_mm: float, tilt_deg: float, *, radius_mm: float, length_mm: float) -> NDArray[np.bool_] | None:
     """Mark of CCD-BSM as published, (128, 128) on the default field; None if the model gives none. Takes a few ms."""
-    return mark_of(FittedPress(radius_mm, length_mm), height_mm, tilt_deg)
+    return mark_of(FittedPress(radius_mm, length_mm), depth_mm, tilt_deg)
 
 
-def mark_of(press: FittedPress, height_mm: float, tilt_deg: float) -> NDArray[np.bool_] | None:
+def mark_of(press: FittedPress, depth_mm: float, tilt_deg: float) -> NDArray[np.bool_] | None:
     """Mark of a brush, (128, 128) on the default field; None if the model gives none there. Takes a few ms."""
     left, top = FIELD.anchor_mm
     centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
     try:
-        upper, lower = press.edges_at(height_mm, tilt_deg, np.asarray(centres - left, np.float64))
+        upper, lower = press.edges_at(depth_mm, tilt_deg, np.asarray(centres - left, np.float64))
     except ValueError:
         return None
     up_mm = (top - centres)[:, None]
@@ -80,25 +78,25 @@ def mark_of(press: FittedPress, height_mm: float, tilt_deg: float) -> NDArray[np
     return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
 
 
-def cell_raster(image: Gray, plane: Plane, cell: Cell) -> tuple[Gray, tuple[float, float], tuple[int, int, int, int]]:
-    """The field around the cell's zero-touch point, rectified, with that point and the cell (x, y, width, height) in
+def cell_raster(image: Gray, plane: Plane, patch: Patch) -> tuple[Gray, tuple[float, float], tuple[int, int, int, int]]:
+    """The field around the patch's zero-touch point, rectified, with that point and the patch (x, y, width, height) in
     its pixels."""
-    x, y, _, height = window = FIELD.window_mm(cell.anchor_mm)
+    x, y, _, height = window = FIELD.window_mm(patch.anchor_mm)
     left, top = FIELD.anchor_mm
     raster = rectify(image, plane.image_to_paper, window)
-    top_of_cell = y + height - (cell.y_mm + cell.height_mm)
+    top_of_cell = y + height - (patch.y_mm + patch.size_y_mm)
     cell_px = (
-        round((cell.x_mm - x) * PX_PER_MM),
+        round((patch.x_mm - x) * PX_PER_MM),
         round(top_of_cell * PX_PER_MM),
-        round(cell.width_mm * PX_PER_MM),
-        round(cell.height_mm * PX_PER_MM),
+        round(patch.size_x_mm * PX_PER_MM),
+        round(patch.size_y_mm * PX_PER_MM),
     )
     return raster, (left * PX_PER_MM, top * PX_PER_MM), cell_px
 
 
-def pictures_of(image: Gray, plane: Plane, cell: Cell) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """The field around the cell's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
-    raster, anchor_px, cell_px = cell_raster(image, plane, cell)
+def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """The field around the patch's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
+    raster, anchor_px, cell_px = cell_raster(image, plane, patch)
     try:
         prepared = prepare(raster, anchor_px, "the capture", Params(), cell_px)
     except CaptureRefused:

@@ -143,7 +143,7 @@ def check_fresh_sheet(root: Path, sheet: int | None) -> None:
     pressed, unreadable = False, ""
     for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")) if sheet is None else ():
         try:
-            pressed = pressed or bool(replay(journal).used_cells)
+            pressed = pressed or bool(replay(journal).used_patches)
         except SessionError as error:
             unreadable = f" One cannot be resumed as it is: {error}; see `brushloop sessions verify {journal.parent}`."
     if pressed or unreadable:

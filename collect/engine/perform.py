@@ -38,26 +38,26 @@ class Performer:
         await self._run.procedures.retreat()
 
     async def perform(self, step: Step) -> Result:
-        """Do the step once. If it is cut short, the attempt is void and its cell stays used.
+        """Do the step once. If it is cut short, the attempt is void and its patch stays used.
 
         Raises `SheetFull` before anything is begun.
         """
         run = self._run
         rig, store, progress = run.rig, run.store, run.progress
         progress.doing(_in_words(step))
-        used = run.used_cells()
+        used = run.used_patches()
         marks = step.kind in MARKING
         # Checked before the dip too, so that a brush full of ink does not wait for a fresh sheet.
         free = run.sheet.free(used, store.state.sheet + 1) if marks or step.kind == StepKind.DIP else None
-        cell = free if marks else None
-        more = partners(run.sheet, cell, used) if cell is not None and step.kind == StepKind.SELF_CHECK else ()
+        patch = free if marks else None
+        more = partners(run.sheet, patch, used) if patch is not None and step.kind == StepKind.SELF_CHECK else ()
         notes: dict[str, Any] = {"params": dict(step.params)}
         if more:
-            notes["more_cells"] = [other.index for other in more]
-        attempt = store.begin(step.key, step.kind, cell=cell.index if cell else None, notes=notes)
+            notes["more_patches"] = [other.index for other in more]
+        attempt = store.begin(step.key, step.kind, patch=patch.index if patch else None, notes=notes)
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
-        place = None if cell is None else (store.state.sheet, cell.index)
+        place = None if patch is None else (store.state.sheet, patch.index)
         progress.begun(step, place)
         guard = ForceGuard(rig, recorder.force)
         event = StepEvent(
@@ -74,7 +74,7 @@ class Performer:
             guard.listen()
             try:
                 with guard.also(self._telemetry.force) if self._telemetry is not None else contextlib.nullcontext():
-                    result = await self._do(StepContext(run, step, cell, more, attempt, recorder, guard))
+                    result = await self._do(StepContext(run, step, patch, more, attempt, recorder, guard))
                 if step.kind in HEIGHTS:
                     with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
                         await rig.robot.confirm()

@@ -41,7 +41,7 @@ class Action(StrEnum):
     """What the engine does next."""
 
     RETRY = "again"
-    """Retreat, then do the step again; a press takes a new cell."""
+    """Retreat, then do the step again; a press takes a new patch."""
     ASK = "ask"
     """Let a person decide; if nobody watches, stop the run."""
     ABORT = "stop the run"
@@ -65,7 +65,7 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
             # The arm was stopped because the sensor fell silent; if it still is, the next press fails at once.
             action = Action.RETRY
         case StepKind.PRESS | StepKind.DRAW | StepKind.SELF_CHECK, BadPicture():
-            return Action.ASK  # another try would use up another cell
+            return Action.ASK  # another try would use up another patch
         case _, BadPicture():
             action = Action.RETRY
         case StepKind.CAPTURE | StepKind.BOARD, DeviceTimeout(device="camera"):

@@ -62,7 +62,7 @@ class Progress:
         """Whether this process has begun a step after the set-up."""
 
     def opened(self, store: SessionStore, sheet: Sheet) -> None:
-        """Begin with what a new or resumed session holds. `sheet` is how the paper is divided into cells."""
+        """Begin with what a new or resumed session holds. `sheet` is how the paper is divided into patches."""
         with self._lock:
             self._folder = str(store.folder)
             self._sheet = store.state.sheet
@@ -90,7 +90,7 @@ class Progress:
         self.doing(before)
 
     def begun(self, step: Step, place: Place | None) -> None:
-        """Note that a step begins; `place` is the sheet and cell that it marks."""
+        """Note that a step begins; `place` is the sheet and patch that it marks."""
         with self._lock:
             self._tally.begun(step, place)
             self.set_up_over = self.set_up_over or not in_set_up(step)
@@ -135,7 +135,7 @@ class Progress:
     def skipped(self, step: Step) -> Result:
         """Result of a dip whose stroke is left out."""
         stroke = self._by_index[step.index]
-        named = {"stroke_id": stroke.stroke_id, "height_mm": stroke.height_mm, "tilt_deg": stroke.tilt_deg}
+        named = {"stroke_id": stroke.stroke_id, "depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
         return {"skipped": True, **named}
 
     def sheet_in(self, sheet: int) -> None:
@@ -189,18 +189,18 @@ class Progress:
             current = self._current()
             waiting = (p for p in self._plan if p.stroke_id not in tally.over and p is not current)
             following = next(waiting, None)
-            counts = Counter((p.height_mm, p.tilt_deg) for p in self._plan)
+            counts = Counter((p.depth_mm, p.tilt_deg) for p in self._plan)
             grid = tuple(
                 CellCount(
-                    *cell,
-                    tally.done[cell],
+                    *patch,
+                    tally.done[patch],
                     count,
-                    tally.bad[cell],
-                    tally.left_out[cell],
-                    current is not None and cell == (current.height_mm, current.tilt_deg),
-                    following is not None and cell == (following.height_mm, following.tilt_deg),
+                    tally.bad[patch],
+                    tally.left_out[patch],
+                    current is not None and patch == (current.depth_mm, current.tilt_deg),
+                    following is not None and patch == (following.depth_mm, following.tilt_deg),
                 )
-                for cell, count in sorted(counts.items())
+                for patch, count in sorted(counts.items())
             )
             return Snapshot(
                 session_id=self._session_id,

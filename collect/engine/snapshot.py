@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CellCount:
-    """Strokes of one cell of the grid: one depth H at one tilt alpha."""
+    """Strokes of one patch of the grid: one depth H at one tilt alpha."""
 
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     done: int
     planned: int
@@ -30,9 +30,9 @@ class CellCount:
     left_out: int = 0
     """Strokes that were given up."""
     now: bool = False
-    """The stroke in progress belongs to this cell."""
+    """The stroke in progress belongs to this patch."""
     next: bool = False
-    """The next planned stroke belongs to this cell."""
+    """The next planned stroke belongs to this patch."""
 
     @property
     def over(self) -> bool:
@@ -41,7 +41,7 @@ class CellCount:
 
 
 class Mark(StrEnum):
-    """State of a paper cell that is not blank."""
+    """State of a paper patch that is not blank."""
 
     NOW = "now"
     WAITING = "pressed"
@@ -56,14 +56,14 @@ class Mark(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SheetMap:
-    """The current sheet, cell by cell, row by row from the far edge."""
+    """The current sheet, patch by patch, row by row from the far edge."""
 
     number: int
     """From 1."""
     columns: int
     rows: int
     marks: tuple[Mark | None, ...]
-    """None for a blank cell."""
+    """None for a blank patch."""
 
 
 @dataclass(frozen=True, slots=True)

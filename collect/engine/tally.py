@@ -37,7 +37,7 @@ class Tally:
     def opened(self, state: Replay, columns: int, rows: int) -> None:
         """Begin with the used cells of a session, on sheets of that shape; then pass its results to `finished`."""
         self._shape = (columns, rows)
-        self._marks = dict.fromkeys(state.used_cells, Mark.VOID)
+        self._marks = dict.fromkeys(state.used_patches, Mark.VOID)
 
     def begun(self, step: Step, place: Place | None) -> None:
         """Note that a step begins; `place` is where it marks the paper."""
@@ -53,11 +53,11 @@ class Tally:
         """Note that a step is done."""
         match kind:
             case StepKind.PRESS | StepKind.DRAW:
-                place = (int(result["sheet"]), int(result["cell"]))
+                place = (int(result["sheet"]), int(result["patch"]))
                 self._marks[place] = Mark.WAITING
                 self._stroke_at[str(result["stroke_id"])] = place
-            case StepKind.SELF_CHECK if "cell" in result:
-                for cell in result.get("cells", [result["cell"]]):
+            case StepKind.SELF_CHECK if "patch" in result:
+                for cell in result.get("patches", [result["patch"]]):
                     self._marks[(int(result["sheet"]), int(cell))] = Mark.CHECK
             case StepKind.CAPTURE:
                 self._captured(result)
@@ -104,4 +104,4 @@ class Tally:
 
 
 def _cell(result: Result) -> GridCell:
-    return float(result["height_mm"]), float(result["tilt_deg"])
+    return float(result["depth_mm"]), float(result["tilt_deg"])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from brushloop.collect.protocols.plan import TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig, WashConfig
-from brushloop.collect.rig.paper import Cell, PaperPlane, to_base
+from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
 from brushloop.drivers.geometry import brush_pose, interpolate, lean
 from brushloop.drivers.samples import Pose
 
@@ -54,8 +54,8 @@ class Room:
         cls, config: RigConfig, rect_mm: tuple[float, float, float, float], lowest_z_mm: float, speed_mm_s: float
     ) -> Room:
         """The region over a rectangle of the sheet (x, y, width, height), which may be a point, up to travel height."""
-        x_mm, y_mm, width_mm, height_mm = rect_mm
-        places = dict.fromkeys((x, y) for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm))
+        x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
+        places = dict.fromkeys((x, y) for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm))
         heights = (lowest_z_mm, config.motion.safe_z_mm)
         return cls(tuple(touching(config, *place, z_mm) for z_mm in heights for place in places), speed_mm_s)
 
@@ -104,8 +104,8 @@ def park_moves(config: RigConfig) -> list[Move]:
 
 def over_sheet_move(config: RigConfig) -> Move:
     """Over the middle of the sheet at travel height, where the camera must see the arm."""
-    width_mm, height_mm = config.paper.size_mm
-    return over(config, 0.5 * width_mm, 0.5 * height_mm)
+    size_x_mm, size_y_mm = config.paper.size_mm
+    return over(config, 0.5 * size_x_mm, 0.5 * size_y_mm)
 
 
 def photograph_moves(config: RigConfig) -> list[Move]:
@@ -146,20 +146,20 @@ def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
 
 
 def press_moves(
-    config: RigConfig, plane: PaperPlane, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float = 0.0
+    config: RigConfig, plane: PaperPlane, patch: Patch, depth_mm: float, tilt_deg: float, dwell_s: float = 0.0
 ) -> tuple[list[Move], list[Move]]:
-    """Two lists: over the cell and tilt about the tip at clearance; down to touch height and by H, dwell, up again.
+    """Two lists: over the patch and tilt about the tip at clearance; down to touch height and by H, dwell, up again.
 
     The controller carries out the second list by itself, so that list must end above the paper.
     Tilting about the tip just above the paper gives the same pose at touch as tilting on it, without a smear.
     """
     motion, paper = config.motion, config.paper
-    above = over(config, *cell.anchor_mm)
+    above = over(config, *patch.anchor_mm)
 
     def pose(above_mm: float, tilt: float) -> Pose:
-        return plane.pose(paper, *cell.anchor_mm, above_mm, tilt_deg=tilt)
+        return plane.pose(paper, *patch.anchor_mm, above_mm, tilt_deg=tilt)
 
-    touch, deep = pose(0.0, tilt_deg), pose(-height_mm, tilt_deg)
+    touch, deep = pose(0.0, tilt_deg), pose(-depth_mm, tilt_deg)
     before = [
         above,
         Move(pose(CLEARANCE_MM, 0.0), motion.travel_speed_mm_s),
@@ -167,7 +167,7 @@ def press_moves(
     ]
     pressing = [
         Move(touch, motion.press_speed_mm_s),
-        Move(interpolate(touch, deep, max(0.5, 1.0 - DWELL_MM / height_mm)), motion.press_speed_mm_s),
+        Move(interpolate(touch, deep, max(0.5, 1.0 - DWELL_MM / depth_mm)), motion.press_speed_mm_s),
         Move(deep, motion.press_speed_mm_s, max(dwell_s, motion.least_dwell_s)),
         Move(pose(CLEARANCE_MM, tilt_deg), motion.press_speed_mm_s),
         above,
@@ -190,20 +190,20 @@ class StrokeMoves:
 
 
 def stroke_moves(
-    config: RigConfig, plane: PaperPlane, cell: Cell, points: Sequence[TrajectoryPoint], speed_mm_s: float
+    config: RigConfig, plane: PaperPlane, patch: Patch, points: Sequence[TrajectoryPoint], speed_mm_s: float
 ) -> StrokeMoves:
     """Over the first point with the wrist turned as the stroke begins, tilt just above the paper, land, follow, lift.
 
-    Points are in the cell's frame: origin at its lower left corner, axes along the sheet's.
+    Points are in the patch's frame: origin at its lower left corner, axes along the sheet's.
     """
     motion, paper = config.motion, config.paper
 
     def at(point: TrajectoryPoint, above_mm: float, tilt_deg: float) -> Pose:
-        x_mm, y_mm = cell.x_mm + point[0], cell.y_mm + point[1]
+        x_mm, y_mm = patch.x_mm + point[0], patch.y_mm + point[1]
         return plane.pose(paper, x_mm, y_mm, above_mm, tilt_deg=tilt_deg, turn_deg=point[4])
 
     def high(point: TrajectoryPoint) -> Pose:
-        base = to_base(paper, cell.x_mm + point[0], cell.y_mm + point[1])
+        base = to_base(paper, patch.x_mm + point[0], patch.y_mm + point[1])
         return brush_pose(*base, motion.safe_z_mm, heading_deg=paper.yaw_deg + point[4])
 
     def clear(point: TrajectoryPoint) -> float:

@@ -21,7 +21,7 @@ from brushloop.collect.photograph.photographer import ArmTrips, Photographer
 from brushloop.collect.protocols.plan import Drawn, TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, limits_of
-from brushloop.collect.rig.paper import Cell, PaperPlane, to_paper
+from brushloop.collect.rig.paper import PaperPlane, Patch, to_paper
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.protocols import Robot
 from brushloop.drivers.samples import Frame, QueuedLine
@@ -93,18 +93,18 @@ class Procedures:
             await self.go(move)
         self._dips += 1
 
-    async def press(self, cell: Cell, height_mm: float, tilt_deg: float, dwell_s: float) -> float:
+    async def press(self, patch: Patch, depth_mm: float, tilt_deg: float, dwell_s: float) -> float:
         """Press once; returns the depth reached below the paper along its normal, in mm."""
-        before, pressing = press_moves(self._config, self.plane, cell, height_mm, tilt_deg, dwell_s)
+        before, pressing = press_moves(self._config, self.plane, patch, depth_mm, tilt_deg, dwell_s)
         for move in before:
             await self.go(move)
         # From here on the arm lifts by itself, whatever happens to this program.
         lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in pressing]
         seen = await self._rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
-        depth_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
-        if abs(depth_mm - height_mm) > DEPTH_TOLERANCE_MM:
-            raise StepVoid(f"the depth was {depth_mm:.3f} mm, {height_mm:g} mm was commanded")
-        return depth_mm
+        reached_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
+        if abs(reached_mm - depth_mm) > DEPTH_TOLERANCE_MM:
+            raise StepVoid(f"the depth was {reached_mm:.3f} mm, {depth_mm:g} mm was commanded")
+        return reached_mm
 
     async def capture(self) -> Frame:
         """Park, and return the first frame exposed after the camera has shown the arm gone."""
@@ -118,8 +118,8 @@ class Procedures:
     async def _over_sheet(self) -> bool:
         here = await self._rig.robot.where()
         x_mm, y_mm = to_paper(self._config.paper, here.x_mm, here.y_mm)
-        width_mm, height_mm = self._config.paper.size_mm
-        return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
+        size_x_mm, size_y_mm = self._config.paper.size_mm
+        return 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
 
     async def go(self, move: Move) -> None:
         """Make one move and wait for its end."""
@@ -127,11 +127,11 @@ class Procedures:
         await self._rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=motion.acc_mm_s2)
 
 
-def check_drawn(config: RigConfig, plane: PaperPlane, limits: Limits, cells: Iterable[Cell], drawn: Drawn) -> None:
-    """Check every pose of a figure on these cells. Raises `LimitExceeded`."""
-    for cell in cells:
+def check_drawn(config: RigConfig, plane: PaperPlane, limits: Limits, patches: Iterable[Patch], drawn: Drawn) -> None:
+    """Check every pose of a figure on these patches. Raises `LimitExceeded`."""
+    for patch in patches:
         for points in drawn.strokes:
-            for pose, speed_mm_s in commanded(stroke_moves(config, plane, cell, points, drawn.speed_mm_s).parts):
+            for pose, speed_mm_s in commanded(stroke_moves(config, plane, patch, points, drawn.speed_mm_s).parts):
                 limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
 
 
@@ -139,7 +139,7 @@ async def draw_stroke(
     robot: Robot,
     config: RigConfig,
     plane: PaperPlane,
-    cell: Cell,
+    patch: Patch,
     points: Sequence[TrajectoryPoint],
     *,
     speed_mm_s: float,
@@ -150,7 +150,7 @@ async def draw_stroke(
     All poses are checked before the arm moves. Raises `LimitExceeded` and what `Robot.move` and `Robot.follow` raise.
     """
     acc_mm_s2 = config.motion.acc_mm_s2
-    moves = stroke_moves(config, plane, cell, points, speed_mm_s)
+    moves = stroke_moves(config, plane, patch, points, speed_mm_s)
     for pose, pace_mm_s in commanded(moves.parts):
         robot.check(pose, speed_mm_s=pace_mm_s, acc_mm_s2=acc_mm_s2)
     for move in moves.down:

@@ -1,6 +1,6 @@
 """The limit check before motion: every pose that a protocol can command, and whether the arm can reach it.
 
-Poses are checked on every cell, because a void press moves all later ones to other cells.
+Poses are checked on every patch, because a void press moves all later ones to other patches.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import Cell, PaperPlane, Sheet
+from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.arcs.controller import Controller, six
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
@@ -30,7 +30,7 @@ from brushloop.drivers.rotation import inverse, product, turned
 from brushloop.drivers.samples import Pose
 
 TOUCH_CLEAR_MM = 5.0
-MARKED = {"sheet": 0, "cell": 0}
+MARKED = {"sheet": 0, "patch": 0}
 
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
@@ -50,7 +50,7 @@ def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step
     try:
         step = next(generator)
         while True:
-            names = sorted(set(step.params) - {"stroke_id", "again_of", "dwell_s", "sheet", "cell"})
+            names = sorted(set(step.params) - {"stroke_id", "again_of", "dwell_s", "sheet", "patch"})
             asked = (step.kind, *(step.params[name] for name in names if step.kind != StepKind.CAPTURE))
             if asked not in seen:
                 seen.add(asked)
@@ -87,7 +87,7 @@ def _depths(protocol: ProtocolConfig) -> Iterator[tuple[float, float, str]]:
                 yield from ((point[2], point[3], f"{figure.name}: ") for point in stroke.points)
     else:
         for stroke in protocol.planned():
-            yield stroke.height_mm, stroke.tilt_deg, "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
+            yield stroke.depth_mm, stroke.tilt_deg, "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
 
 
 def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
@@ -100,13 +100,13 @@ def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
         )
     if rig.self_check.enabled:
         try:
-            triangle_in(sheet.cell(0), rig.self_check)
+            triangle_in(sheet.patch(0), rig.self_check)
         except StepError as error:
             what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off"
             raise ConfigError(rig_path, "self_check.legs_mm", what) from None
     x_mm, y_mm = rig.paper.touch_point_mm
-    for cell in map(sheet.cell, range(sheet.capacity)):
-        for mark_x, mark_y in _marks(protocol, cell):
+    for patch in map(sheet.patch, range(sheet.capacity)):
+        for mark_x, mark_y in _marks(protocol, patch):
             if math.dist((mark_x, mark_y), (x_mm, y_mm)) < TOUCH_CLEAR_MM:
                 what = "a drawn point" if own else "a press"
                 raise ConfigError(
@@ -117,13 +117,13 @@ def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolC
                 )
 
 
-def _marks(protocol: ProtocolConfig, cell: Cell) -> Iterator[tuple[float, float]]:
+def _marks(protocol: ProtocolConfig, patch: Patch) -> Iterator[tuple[float, float]]:
     if not isinstance(protocol, WriteConfig):
-        yield cell.anchor_mm
+        yield patch.anchor_mm
         return
     for figure in protocol.figures:
         for stroke in figure.strokes:
-            yield from ((cell.x_mm + x_mm, cell.y_mm + y_mm) for x_mm, y_mm, *_ in stroke.points)
+            yield from ((patch.x_mm + x_mm, patch.y_mm + y_mm) for x_mm, y_mm, *_ in stroke.points)
 
 
 def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
@@ -147,7 +147,7 @@ def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane:
 
 
 def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step) -> None:
-    """Check the poses of a step that the operator asked for and that needs no cell. Raises `ConfigError`."""
+    """Check the poses of a step that the operator asked for and that needs no patch. Raises `ConfigError`."""
     _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, None).poses))
 
 
@@ -163,35 +163,35 @@ def _check(rig_path: Path, rig: RigConfig, poses: Iterable[tuple[Pose, float, st
 
 
 def all_poses(
-    rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_cell: bool = False
+    rig: RigConfig, protocol: ProtocolConfig, plane: PaperPlane, *, every_patch: bool = False
 ) -> Iterator[tuple[Pose, float, str]]:
     """Yield (pose, speed in mm/s, what it belongs to) for everything that the protocol can command.
 
-    The box of the limits is convex, so what fits on the outermost cells fits on all. The arm's reach is not convex and
-    needs `every_cell`.
+    The box of the limits is convex, so what fits on the outermost patches fits on all. The arm's reach is not convex
+    and needs `every_patch`.
     """
     yield from ((move.target, move.speed_mm_s, "park") for move in park_moves(rig))
     sheet = sheet_of(rig, protocol)
-    cells = [sheet.cell(i) for i in range(sheet.capacity)] if every_cell else sheet.corners
+    patches = [sheet.patch(i) for i in range(sheet.capacity)] if every_patch else sheet.corners
     # Assume that a wash is due in every step: when one is due depends on the step at which the process starts.
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     for step in distinct_steps(rig, protocol):
-        for cell, more in _places(step, cells):
+        for patch, more in _places(step, patches):
             name = str(step.params.get("stroke_id", step.kind))
-            where = f"{name} on cell {cell.index}" if cell is not None else name
-            moves = moves_of(rig, plane, step, cell, more, dips=dips)
+            where = f"{name} on patch {patch.index}" if patch is not None else name
+            moves = moves_of(rig, plane, step, patch, more, dips=dips)
             yield from ((pose, speed, where) for pose, speed in moves.poses)
 
 
-def _places(step: Step, cells: list[Cell]) -> Iterator[tuple[Cell | None, tuple[Cell, ...]]]:
-    """Cells that a step may mark, as arguments of `moves_of`; the self-check marks one cell, or three."""
+def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch | None, tuple[Patch, ...]]]:
+    """Cells that a step may mark, as arguments of `moves_of`; the self-check marks one patch, or three."""
     if step.kind not in MARKING:
         yield None, ()
         return
-    for cell in cells:
-        yield cell, ()
+    for patch in patches:
+        yield patch, ()
         if step.kind is StepKind.SELF_CHECK:
-            yield cell, (cell, cell)
+            yield patch, (patch, patch)
 
 
 DEVICE = "robot"

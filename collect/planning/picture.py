@@ -1,4 +1,4 @@
-"""A picture of the sheets from above: cells with their strokes, touch points, well, park position, board."""
+"""A picture of the sheets from above: patches with their strokes, touch points, well, park position, board."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
     axes.add_patch(Rectangle(board.origin_mm, *size, fill=False, edgecolor=GREY, linestyle="--", label="board"))
     axes.add_patch(Rectangle((0.0, 0.0), *config.paper.size_mm, facecolor=PAPER, edgecolor="black", label="sheet"))
     for index in range(sheet.capacity if plan.placed else 0):
-        cell = sheet.cell(index)
-        axes.add_patch(_outline(cell.rect_mm, GREY))
+        patch = sheet.patch(index)
+        axes.add_patch(_outline(patch.rect_mm, GREY))
     axes.add_patch(Circle(config.ink.well_mm, 6.0, facecolor=BLUE, edgecolor="black", label="well"))
     axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=9, mew=2.5, label="touch point")
     park = to_paper(config.paper, config.motion.park_mm[0], config.motion.park_mm[1])
@@ -85,35 +85,35 @@ def _sheet(
 ) -> None:
     from matplotlib import colormaps
 
-    heights = [p.height_mm for p in plan.placed]
+    heights = [p.depth_mm for p in plan.placed]
     low, high = min(heights), max(heights)
     axes.add_patch(_outline((0.0, 0.0, *config.paper.size_mm), "black"))
     for stroke in placed:
-        cell = sheet.cell(stroke.cell)
-        share = 0.5 if high == low else (stroke.height_mm - low) / (high - low)
+        patch = sheet.patch(stroke.patch)
+        share = 0.5 if high == low else (stroke.depth_mm - low) / (high - low)
         shade = colormaps["cividis"](0.25 + 0.75 * (1.0 - share))
-        axes.add_patch(_outline(cell.rect_mm, GREY, None if stroke.drawn else shade))
+        axes.add_patch(_outline(patch.rect_mm, GREY, None if stroke.drawn else shade))
         ink = "white" if not stroke.drawn and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
-        points = max(4.0, min(0.34 * cell.height_mm, 0.17 * cell.width_mm) * 498.0 / config.paper.size_mm[0])
+        points = max(4.0, min(0.34 * patch.size_y_mm, 0.17 * patch.size_x_mm) * 498.0 / config.paper.size_mm[0])
         if stroke.drawn:
-            _figure(axes, cell.rect_mm, drawn[stroke.stroke_id])
-            axes.text(cell.x_mm + 1.0, cell.y_mm + 1.0, f"#{stroke.order} {_plain(stroke.stroke_id)}", fontsize=8)
+            _figure(axes, patch.rect_mm, drawn[stroke.stroke_id])
+            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{stroke.order} {_plain(stroke.stroke_id)}", fontsize=8)
         else:
             axes.text(
-                cell.x_mm + 0.36 * cell.width_mm,
-                cell.y_mm + 0.5 * cell.height_mm,
-                f"#{stroke.order}\nH{stroke.height_mm:g} a{stroke.tilt_deg:g}",
+                patch.x_mm + 0.36 * patch.size_x_mm,
+                patch.y_mm + 0.5 * patch.size_y_mm,
+                f"#{stroke.order}\nH{stroke.depth_mm:g} a{stroke.tilt_deg:g}",
                 fontsize=min(points, 9.0),
                 color=ink,
                 ha="center",
                 va="center",
             )
-            axes.plot(*cell.anchor_mm, "+", color=ink, markersize=5, alpha=0.7)
+            axes.plot(*patch.anchor_mm, "+", color=ink, markersize=5, alpha=0.7)
     if number == 1 and plan.steps.get("self_check"):
-        first = sheet.cell(0)
-        for cell in (first, *partners(sheet, first, set())):
-            axes.add_patch(_outline(cell.rect_mm, GREY))
-            axes.text(cell.x_mm + 2.0, cell.y_mm + 0.5 * cell.height_mm, "self-check", fontsize=8, va="center")
+        first = sheet.patch(0)
+        for patch in (first, *partners(sheet, first, set())):
+            axes.add_patch(_outline(patch.rect_mm, GREY))
+            axes.text(patch.x_mm + 2.0, patch.y_mm + 0.5 * patch.size_y_mm, "self-check", fontsize=8, va="center")
     axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
     axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
     axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)
@@ -145,5 +145,5 @@ def _plain(name: str) -> str:
 def _outline(rect_mm: tuple[float, float, float, float], edge: str, face: object = None) -> Any:
     from matplotlib.patches import Rectangle
 
-    x_mm, y_mm, width_mm, height_mm = rect_mm
-    return Rectangle((x_mm, y_mm), width_mm, height_mm, edgecolor=edge, facecolor=face or "none", linewidth=0.8)
+    x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
+    return Rectangle((x_mm, y_mm), size_x_mm, size_y_mm, edgecolor=edge, facecolor=face or "none", linewidth=0.8)

@@ -19,7 +19,7 @@ from brushloop.collect.protocols.presses import ReplayConfig
 from brushloop.collect.protocols.steps import MARKING, StepKind
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.paper import Cell, Sheet
+from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.samples import Pose
 
@@ -33,10 +33,10 @@ class PlacedStroke:
     order: int
     """From 1."""
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     sheet: int
-    cell: int
+    patch: int
     drawn: bool
 
 
@@ -48,7 +48,7 @@ class Plan:
     steps: dict[str, int]
     """Number of steps of each kind."""
     placed: tuple[PlacedStroke, ...]
-    cells_per_sheet: int
+    patches_per_sheet: int
     sheets: int
     sheet_changes: tuple[str, ...]
     """Strokes before which a fresh sheet goes in."""
@@ -89,7 +89,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         poses += len(walked.moves.poses)
         if step.kind == StepKind.TOUCH:
             touches.append((float(step.params["x_mm"] or 0.0), float(step.params["y_mm"] or 0.0)))
-        if step.kind in STROKES and walked.cell is not None:
+        if step.kind in STROKES and walked.patch is not None:
             stroke_id = str(step.params["stroke_id"])
             if placed and walked.sheet != placed[-1].sheet:
                 changes.append(stroke_id)
@@ -97,10 +97,10 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
                 PlacedStroke(
                     len(placed) + 1,
                     stroke_id,
-                    float(step.params["height_mm"] or 0.0),
+                    float(step.params["depth_mm"] or 0.0),
                     float(step.params["tilt_deg"] or 0.0),
                     walked.sheet,
-                    walked.cell.index,
+                    walked.patch.index,
                     step.kind == StepKind.DRAW,
                 )
             )
@@ -108,7 +108,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         kind=protocol.kind,
         steps=dict(kinds),
         placed=tuple(placed),
-        cells_per_sheet=sheet.capacity,
+        patches_per_sheet=sheet.capacity,
         sheets=placed[-1].sheet if placed else 1,
         sheet_changes=tuple(changes),
         dips=dips,
@@ -122,7 +122,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
 
 
 def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Walked) -> float:
-    """Seconds that the arm waits over the cell for the ink; of a figure, before its first stroke."""
+    """Seconds that the arm waits over the patch for the ink; of a figure, before its first stroke."""
     if protocol.wait_after_dip_s is None or walked.step.kind not in STROKES:
         return 0.0
     over_s, _ = step_s(config, here, StepMoves(walked.moves.parts[:1]))
@@ -138,7 +138,7 @@ def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list
     over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))
     if over_mm > 0.0:
         warnings.append(
-            f"{worst} may reach {over_mm:.1f} mm beyond its cell of {sheet.cell_mm[0]:g} x {sheet.cell_mm[1]:g} mm, "
+            f"{worst} may reach {over_mm:.1f} mm beyond its patch of {sheet.cell_mm[0]:g} x {sheet.cell_mm[1]:g} mm, "
             "by the closed-form stroke model: marks may run into each other"
         )
     return warnings
@@ -150,55 +150,57 @@ def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
         return None
     armed = config.checking_itself(True)
     try:
-        triangle_in(sheet_of(armed, protocol).cell(0), armed.self_check)
+        triangle_in(sheet_of(armed, protocol).patch(0), armed.self_check)
     except StepError as error:
         return f"with --arm the self-check comes first, and {error}: change [self_check] legs_mm, or enabled = false"
     (before, _), (sheets, taken) = (_sheets(one, protocol) for one in (config, armed))
     if sheets == before:
         return None
-    cells = f"{taken} cells" if taken > 1 else "one cell"
-    return f"with --arm the self-check first takes {cells}: {sheets} sheets instead of {before} (`collect plan --arm`)"
+    patches = f"{taken} patches" if taken > 1 else "one patch"
+    return (
+        f"with --arm the self-check first takes {patches}: {sheets} sheets instead of {before} (`collect plan --arm`)"
+    )
 
 
 def _sheets(config: RigConfig, protocol: ProtocolConfig) -> tuple[int, int]:
-    """(sheets that are marked, cells of the first sheet that the self-check takes)."""
+    """(sheets that are marked, patches of the first sheet that the self-check takes)."""
     sheets, taken = 1, 0
     for walked in walk(config, protocol):
-        if walked.cell is not None and walked.step.kind in MARKING:
+        if walked.patch is not None and walked.step.kind in MARKING:
             sheets = walked.sheet
         if walked.step.kind is StepKind.SELF_CHECK:
-            taken = 1 + len(walked.more_cells)
+            taken = 1 + len(walked.more_patches)
     return sheets, taken
 
 
 def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[tuple[float, str]]:
-    """(mm beyond the cell, stroke id) of every distinct press or figure."""
+    """(mm beyond the patch, stroke id) of every distinct press or figure."""
     if not sheet.capacity:
         return []
-    cell = sheet.cell(0)
+    patch = sheet.patch(0)
     if isinstance(protocol, WriteConfig):
         return [
-            (max(_figure_overhang(config, cell, point) for s in figure.strokes for point in s.points), figure.name)
+            (max(_figure_overhang(config, patch, point) for s in figure.strokes for point in s.points), figure.name)
             for figure in protocol.figures
         ]
-    anchor_x, anchor_y = cell.anchor_mm[0] - cell.x_mm, cell.anchor_mm[1] - cell.y_mm
+    anchor_x, anchor_y = patch.anchor_mm[0] - patch.x_mm, patch.anchor_mm[1] - patch.y_mm
     found: dict[tuple[float, float], tuple[float, str]] = {}
     for stroke in protocol.planned():
-        reach = reach_of(config.brush, stroke.height_mm, stroke.tilt_deg)
+        reach = reach_of(config.brush, stroke.depth_mm, stroke.tilt_deg)
         beyond_mm = max(
             reach.behind_mm - anchor_x,
-            anchor_x + reach.ahead_mm - cell.width_mm,
-            reach.side_mm - min(anchor_y, cell.height_mm - anchor_y),
+            anchor_x + reach.ahead_mm - patch.size_x_mm,
+            reach.side_mm - min(anchor_y, patch.size_y_mm - anchor_y),
         )
-        found.setdefault((stroke.height_mm, stroke.tilt_deg), (beyond_mm, stroke.stroke_id))
+        found.setdefault((stroke.depth_mm, stroke.tilt_deg), (beyond_mm, stroke.stroke_id))
     return list(found.values())
 
 
-def _figure_overhang(config: RigConfig, cell: Cell, point: tuple[float, float, float, float, float]) -> float:
-    """How far the line, half its width to either side of a drawn point, reaches beyond the cell."""
+def _figure_overhang(config: RigConfig, patch: Patch, point: tuple[float, float, float, float, float]) -> float:
+    """How far the line, half its width to either side of a drawn point, reaches beyond the patch."""
     x_mm, y_mm, depth_mm, tilt_deg, _ = point
     side_mm = reach_of(config.brush, depth_mm, tilt_deg).side_mm
-    return side_mm - min(x_mm, y_mm, cell.width_mm - x_mm, cell.height_mm - y_mm)
+    return side_mm - min(x_mm, y_mm, patch.size_x_mm - x_mm, patch.size_y_mm - y_mm)
 
 
 MOST_ROWS = 40
@@ -210,7 +212,9 @@ def plan_table(plan: Plan) -> Group:
     totals = Table(title=f"plan of {plan.kind}", show_header=False)
     changes = f", a fresh one before {', '.join(plan.sheet_changes)}" if plan.sheet_changes else ""
     totals.add_row("strokes", str(len(plan.placed)))
-    totals.add_row("sheets", f"{plan.sheets} of {plan.cells_per_sheet} cells{changes}" if plan.placed else "no marks")
+    totals.add_row(
+        "sheets", f"{plan.sheets} of {plan.patches_per_sheet} patches{changes}" if plan.placed else "no marks"
+    )
     totals.add_row("dips", str(plan.dips))
     totals.add_row("ink", f"{plan.ink.ml:.1f} ml, {plan.ink.why}" if plan.dips else "none")
     totals.add_row("steps", ", ".join(f"{count} {kind}" for kind, count in plan.steps.items()))
@@ -233,11 +237,11 @@ def duration(seconds: float) -> str:
 
 def _conditions(plan: Plan) -> Table:
     table = Table("H mm", "alpha deg", "strokes", "on each sheet")
-    counts = Counter((p.height_mm, p.tilt_deg, p.sheet) for p in plan.placed)
-    cells = sorted({(p.height_mm, p.tilt_deg) for p in plan.placed})
-    for height_mm, tilt_deg in cells[:MOST_ROWS]:
-        by_sheet = [counts[height_mm, tilt_deg, sheet] for sheet in range(1, plan.sheets + 1)]
-        table.add_row(f"{height_mm:g}", f"{tilt_deg:g}", str(sum(by_sheet)), " ".join(map(str, by_sheet[:20])))
-    if len(cells) > MOST_ROWS:
-        table.add_row("...", "...", f"{len(cells) - MOST_ROWS} more", "")
+    counts = Counter((p.depth_mm, p.tilt_deg, p.sheet) for p in plan.placed)
+    patches = sorted({(p.depth_mm, p.tilt_deg) for p in plan.placed})
+    for depth_mm, tilt_deg in patches[:MOST_ROWS]:
+        by_sheet = [counts[depth_mm, tilt_deg, sheet] for sheet in range(1, plan.sheets + 1)]
+        table.add_row(f"{depth_mm:g}", f"{tilt_deg:g}", str(sum(by_sheet)), " ".join(map(str, by_sheet[:20])))
+    if len(patches) > MOST_ROWS:
+        table.add_row("...", "...", f"{len(patches) - MOST_ROWS} more", "")
     return table

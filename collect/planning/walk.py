@@ -1,4 +1,4 @@
-"""Walks a protocol as if every step succeeded: each step, its cell and its moves. Nothing connects, nothing moves."""
+"""Walks a protocol as if every step succeeded: each step, its patch and its moves. Nothing connects, nothing moves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from brushloop.collect.protocols.plan import Drawn
 from brushloop.collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
-from brushloop.collect.rig.paper import Cell, Layout, PaperPlane, Sheet
+from brushloop.collect.rig.paper import Layout, PaperPlane, Patch, Sheet
 from brushloop.collect.touch.heights import lowest_z_mm
 from brushloop.collect.touch.places import patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
@@ -46,12 +46,18 @@ class StepMoves:
 
 
 def moves_of(
-    config: RigConfig, plane: PaperPlane, step: Step, cell: Cell | None, more: tuple[Cell, ...] = (), *, dips: int = 0
+    config: RigConfig,
+    plane: PaperPlane,
+    step: Step,
+    patch: Patch | None,
+    more: tuple[Patch, ...] = (),
+    *,
+    dips: int = 0,
 ) -> StepMoves:
     """The moves of a step, as the run makes them.
 
-    `cell` is where a press or a figure goes; `more` are the further cells of a self-check. `dips` is the number of dips
-    before the step, which decides when the brush is washed.
+    `patch` is where a press or a figure goes; `more` are the further patches of a self-check. `dips` is the number of
+    dips before the step, which decides when the brush is washed.
     """
     match step.kind:
         case StepKind.ZERO_TOUCH | StepKind.TOUCH:
@@ -65,20 +71,20 @@ def moves_of(
         case StepKind.CAPTURE:
             return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
         case StepKind.PRESS:
-            assert cell is not None
-            down, up = press_moves(config, plane, cell, _number(step, "height_mm"), _number(step, "tilt_deg"))
+            assert patch is not None
+            down, up = press_moves(config, plane, patch, _number(step, "depth_mm"), _number(step, "tilt_deg"))
             return StepMoves([*down, *up], dwell_s=_number(step, "dwell_s"))
         case StepKind.SELF_CHECK:
-            assert cell is not None
+            assert patch is not None
             moves = [
                 move
-                for number, place_mm in enumerate(triangle_on((cell, *more), config.self_check))
+                for number, place_mm in enumerate(triangle_on((patch, *more), config.self_check))
                 for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
             return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
         case StepKind.DRAW:
-            assert cell is not None
-            return _figure(config, plane, Drawn.of(step), cell, dips)
+            assert patch is not None
+            return _figure(config, plane, Drawn.of(step), patch, dips)
 
 
 def touch_of(config: RigConfig, step: Step) -> TouchConfig:
@@ -113,14 +119,14 @@ def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> Ste
     return StepMoves([*photograph_moves(config), *inked, *parts, *photograph_moves(config)], dips=count)
 
 
-def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, cell: Cell, dips: int) -> StepMoves:
+def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, patch: Patch, dips: int) -> StepMoves:
     parts: list[Part] = []
     made = 0
     for number, points in enumerate(drawn.strokes):
         if drawn.dips_before(number):
             parts += inking_moves(config, dips + made)
             made += 1
-        parts += stroke_moves(config, plane, cell, points, drawn.speed_mm_s).parts
+        parts += stroke_moves(config, plane, patch, points, drawn.speed_mm_s).parts
     return StepMoves(parts, dips=made)
 
 
@@ -137,25 +143,25 @@ class Walked:
     step: Step
     sheet: int
     """From 1."""
-    cell: Cell | None
-    """Cell that the step marks or photographs."""
+    patch: Patch | None
+    """Patch that the step marks or photographs."""
     moves: StepMoves
-    more_cells: list[Cell] = field(default_factory=list[Cell])
-    """Further cells that the step marks."""
+    more_patches: list[Patch] = field(default_factory=list[Patch])
+    """Further patches that the step marks."""
 
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
     """The sheet as this protocol divides it."""
-    return Sheet(config.paper, protocol.own_cell_mm)
+    return Sheet(config.paper, protocol.own_patch_mm)
 
 
 def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
-    """The sheet's columns and rows, and the cells of the first sheet that the self-check uses."""
+    """The sheet's columns and rows, and the patches of the first sheet that the self-check uses."""
     sheet = sheet_of(config, protocol)
     if not config.self_check.enabled or not sheet.capacity:
         return sheet.layout
-    first = sheet.cell(0)
-    return replace(sheet.layout, taken=frozenset({0} | {cell.index for cell in partners(sheet, first, set())}))
+    first = sheet.patch(0)
+    return replace(sheet.layout, taken=frozenset({0} | {patch.index for patch in partners(sheet, first, set())}))
 
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
@@ -165,9 +171,9 @@ def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
 
 
 def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
-    """Every step in order, each mark on the next free cell, with a fresh sheet whenever one is full.
+    """Every step in order, each mark on the next free patch, with a fresh sheet whenever one is full.
 
-    The sheet must have room for at least one cell.
+    The sheet must have room for at least one patch.
     """
     plane, sheet = PaperPlane(config.paper.touch_z_mm), sheet_of(config, protocol)
     number = dips = 0
@@ -177,22 +183,22 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
         step = next(generator)
         while True:
             answer: Result = {}
-            cell, shown = None, number
-            more: tuple[Cell, ...] = ()
+            patch, shown = None, number
+            more: tuple[Patch, ...] = ()
             if step.kind in MARKING:
                 if len(used) == sheet.capacity:
                     number += 1
                     used.clear()
-                cell, shown = sheet.free(used, number + 1), number
-                more = partners(sheet, cell, used) if step.kind == StepKind.SELF_CHECK else ()
-                used |= {one.index for one in (cell, *more)}
-                answer = {"sheet": number, "cell": cell.index}
+                patch, shown = sheet.free(used, number + 1), number
+                more = partners(sheet, patch, used) if step.kind == StepKind.SELF_CHECK else ()
+                used |= {one.index for one in (patch, *more)}
+                answer = {"sheet": number, "patch": patch.index}
             elif step.kind == StepKind.CAPTURE:
                 shown = int(step.params["sheet"] or 0)
-                cell = sheet.cell(int(step.params["cell"] or 0))
-            moves = moves_of(config, plane, step, cell, more, dips=dips)
+                patch = sheet.patch(int(step.params["patch"] or 0))
+            moves = moves_of(config, plane, step, patch, more, dips=dips)
             dips += moves.dips
-            yield Walked(step, shown + 1, cell, moves, list(more))
+            yield Walked(step, shown + 1, patch, moves, list(more))
             step = generator.send(answer)
     except StopIteration:
         return

@@ -39,12 +39,12 @@ class ProtocolBase(Config):
     wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = Field(
         default=None, exclude_if=lambda wait_s: wait_s is None
     )
-    """Wait over the cell until this much time has passed since the brush left the ink. If left out, it presses at
+    """Wait over the patch until this much time has passed since the brush left the ink. If left out, it presses at
     once and the field is not written, so that protocols written before it existed stay the same."""
 
     @property
-    def own_cell_mm(self) -> tuple[float, float] | None:
-        """Size of the paper cell that each stroke needs; None for that of the rig, `paper.cell_mm`."""
+    def own_patch_mm(self) -> tuple[float, float] | None:
+        """Size of the paper patch that each stroke needs; None for that of the rig, `paper.cell_mm`."""
         return None
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
@@ -65,9 +65,9 @@ def check_count(strokes: int) -> None:
         raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
 
 
-def check_axes(heights_mm: list[float], tilts_deg: list[float]) -> None:
+def check_axes(depths_mm: list[float], tilts_deg: list[float]) -> None:
     """Raise ValueError if an axis of a grid has a value twice."""
-    for name, values in (("heights_mm", heights_mm), ("tilts_deg", tilts_deg)):
+    for name, values in (("depths_mm", depths_mm), ("tilts_deg", tilts_deg)):
         if len(set(values)) != len(values):
             raise ValueError(f"{name} has the same value twice: {values}")
 

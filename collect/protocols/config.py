@@ -10,7 +10,7 @@ import csv
 import io
 import math
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, cast, get_args
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
@@ -20,7 +20,7 @@ from brushloop.collect.protocols.base import MAX_STROKES, ProtocolBase
 from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
 from brushloop.collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
-from brushloop.collect.rig.config_file import read_text, read_toml, refusal
+from brushloop.collect.rig.config_file import EARLIER_NAMES, read_text, read_toml, refusal
 from brushloop.sessions.cells import as_text, number
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
@@ -40,13 +40,13 @@ def load_protocol(path: Path) -> ProtocolConfig:
             return _PROTOCOL.validate_json(read_text(path, MAX_EFFECTIVE_BYTES))
         except ValidationError as error:
             raise refusal(path, error, TaggedProtocol, tagged=True) from None
-    values = read_toml(path, MAX_PROTOCOL_BYTES)
+    values = _renamed(path, read_toml(path, MAX_PROTOCOL_BYTES))
     for name in ("presses", "points", "ignored_columns"):
         if name in values and "file" in values:
             raise ConfigError(path, name, "a file is named too: give only one of the two")
     if values.get("kind") == "adaptive":
         raise ConfigError(
-            path, "kind", "'adaptive' is no longer a protocol: use 'few-strokes' with heights_mm and tilts_deg"
+            path, "kind", "'adaptive' is no longer a protocol: use 'few-strokes' with depths_mm and tilts_deg"
         )
     kind = _KINDS.get(str(values.get("kind")))
     if kind is WriteConfig:
@@ -62,6 +62,19 @@ def load_protocol(path: Path) -> ProtocolConfig:
         return _PROTOCOL.validate_python(values)
     except ValidationError as error:
         raise refusal(path, error, TaggedProtocol, tagged=True) from None
+
+
+def _renamed(path: Path, value: Any) -> Any:
+    """The values of a file with `EARLIER_NAMES` replaced. Raises `ConfigError` for a field under both names."""
+    if isinstance(value, list):
+        return [_renamed(path, item) for item in cast("list[Any]", value)]
+    if not isinstance(value, dict):
+        return value
+    table = cast("dict[str, Any]", value)
+    for earlier, name in EARLIER_NAMES.items():
+        if earlier in table and name in table:
+            raise ConfigError(path, name, f"is given twice, also as {earlier}")
+    return {EARLIER_NAMES.get(name, name): _renamed(path, item) for name, item in table.items()}
 
 
 def _fill_strokes(path: Path, values: dict[str, Any]) -> None:
@@ -157,7 +170,7 @@ def _beside(protocol: Path, field: str, name: object) -> Path:
 
 
 def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others: bool) -> list[str]:
-    columns = [cell.strip() for cell in cells]
+    columns = [EARLIER_NAMES.get(cell.strip(), cell.strip()) for cell in cells]
     known = list(row.model_fields)
     if len(columns) > MAX_COLUMNS:
         raise ConfigError(path, "line 1", f"{len(columns)} columns, at most {MAX_COLUMNS}")

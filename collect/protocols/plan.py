@@ -1,9 +1,9 @@
 """The plan of a protocol: its strokes, their order over the sheet, and the steps that each stroke takes.
 
-Conditions of a design are spread over the sheet. Its cells are used in order, so a stroke's number determines
+Conditions of a design are spread over the sheet. Its patches are used in order, so a stroke's number determines
 its place. The sheet is cut into three bands of rows and three of columns; within each round, pairs of strokes change
 places wherever that evens out how often each (H, alpha) lies in each band. Rounds stay whole, so a drift of ink still
-affects every condition alike. A void press shifts what follows by one cell: only the plan stays balanced.
+affects every condition alike. A void press shifts what follows by one patch: only the plan stays balanced.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]
 TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]
 HeadingDeg = Annotated[float, Field(ge=-720.0, le=720.0)]
 TrajectoryPoint = tuple[InCellMm, InCellMm, PathDepthMm, TiltDeg, HeadingDeg]
-"""x, y in the figure's cell; depth below the touch height, negative above the paper; tilt; direction in which the
+"""x, y in the figure's patch; depth below the touch height, negative above the paper; tilt; direction in which the
 ferrule leans, counter-clockwise from the sheet's x."""
 AGAIN = "-again"
 
@@ -36,7 +36,7 @@ class Drawn:
 
     strokes: list[list[TrajectoryPoint]]
     cell_mm: tuple[float, float]
-    """Size of the figure's cell."""
+    """Size of the figure's patch."""
     speed_mm_s: float
     blend_mm: float
     dip_every_strokes: int
@@ -75,7 +75,7 @@ class Planned:
     """One press, or one figure of several strokes."""
 
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     """Depth of the press; of a figure, its greatest depth."""
     tilt_deg: float
     """Tilt of the press; of a figure, at its deepest point."""
@@ -125,8 +125,8 @@ def takes(stroke: Planned) -> Generator[Step, Result, None]:
             break
         kind = StepKind.PRESS if stroke.drawn is None else StepKind.DRAW
         marked = yield Step(kind, stroke.index, _mark_params(stroke) | taken)
-        # A capture belongs to one cell: a capture of another cell is another step.
-        place = _capture_params(stroke, int(marked["sheet"]), int(marked["cell"]))
+        # A capture belongs to one patch: a capture of another patch is another step.
+        place = _capture_params(stroke, int(marked["sheet"]), int(marked["patch"]))
         seen = yield Step(StepKind.CAPTURE, stroke.index, place | taken)
         if not seen.get("retake"):
             break
@@ -149,20 +149,20 @@ def strokes_of(text: str) -> list[list[TrajectoryPoint]]:
 
 
 def _mark_params(stroke: Planned) -> Params:
-    params: Params = {"stroke_id": stroke.stroke_id, "height_mm": stroke.height_mm, "tilt_deg": stroke.tilt_deg}
+    params: Params = {"stroke_id": stroke.stroke_id, "depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
     if stroke.drawn is not None:
         return params | stroke.drawn.params
     params["dwell_s"] = stroke.dwell_s
     return params if stroke.again_of is None else {**params, "again_of": stroke.again_of}
 
 
-def _capture_params(stroke: Planned, sheet: int, cell: int) -> Params:
+def _capture_params(stroke: Planned, sheet: int, patch: int) -> Params:
     params: Params = {
         "stroke_id": stroke.stroke_id,
-        "height_mm": stroke.height_mm,
+        "depth_mm": stroke.depth_mm,
         "tilt_deg": stroke.tilt_deg,
         "sheet": sheet,
-        "cell": cell,
+        "patch": patch,
     }
     if stroke.again_of is not None:
         params["again_of"] = stroke.again_of
@@ -179,7 +179,7 @@ def numbered(rounds: list[list[Planned]], seed: int | None, layout: Layout | Non
             strokes[k] = replace(stroke, index=index)
             index += 1
     if seed is not None and layout is not None and layout.capacity > 0:
-        conditions = [[(s.height_mm, s.tilt_deg) for s in strokes] for strokes in rounds]
+        conditions = [[(s.depth_mm, s.tilt_deg) for s in strokes] for strokes in rounds]
         orders = balanced(conditions, layout, seed)
         rounds = [[strokes[i] for i in order] for strokes, order in zip(rounds, orders, strict=True)]
     return [stroke for strokes in rounds for stroke in strokes]
@@ -236,7 +236,7 @@ def _bands(layout: Layout, place: int) -> tuple[int, int]:
 
 
 def _shares(layout: Layout) -> list[float]:
-    """Share of the sheet that each band holds; bands that hold nothing count as one cell."""
+    """Share of the sheet that each band holds; bands that hold nothing count as one patch."""
     counts = [0] * (2 * BANDS)
     for place in range(layout.capacity):
         _count(counts, _bands(layout, place), 1)

@@ -33,10 +33,10 @@ class GridConfig(ProtocolBase):
     Where the layout of the sheet is known, the order also spreads each (H, alpha) over the sheet (`protocols.plan`).
     """
 
-    depths_field: ClassVar[str] = "heights_mm"
+    depths_field: ClassVar[str] = "depths_mm"
 
     kind: Literal["grid"]
-    heights_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    depths_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
     """Depths H below the touch height."""
     tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
     """Tilts alpha from the paper's normal."""
@@ -49,8 +49,8 @@ class GridConfig(ProtocolBase):
 
     @model_validator(mode="after")
     def _distinct(self) -> GridConfig:
-        check_axes(self.heights_mm, self.tilts_deg)
-        check_count(len(self.heights_mm) * len(self.tilts_deg) * self.repeats)
+        check_axes(self.depths_mm, self.tilts_deg)
+        check_count(len(self.depths_mm) * len(self.tilts_deg) * self.repeats)
         return self
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
@@ -60,7 +60,7 @@ class GridConfig(ProtocolBase):
         also spread over the sheet, which does the same for unevenness of the paper or of the camera's view.
         """
         rng = random.Random(self.seed)
-        cells = [(h, a) for h in self.heights_mm for a in self.tilts_deg]
+        cells = [(h, a) for h in self.depths_mm for a in self.tilts_deg]
         rounds: list[list[Planned]] = []
         for repeat in range(1, self.repeats + 1):
             rng.shuffle(cells)
@@ -73,10 +73,10 @@ class GridConfig(ProtocolBase):
 class FewStrokesConfig(ProtocolBase):
     """A few presses of a grid that tell most about a brush: each (H, alpha) as far as possible from those before it."""
 
-    depths_field: ClassVar[str] = "heights_mm"
+    depths_field: ClassVar[str] = "depths_mm"
 
     kind: Literal["few-strokes"]
-    heights_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    depths_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
     """Depths H below the touch height."""
     tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
     """Tilts alpha from the paper's normal."""
@@ -87,12 +87,12 @@ class FewStrokesConfig(ProtocolBase):
 
     @model_validator(mode="after")
     def _distinct(self) -> FewStrokesConfig:
-        check_axes(self.heights_mm, self.tilts_deg)
+        check_axes(self.depths_mm, self.tilts_deg)
         return self
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """The presses in the order of the design, which does not depend on the sheet."""
-        order = spread_out(self.heights_mm, self.tilts_deg)
+        order = spread_out(self.depths_mm, self.tilts_deg)
         return [
             Planned(f"H{h:g}-a{a:g}-r{repeat + 1:02d}", h, a, repeat + 1, number, dwell_s=self.dwell_s)
             for number in range(self.strokes)
@@ -103,7 +103,7 @@ class FewStrokesConfig(ProtocolBase):
 class PressRow(Config):
     """One press of a list."""
 
-    height_mm: DeepMm
+    depth_mm: DeepMm
     tilt_deg: TiltDeg = 0.0
     dwell_s: DwellS | None = None
     """Time at full depth; if left out, the protocol's."""
@@ -118,7 +118,7 @@ class ListConfig(ProtocolBase):
 
     kind: Literal["list"]
     file: FileName | None = None
-    """CSV with a column `height_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
+    """CSV with a column `depth_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
     presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
     """The presses. Read from `file` where one is named."""
     repeats: Repeats = 1
@@ -144,7 +144,7 @@ class ListConfig(ProtocolBase):
         return [
             row.stroke_id + (ending if repeat > 1 else "")
             if row.stroke_id is not None
-            else f"{number:03d}-H{row.height_mm:g}-a{row.tilt_deg:g}{ending}"
+            else f"{number:03d}-H{row.depth_mm:g}-a{row.tilt_deg:g}{ending}"
             for number, row in enumerate(self.presses, 1)
         ]
 
@@ -154,7 +154,7 @@ class ListConfig(ProtocolBase):
             [
                 Planned(
                     name,
-                    row.height_mm,
+                    row.depth_mm,
                     row.tilt_deg,
                     repeat,
                     dwell_s=self.dwell_s if row.dwell_s is None else row.dwell_s,
@@ -171,7 +171,7 @@ class ReplayRow(Config):
 
     stroke_id: StrokeId
     """Its id in the original session."""
-    height_mm: DeepMm
+    depth_mm: DeepMm
     tilt_deg: TiltDeg
 
 
@@ -185,7 +185,7 @@ class ReplayConfig(ProtocolBase):
     of: Annotated[str, Field(min_length=1, max_length=100)]
     """Id of the session that the strokes are from."""
     file: FileName | None = None
-    """CSV with the columns `stroke_id`, `height_mm` and `tilt_deg`; any other column is ignored and named in
+    """CSV with the columns `stroke_id`, `depth_mm` and `tilt_deg`; any other column is ignored and named in
     `ignored_columns`."""
     presses: Annotated[tuple[ReplayRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
     """The presses, under the ids that the strokes had. Read from `file` where one is named."""
@@ -216,7 +216,7 @@ class ReplayConfig(ProtocolBase):
             [
                 Planned(
                     f"{row.stroke_id}~{repeat}",
-                    row.height_mm,
+                    row.depth_mm,
                     row.tilt_deg,
                     repeat,
                     dwell_s=self.dwell_s,

@@ -24,7 +24,7 @@ class StepKind(StrEnum):
     DIP = "dip"
     PRESS = "press"
     DRAW = "draw"
-    """A figure: all strokes of one character, on one cell. If it is interrupted, all of it is done again."""
+    """A figure: all strokes of one character, on one patch. If it is interrupted, all of it is done again."""
     TOUCH = "touch"
     """Bring the tip down on a given point of the sheet and measure its height."""
     CAPTURE = "capture"
@@ -35,7 +35,7 @@ class StepKind(StrEnum):
 
 
 MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
-"""Steps that leave ink on a paper cell of their own."""
+"""Steps that leave ink on a paper patch of their own."""
 RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH, StepKind.BOARD})
 """Steps whose first one every process does again: it finds the paper, and sees whether camera or board moved."""
 

@@ -1,4 +1,4 @@
-"""`write`: figures made of trajectories, each on its own paper cell."""
+"""`write`: figures made of trajectories, each on its own paper patch."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ class PointRow(Config):
 
     x_mm: InCellMm
     y_mm: InCellMm
-    height_mm: PathDepthMm
+    depth_mm: PathDepthMm
     tilt_deg: TiltDeg = 0.0
     heading_deg: HeadingDeg = 0.0
 
     @property
     def point(self) -> TrajectoryPoint:
         """The row as a tuple, in the order of `points` in a protocol."""
-        return self.x_mm, self.y_mm, self.height_mm, self.tilt_deg, self.heading_deg
+        return self.x_mm, self.y_mm, self.depth_mm, self.tilt_deg, self.heading_deg
 
 
 class DrawnStroke(Config):
     """One stroke: down at the first point, along the others without a halt, up at the last."""
 
     file: FileName | None = None
-    """CSV with the columns `x_mm`, `y_mm`, `height_mm` and optionally `tilt_deg` and `heading_deg`."""
+    """CSV with the columns `x_mm`, `y_mm`, `depth_mm` and optionally `tilt_deg` and `heading_deg`."""
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=2, max_length=1000)]
-    """Points [x_mm, y_mm, height_mm, tilt_deg, heading_deg]. Read from `file` where one is named."""
+    """Points [x_mm, y_mm, depth_mm, tilt_deg, heading_deg]. Read from `file` where one is named."""
 
     @model_validator(mode="after")
     def _drawn(self) -> DrawnStroke:
@@ -76,7 +76,7 @@ class DrawnStroke(Config):
 
 
 class Figure(Config):
-    """A character or a single drawn line: strokes that share one paper cell."""
+    """A character or a single drawn line: strokes that share one paper patch."""
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
     """The stroke id is this name and the number of the repeat."""
@@ -85,7 +85,7 @@ class Figure(Config):
 
 
 class WriteConfig(ProtocolBase):
-    """Trajectories to draw: x, y, depth, tilt and heading, in the frame of the figure's own paper cell."""
+    """Trajectories to draw: x, y, depth, tilt and heading, in the frame of the figure's own paper patch."""
 
     depths_field: ClassVar[str] = "figures"
 
@@ -122,15 +122,15 @@ class WriteConfig(ProtocolBase):
                     if not (0.0 <= x_mm <= self.cell_mm[0] and 0.0 <= y_mm <= self.cell_mm[1]):
                         raise ValueError(
                             f"figure {figure.name}, stroke {number}: the point [{x_mm:g}, {y_mm:g}] lies outside its "
-                            f"cell of {self.cell_mm[0]:g} x {self.cell_mm[1]:g} mm"
+                            f"patch of {self.cell_mm[0]:g} x {self.cell_mm[1]:g} mm"
                         )
         if points > MAX_POINTS:
             raise ValueError(f"{points} points in all, at most {MAX_POINTS}")
         return self
 
     @property
-    def own_cell_mm(self) -> tuple[float, float]:
-        """The cell of one figure."""
+    def own_patch_mm(self) -> tuple[float, float]:
+        """The patch of one figure."""
         return self.cell_mm
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
@@ -140,7 +140,7 @@ class WriteConfig(ProtocolBase):
         for repeat in range(1, self.repeats + 1):
             strokes: list[Planned] = []
             for figure in self.figures:
-                _, _, height_mm, tilt_deg, _ = max((s.deepest for s in figure.strokes), key=lambda point: point[2])
+                _, _, depth_mm, tilt_deg, _ = max((s.deepest for s in figure.strokes), key=lambda point: point[2])
                 drawn = Drawn(
                     [list(stroke.points) for stroke in figure.strokes],
                     self.cell_mm,
@@ -149,7 +149,7 @@ class WriteConfig(ProtocolBase):
                     self.dip_every_strokes,
                 )
                 name = f"{figure.name}-r{repeat:02d}"
-                strokes.append(Planned(name, height_mm, tilt_deg, repeat, index, drawn=drawn))
+                strokes.append(Planned(name, depth_mm, tilt_deg, repeat, index, drawn=drawn))
                 index += 1
             rounds.append(strokes)
         return [stroke for strokes in shuffled(rounds, self.seed) for stroke in strokes]

@@ -19,18 +19,18 @@ from brushloop.collect.quality.ink import Ink, Point, Rect, around, mm2, on_shee
 from brushloop.collect.quality.measure import Mark, measure_mark
 from brushloop.collect.quality.verdict import Check, Failure, Verdict
 from brushloop.collect.rig.config_quality import QualityConfig
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 
 MARGIN_MM = 4.0
-"""Margin around the cell in which a stroke that leaves it is looked for."""
+"""Margin around the patch in which a stroke that leaves it is looked for."""
 FAR_MM = 45.0
-"""Margin around the cell in which a press that left nothing in it is looked for."""
+"""Margin around the patch in which a press that left nothing in it is looked for."""
 LIGHT_MM = 22.0
-"""Margin around the cell that shows enough paper to tell glare from the light."""
+"""Margin around the patch that shows enough paper to tell glare from the light."""
 LONGEST, WIDEST = 1.6, 0.65
 """Length and width of the largest mark per depth of its press; a few mm more come from the tip."""
 CROSSING_MM = 4.0
-"""Length of ink across the edge of a cell, in mm; the end of one stroke that goes too far covers less."""
+"""Length of ink across the edge of a patch, in mm; the end of one stroke that goes too far covers less."""
 
 
 def check_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Verdict:
@@ -41,26 +41,26 @@ def check_frame(image: Gray, plane: Plane, limits: QualityConfig) -> Verdict:
 def check_capture(
     image: Gray,
     plane: Plane,
-    cell: Cell,
+    patch: Patch,
     *,
-    height_mm: float,
+    depth_mm: float,
     limits: QualityConfig,
     previous: Gray | None = None,
     sheet_mm: tuple[float, float] | None = None,
     anchor_mm: Point | None = None,
 ) -> Verdict:
-    """Judge one press of commanded depth `height_mm` from the (h, w) photograph taken after it.
+    """Judge one press of commanded depth `depth_mm` from the (h, w) photograph taken after it.
 
     `previous` is the last valid photograph before the press, from the same camera pose: it separates new ink from old,
     and reveals a press that landed far off. `sheet_mm` (width, height) excludes the sheet's edge and the table
-    beyond it. `anchor_mm` is the zero-touch point if it is not the cell's own. Checks that an earlier failure makes
+    beyond it. `anchor_mm` is the zero-touch point if it is not the patch's own. Checks that an earlier failure makes
     meaningless are left out of the verdict.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
         return frame
-    anchor = cell.anchor_mm if anchor_mm is None else anchor_mm
-    press = _Press(image, previous, plane, cell, anchor, height_mm, sheet_mm, limits)
+    anchor = patch.anchor_mm if anchor_mm is None else anchor_mm
+    press = _Press(image, previous, plane, patch, anchor, depth_mm, sheet_mm, limits)
     ink = press.ink(MARGIN_MM)
     checks = [
         *frame.checks,
@@ -75,39 +75,39 @@ def check_capture(
 def check_drawing(
     image: Gray,
     plane: Plane,
-    cell: Cell,
+    patch: Patch,
     *,
-    height_mm: float,
+    depth_mm: float,
     limits: QualityConfig,
     previous: Gray | None = None,
 ) -> Verdict:
-    """Judge a figure, drawn down to `height_mm`, from the (h, w) photograph taken after it.
+    """Judge a figure, drawn down to `depth_mm`, from the (h, w) photograph taken after it.
 
-    Checks exposure and blur, that the cell holds ink that `previous` does not show, and that nothing new lies across
-    the cell's edge, as an arm still in the picture would. The shape is not judged: every figure has its own.
+    Checks exposure and blur, that the patch holds ink that `previous` does not show, and that nothing new lies across
+    the patch's edge, as an arm still in the picture would. The shape is not judged: every figure has its own.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
         return frame
-    inked = take(image, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
+    inked = take(image, plane.image_to_paper, patch.rect_mm, Params()).inked(limits.ink_gate)
     if previous is not None:
-        inked = inked & ~take(previous, plane.image_to_paper, cell.rect_mm, Params()).inked(limits.ink_gate)
+        inked = inked & ~take(previous, plane.image_to_paper, patch.rect_mm, Params()).inked(limits.ink_gate)
     edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
-    return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), height_mm, limits)))
+    return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), depth_mm, limits)))
 
 
-def cell_is_blank(
-    image: Gray, plane: Plane, cell: Cell, *, limits: QualityConfig, sheet_mm: tuple[float, float] | None = None
+def patch_is_blank(
+    image: Gray, plane: Plane, patch: Patch, *, limits: QualityConfig, sheet_mm: tuple[float, float] | None = None
 ) -> Check:
-    """Check in an (h, w) photograph that the cell is blank; `NEIGHBOUR` if it holds ink or is not completely seen.
+    """Check in an (h, w) photograph that the patch is blank; `NEIGHBOUR` if it holds ink or is not completely seen.
 
     `sheet_mm` (width, height) excludes the sheet's edge and what lies beyond it.
     """
-    patch = take(image, plane.image_to_paper, on_sheet(cell.rect_mm, sheet_mm), Params())
-    hidden_mm2 = mm2(~patch.in_view)
+    window = take(image, plane.image_to_paper, on_sheet(patch.rect_mm, sheet_mm), Params())
+    hidden_mm2 = mm2(~window.in_view)
     if hidden_mm2 > 0.0:
-        return unseen(cell.index, hidden_mm2, limits)
-    return before_press(cell.index, mm2(patch.inked(limits.ink_gate)), limits)
+        return unseen(patch.index, hidden_mm2, limits)
+    return before_press(patch.index, mm2(window.inked(limits.ink_gate)), limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,42 +117,42 @@ class _Press:
     image: Gray
     previous: Gray | None
     plane: Plane
-    cell: Cell
+    patch: Patch
     anchor_mm: Point
-    height_mm: float
+    depth_mm: float
     sheet_mm: tuple[float, float] | None
     limits: QualityConfig
 
     @property
     def cell_mm(self) -> Rect:
-        """The cell, without what lies at the sheet's edge."""
-        return on_sheet(self.cell.rect_mm, self.sheet_mm)
+        """The patch, without what lies at the sheet's edge."""
+        return on_sheet(self.patch.rect_mm, self.sheet_mm)
 
     def around(self, margin_mm: float) -> Rect:
-        """The cell with a margin, clipped to the sheet."""
-        return around(self.cell.rect_mm, margin_mm, self.sheet_mm)
+        """The patch with a margin, clipped to the sheet."""
+        return around(self.patch.rect_mm, margin_mm, self.sheet_mm)
 
     def ink(self, margin_mm: float) -> Ink:
-        """The ink in the cell and a margin around it: the stroke's own, other new ink, and old ink."""
+        """The ink in the patch and a margin around it: the stroke's own, other new ink, and old ink."""
         window, to_paper = self.around(margin_mm), self.plane.image_to_paper
         now = take(self.image, to_paper, window, Params())
         before = None if self.previous is None else take(self.previous, to_paper, window, Params())
         return tell_apart(now, before, self.cell_mm, self.anchor_mm, self.limits.ink_gate)
 
     def away_mm(self) -> float | None:
-        """Distance from the anchor to new ink outside the cell, if there is as much of it as a press leaves."""
+        """Distance from the anchor to new ink outside the patch, if there is as much of it as a press leaves."""
         if self.previous is None:
             return None
         ink = self.ink(FAR_MM)
-        if ink.own_mm2 < self.limits.blank_mm2_per_mm * self.height_mm:
+        if ink.own_mm2 < self.limits.blank_mm2_per_mm * self.depth_mm:
             return None
-        return float(np.hypot(*(ink.patch.points_mm(ink.own) - np.array(self.anchor_mm)).T).min())
+        return float(np.hypot(*(ink.window.points_mm(ink.own) - np.array(self.anchor_mm)).T).min())
 
 
 def _ink_checks(press: _Press, ink: Ink) -> list[Check]:
     limits = press.limits
     checks = [neighbour(ink, limits)]
-    enough = blank(ink.own_mm2, press.height_mm, limits)
+    enough = blank(ink.own_mm2, press.depth_mm, limits)
     if not enough.passed:
         away_mm = press.away_mm()
         return [*checks, enough if away_mm is None else far_off(away_mm, limits)]
@@ -161,7 +161,7 @@ def _ink_checks(press: _Press, ink: Ink) -> list[Check]:
     checks += [enough, dry(mark, limits)]
     if checks[-1].passed:
         # The head, tip and tone of a dry brush's mark mean nothing.
-        checks += [smeared(mark, press.height_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
+        checks += [smeared(mark, press.depth_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
     return checks
 
 
@@ -199,66 +199,67 @@ def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ..
 
 def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits: QualityConfig) -> Check:
     """The stroke, or the zero-touch point if there is none, lies completely in the frame."""
-    points = ink.patch.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
+    points = ink.window.points_mm(ink.own) if ink.own.any() else np.array([anchor_mm])
     gap_mm = measure.edge_mm(points, plane, shape)
     reason = f"The stroke ends {max(gap_mm, 0.0):.1f} mm from the edge of the picture. Move the camera or the sheet."
     return _at_least(Failure.CUT, gap_mm, "mm", limits.edge_mm, reason)
 
 
 def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
-    """No reflection in the cell; `window` includes enough paper around it to measure the light."""
+    """No reflection in the patch; `window` includes enough paper around it to measure the light."""
     spots = measure.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
     scale = measure.BRIGHT_PX_PER_MM
     left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
     rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))
     columns = slice(round(left * scale), round((left + cell_mm[2]) * scale))
     area_mm2 = float(spots[rows, columns].sum()) / scale**2
-    reason = f"{area_mm2:.0f} mm^2 of glare in the cell. Move the lamp, or wait until the ink no longer shines."
+    reason = f"{area_mm2:.0f} mm^2 of glare in the patch. Move the lamp, or wait until the ink no longer shines."
     return _below(Failure.GLARE, area_mm2, "mm^2", limits.glare_mm2, reason)
 
 
-def before_press(cell: int, area_mm2: float, limits: QualityConfig) -> Check:
-    """The cell holds no ink before its press."""
-    reason = f"Cell {cell} is not blank: {area_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
+def before_press(patch: int, area_mm2: float, limits: QualityConfig) -> Check:
+    """The patch holds no ink before its press."""
+    reason = f"Patch {patch} is not blank: {area_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
     return _below(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
-def unseen(cell: int, hidden_mm2: float, limits: QualityConfig) -> Check:
-    """A cell that lies partly outside the frame cannot be called blank."""
+def unseen(patch: int, hidden_mm2: float, limits: QualityConfig) -> Check:
+    """A patch that lies partly outside the frame cannot be called blank."""
     reason = (
-        f"Cell {cell} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. Move the camera or the sheet."
+        f"Patch {patch} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. "
+        "Move the camera or the sheet."
     )
     return Check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, False, reason)
 
 
 def neighbour(ink: Ink, limits: QualityConfig) -> Check:
-    """The cell holds no ink but the press's own."""
+    """The patch holds no ink but the press's own."""
     area_mm2 = ink.before_mm2 + ink.beside_mm2
     source = (
-        "a stroke of the next cell reaches into it. Leave this cell out and make the cells larger"
+        "a stroke of the next patch reaches into it. Leave this patch out and make the patches larger"
         if ink.before_mm2 > ink.beside_mm2
         else "something dripped or lies apart from the stroke. Wipe the brush on the rim after a dip"
     )
-    reason = f"{area_mm2:.1f} mm^2 of ink in the cell are not the stroke's: {source}."
+    reason = f"{area_mm2:.1f} mm^2 of ink in the patch are not the stroke's: {source}."
     return _below(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
 def crossing(length_mm: float) -> Check:
-    """No new ink across the edge of a figure's cell."""
-    reason = f"New ink, or the arm, lies across {length_mm:.0f} mm of the cell's edge. Is the arm out of the picture?"
+    """No new ink across the edge of a figure's patch."""
+    reason = f"New ink, or the arm, lies across {length_mm:.0f} mm of the patch's edge. Is the arm out of the picture?"
     return _below(Failure.NEIGHBOUR, length_mm, "mm", CROSSING_MM, reason)
 
 
-def blank(own_mm2: float, height_mm: float, limits: QualityConfig) -> Check:
+def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
     """The press left ink."""
-    least_mm2 = limits.blank_mm2_per_mm * height_mm
+    least_mm2 = limits.blank_mm2_per_mm * depth_mm
     reason = f"No stroke: {own_mm2:.1f} mm^2 of ink. Dip again; if the well is full, teach the touch height again."
     return _at_least(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason)
 
 
 def far_off(away_mm: float, limits: QualityConfig) -> Check:
-    """A press whose ink lies outside its cell."""
-    reason = f"The stroke lies {away_mm:.0f} mm away from its cell. {_WHERE}"
+    """A press whose ink lies outside its patch."""
+    reason = f"The stroke lies {away_mm:.0f} mm away from its patch. {_WHERE}"
     return Check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, False, reason)
 
 
@@ -276,11 +277,11 @@ def misplaced(mark: Mark, limits: QualityConfig) -> Check:
     return _below(Failure.MISPLACED, off_mm, "mm", limits.misplaced_mm, reason)
 
 
-def smeared(mark: Mark, height_mm: float, limits: QualityConfig) -> Check:
+def smeared(mark: Mark, depth_mm: float, limits: QualityConfig) -> Check:
     """The mark is no larger than a press of its depth makes it: a brush that moves sideways leaves more."""
-    excess_mm = max(mark.length_mm - LONGEST * height_mm, mark.width_mm - WIDEST * height_mm)
+    excess_mm = max(mark.length_mm - LONGEST * depth_mm, mark.width_mm - WIDEST * depth_mm)
     reason = (
-        f"The stroke is smeared: {mark.length_mm:.0f} by {mark.width_mm:.0f} mm at a depth of {height_mm:g} mm. Did "
+        f"The stroke is smeared: {mark.length_mm:.0f} by {mark.width_mm:.0f} mm at a depth of {depth_mm:g} mm. Did "
         "another client move the arm, or did the sheet slip?"
     )
     return _below(Failure.SMEARED, excess_mm, "mm", limits.smeared_mm, reason)

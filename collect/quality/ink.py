@@ -25,7 +25,7 @@ GRAIN_MM = 0.15
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
+class Window:
     """A window at 20 px/mm, row 0 at its far edge."""
 
     window_mm: Rect
@@ -61,14 +61,14 @@ class Patch:
         return places.astype(np.float64)
 
 
-def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -> Patch:
+def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -> Window:
     """Rectify a window of an (h, w) photograph and divide it by its illumination. `image_to_paper` is (3, 3)."""
     raster = rectify(image, image_to_paper, window_mm)
     in_view = _in_view(image, image_to_paper, window_mm, raster)
     dark = np.where(in_view, 1.0 - flatten(raster, params), 0.0).astype(np.float32)
     seen = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), corners(window_mm))
     pixel_mm = math.sqrt(window_mm[2] * window_mm[3] / cv2.contourArea(seen.astype(np.float32)))
-    return Patch(window_mm, raster, dark, in_view, pixel_mm)
+    return Window(window_mm, raster, dark, in_view, pixel_mm)
 
 
 def on_sheet(rect_mm: Rect, sheet_mm: tuple[float, float] | None) -> Rect:
@@ -122,13 +122,13 @@ SEAM_MM = 0.3
 class Ink:
     """The ink of a press, distinguished from everything else in its window."""
 
-    patch: Patch
+    window: Window
     own: Mask
     """(h, w) the press's own ink, every spot of it above the gate."""
     before_mm2: float
-    """Ink in the cell from before the press; 0 without a photograph from before."""
+    """Ink in the patch from before the press; 0 without a photograph from before."""
     beside_mm2: float
-    """Other ink in the cell that lies apart from the press's own."""
+    """Other ink in the patch that lies apart from the press's own."""
 
     @property
     def own_mm2(self) -> float:
@@ -136,19 +136,19 @@ class Ink:
         return mm2(self.own)
 
 
-def tell_apart(now: Patch, before: Patch | None, cell_mm: Rect, anchor_mm: Point, gate: float) -> Ink:
+def tell_apart(now: Window, before: Window | None, cell_mm: Rect, anchor_mm: Point, gate: float) -> Ink:
     """Find the press's own ink: new since `before` if that is given, in one piece, and near the anchor."""
     ink = now.inked(gate)
-    cell = now.inside(cell_mm)
+    patch = now.inside(cell_mm)
     before_mm2 = 0.0
     if before is not None:
         old = before.inked(gate)
-        before_mm2 = mm2(old[cell])
+        before_mm2 = mm2(old[patch])
         side = round(SEAM_MM * PX_PER_MM) | 1
         ink &= cv2.dilate(old.astype(np.uint8), np.ones((side, side), np.uint8)) == 0
-    # Without a photograph from before, a piece that lies mostly in the next cell is taken to belong there.
+    # Without a photograph from before, a piece that lies mostly in the next patch is taken to belong there.
     least_share = HOME_SHARE if before is None else 0.0
-    own, beside_mm2 = _own_piece(ink, now.to_px(anchor_mm), cell, least_share)
+    own, beside_mm2 = _own_piece(ink, now.to_px(anchor_mm), patch, least_share)
     return Ink(now, own, before_mm2, beside_mm2)
 
 
@@ -157,12 +157,12 @@ def mm2(mask: Mask) -> float:
     return float(np.count_nonzero(mask)) / PX_PER_MM**2
 
 
-def _own_piece(ink: Mask, anchor_px: Point, cell: tuple[slice, slice], least_share: float) -> tuple[Mask, float]:
-    """(the stroke's piece, of which at least `least_share` lies in the cell; mm^2 of the other pieces in the cell)."""
+def _own_piece(ink: Mask, anchor_px: Point, patch: tuple[slice, slice], least_share: float) -> tuple[Mask, float]:
+    """(the stroke's piece, at least `least_share` of which lies in the patch; mm^2 of the other pieces in it)."""
     height, width = ink.shape
     pieces, count = _pieces(ink)
     areas = np.bincount(pieces.ravel(), minlength=count) / PX_PER_MM**2
-    in_cell = np.bincount(pieces[cell].ravel(), minlength=count) / PX_PER_MM**2
+    in_cell = np.bincount(pieces[patch].ravel(), minlength=count) / PX_PER_MM**2
     in_cell[0] = areas[0] = 0.0
     at_home = np.where(in_cell >= least_share * areas, areas, 0.0)
     if count <= 1 or at_home.max() == 0.0:

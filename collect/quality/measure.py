@@ -146,8 +146,8 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
     if not rows.size:
         return None
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    own, dark = ink.own[box], ink.patch.dark[box]
-    x, y = ink.patch.to_px(anchor_mm)
+    own, dark = ink.own[box], ink.window.dark[box]
+    x, y = ink.window.to_px(anchor_mm)
     right_mm, left_mm = (columns[-1] + 1 - x) / PX_PER_MM, (x - columns[0]) / PX_PER_MM
     # The head is the end near the zero-touch point, to whichever side the brush bends.
     flip = abs(left_mm) < abs(right_mm)
@@ -165,7 +165,7 @@ def measure_mark(ink: Ink, anchor_mm: Point) -> Mark | None:
     reach_mm = max((1.0 - 0.5 * (HEAD_SHARE + TIP_SHARE)) * length / PX_PER_MM, 1e-3)
     return Mark(
         tone=tone,
-        uneven=_unevenness(own, dark, tone, max(RIM_MM, RIM_PX * ink.patch.pixel_mm)),
+        uneven=_unevenness(own, dark, tone, max(RIM_MM, RIM_PX * ink.window.pixel_mm)),
         head_mm=(float(left_mm if flip else right_mm), head),
         gap_mm=_gap_mm(hairs),
         bent_deg=float(np.degrees(np.arctan2(abs(tip - head), reach_mm))),

@@ -12,11 +12,11 @@ class Family(StrEnum):
     PICTURE = "picture"
     """The photograph, not the stroke: remove the cause and photograph again; the stroke on paper may be sound."""
     PLACE = "place"
-    """The ink is not where it belongs: press on a new cell."""
+    """The ink is not where it belongs: press on a new patch."""
     INK = "ink"
-    """Too little ink: dip again and press on a new cell."""
+    """Too little ink: dip again and press on a new patch."""
     SHAPE = "shape"
-    """The hairs lay badly: comb or wipe the brush, dip, and press on a new cell."""
+    """The hairs lay badly: comb or wipe the brush, dip, and press on a new patch."""
 
 
 class Failure(StrEnum):

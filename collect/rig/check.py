@@ -73,8 +73,8 @@ def _sheet(config: RigConfig) -> Iterator[Check]:
     paper, board = config.paper, config.board
     yield plausible.square_size(board.square_mm)
     yield plausible.board_rim(size_mm(board), board.origin_mm, paper.size_mm)
-    cells = Sheet(paper).capacity
-    yield within("cells on a sheet", cells, 1, float("inf"), "", "paper.cell_mm does not fit on paper.size_mm.")
+    patches = Sheet(paper).capacity
+    yield within("patches on a sheet", patches, 1, float("inf"), "", "paper.cell_mm does not fit on paper.size_mm.")
     yield plausible.touch_height(len(config.touch.points_mm) or 1, config.touch.method)
     if config.self_check.enabled is False:
         remedy = "Three marks before a session show a mirrored or turned sheet: [self_check] enabled."

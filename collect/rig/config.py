@@ -101,7 +101,7 @@ class PaperConfig(Config):
     cell_mm: tuple[PaperSide, PaperSide] = (40.0, 24.0)
     """Width and height of the patch for one press."""
     touch_point_mm: tuple[Finite, Finite] = (4.0, 4.0)
-    """Where each run first goes to the taught height, in the paper frame; clear of every cell's ink."""
+    """Where each run first goes to the taught height, in the paper frame; clear of every patch's ink."""
 
 
 class WipeConfig(Config):

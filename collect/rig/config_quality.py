@@ -20,7 +20,7 @@ class QualityConfig(BaseModel):
     enabled: bool = True
     """False records captures without judging them."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
-    """How often a stroke that failed is pressed again on a new cell before a person is asked."""
+    """How often a stroke that failed is pressed again on a new patch before a person is asked."""
     dark_level: Level = 80.0
     """Gray level of the paper below which the picture is underexposed."""
     bright_level: Annotated[float, Field(ge=0.0, le=256.0)] = 250.0
@@ -32,11 +32,11 @@ class QualityConfig(BaseModel):
     glare_share: Share = 0.1
     """How much brighter than the paper around it a spot must be to count as glare."""
     glare_mm2: Area = 6.0
-    """Area of glare in the cell."""
+    """Area of glare in the patch."""
     ink_gate: Share = 0.1
     """How far below the paper a spot must lie to count as ink, as a share of the paper's brightness."""
     foreign_mm2: Area = 1.5
-    """Ink in the cell that is not the stroke's own; a cell that holds this much before a press is not blank."""
+    """Ink in the patch that is not the stroke's own; a patch that holds this much before a press is not blank."""
     blank_mm2_per_mm: Area = 0.1
     """A press that leaves less ink for each mm of its depth is blank."""
     uneven: Share = 0.125

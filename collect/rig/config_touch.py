@@ -129,7 +129,7 @@ class SelfCheckConfig(Config):
     resumed session keeps the setting with which it began."""
     depth_mm: Annotated[float, Field(ge=0.5, le=10.0)] = 2.0
     legs_mm: tuple[Annotated[float, Field(ge=8.0, le=200.0)], Annotated[float, Field(ge=8.0, le=200.0)]] = (24.0, 15.0)
-    """Legs of the triangle along paper x and y, on sheets without room for one over three cells; unequal, so that no
+    """Legs of the triangle along paper x and y, on sheets without room for one over three patches; unequal, so that no
     corner is mistaken for another."""
     offset_mm: Positive = 3.0
     """How far the marks may lie, on average, from where they were commanded; a soft tip lands beside its axis."""

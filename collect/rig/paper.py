@@ -1,4 +1,4 @@
-"""The sheet of paper: its cells, its plane, and the transforms between the paper frame and the base frame."""
+"""The sheet of paper: its patches, its plane, and the transforms between the paper frame and the base frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from brushloop.drivers.samples import Pose
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a sheet is divided into cells, filled row by row from the far edge."""
+    """How a sheet is divided into patches, filled row by row from the far edge."""
 
     columns: int
     rows: int
@@ -31,32 +31,32 @@ class Layout:
 
 
 ANCHOR_SHARE = 0.75
-"""Place of the zero-touch point along a cell, as a share of its width: the mark extends mostly toward -x."""
+"""Place of the zero-touch point along a patch, as a share of its width: the mark extends mostly toward -x."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class Patch:
     """A patch of paper for one press, in the paper frame."""
 
     index: int
     x_mm: float
     y_mm: float
-    width_mm: float
-    height_mm: float
+    size_x_mm: float
+    size_y_mm: float
 
     @property
     def anchor_mm(self) -> tuple[float, float]:
         """The zero-touch point."""
-        return self.x_mm + ANCHOR_SHARE * self.width_mm, self.y_mm + 0.5 * self.height_mm
+        return self.x_mm + ANCHOR_SHARE * self.size_x_mm, self.y_mm + 0.5 * self.size_y_mm
 
     @property
     def rect_mm(self) -> tuple[float, float, float, float]:
         """x, y, width, height."""
-        return self.x_mm, self.y_mm, self.width_mm, self.height_mm
+        return self.x_mm, self.y_mm, self.size_x_mm, self.size_y_mm
 
 
 class Sheet:
-    """The cells of one sheet, row by row from the far edge, so that the arm never reaches across wet ink."""
+    """The patches of one sheet, row by row from the far edge, so that the arm never reaches across wet ink."""
 
     def __init__(self, paper: PaperConfig, cell_mm: tuple[float, float] | None = None) -> None:
         """`cell_mm` is the size that the protocol needs; None is `paper.cell_mm`."""
@@ -79,27 +79,27 @@ class Sheet:
         return Layout(self.columns, self.rows)
 
     @property
-    def corners(self) -> list[Cell]:
-        """The outermost cells: poses within a convex box on these are within it on every cell."""
+    def corners(self) -> list[Patch]:
+        """The outermost patches: poses within a convex box on these are within it on every patch."""
         if not self.capacity:
             return []
         last_row = self.capacity - self.columns
-        return [self.cell(i) for i in sorted({0, self.columns - 1, last_row, self.capacity - 1})]
+        return [self.patch(i) for i in sorted({0, self.columns - 1, last_row, self.capacity - 1})]
 
-    def cell(self, index: int) -> Cell:
-        """The cell with this number."""
+    def patch(self, index: int) -> Patch:
+        """The patch with this number."""
         if not 0 <= index < self.capacity:
-            raise IndexError(f"cell {index} is outside [0, {self.capacity - 1}]")
+            raise IndexError(f"patch {index} is outside [0, {self.capacity - 1}]")
         row, column = divmod(index, self.columns)
         cell_w, cell_h = self.cell_mm
         y_mm = self._bottom + (self.rows - 1 - row) * cell_h
-        return Cell(index, self._left + column * cell_w, y_mm, cell_w, cell_h)
+        return Patch(index, self._left + column * cell_w, y_mm, cell_w, cell_h)
 
-    def free(self, used: set[int], sheet: int = 1) -> Cell:
-        """The first unused cell. Raises `SheetFull`, which names the number `sheet`."""
+    def free(self, used: set[int], sheet: int = 1) -> Patch:
+        """The first unused patch. Raises `SheetFull`, which names the number `sheet`."""
         for index in range(self.capacity):
             if index not in used:
-                return self.cell(index)
+                return self.patch(index)
         raise SheetFull(self.capacity, sheet)
 
 

@@ -17,7 +17,7 @@ from brushloop.collect.rig.paper import PaperPlane, fit_plane
 from brushloop.collect.touch.arm import Effector, TouchArm
 from brushloop.collect.touch.force import Floats
 from brushloop.collect.touch.heights import KnownHeights, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
-from brushloop.collect.touch.places import Patch, coarse_count, fine_count
+from brushloop.collect.touch.places import SpotGrid, coarse_count, fine_count
 from brushloop.drivers.samples import Frame
 
 
@@ -79,34 +79,32 @@ class FirstInkTouch:
         """
         paper, extent_mm = self._rig.config.paper, self._config.camera.extent_mm
         known = KnownHeights(paper, self._config)
-        patches = [
-            Patch(point, self._config.camera, paper.size_mm, lowest_z_mm(paper, self._config, *point, extent_mm))
+        grids = [
+            SpotGrid(point, self._config.camera, paper.size_mm, lowest_z_mm(paper, self._config, *point, extent_mm))
             for point in points_mm
         ]
         rough: list[Touch] = []
-        for patch, point in zip(patches, points_mm, strict=True):
-            rough.append(await self._coarse(patch, known.reach(*point, extent_mm)))
+        for grid, point in zip(grids, points_mm, strict=True):
+            rough.append(await self._coarse(grid, known.reach(*point, extent_mm)))
             known.add(rough[-1].x_mm, rough[-1].y_mm, rough[-1].z_mm)
         rounds = [rough]
         for k in range(self._config.touches):
             lean = _plane(rounds[-1])
             # Staggered by parts of a step: equal heights would only repeat the same result.
             lower_mm = k / self._config.touches * self._config.camera.fine_step_mm
-            rounds.append(
-                [await self._fine(p, around, lean, lower_mm) for p, around in zip(patches, rough, strict=True)]
-            )
+            rounds.append([await self._fine(p, around, lean, lower_mm) for p, around in zip(grids, rough, strict=True)])
         touches = [list(point) for point in zip(*rounds[1:], strict=True)]
         lean = _plane([touch for point in touches for touch in point])
         return [at_one_point(point, self._config, lean) for point in touches]
 
-    async def _coarse(self, patch: Patch, reach: Reach) -> Touch:
+    async def _coarse(self, grid: SpotGrid, reach: Reach) -> Touch:
         """Touch lower and lower until a photograph shows ink."""
         camera = self._config.camera
         count = coarse_count(camera, reach)
         before = await self._photograph()
         spots: list[Spot] = []
         for k in range(count):
-            spots.append((*patch.take(), max(reach.start_z_mm - k * camera.coarse_step_mm, reach.lowest_z_mm)))
+            spots.append((*grid.take(), max(reach.start_z_mm - k * camera.coarse_step_mm, reach.lowest_z_mm)))
             await self._touch(spots[-1])
             if len(spots) % camera.spots_per_photo == 0 or k + 1 == count:
                 ink = await self._ink(before, spots)
@@ -114,15 +112,15 @@ class FirstInkTouch:
                     return self._between(spots, ink, camera.coarse_step_mm)
         raise StepError(f"nothing was touched down to {spots[-1][2]:.2f} mm: no spot of the row left ink")
 
-    async def _fine(self, patch: Patch, around: Touch, lean: PaperPlane, lower_mm: float) -> Touch:
+    async def _fine(self, grid: SpotGrid, around: Touch, lean: PaperPlane, lower_mm: float) -> Touch:
         camera = self._config.camera
         before, spots = await self._photograph(), list[Spot]()
         highest_mm = 0.5 * camera.fine_step_mm * (fine_count(camera) - 1) - lower_mm
         for k in range(fine_count(camera)):
-            x, y = patch.take()
+            x, y = grid.take()
             along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
             z_mm = around.z_mm + along_mm + highest_mm - k * camera.fine_step_mm
-            spots.append((x, y, max(z_mm, patch.lowest_z_mm)))
+            spots.append((x, y, max(z_mm, grid.lowest_z_mm)))
             await self._touch(spots[-1])
         return self._between(spots, await self._ink(before, spots), camera.fine_step_mm)
 

@@ -1,4 +1,4 @@
-"""Where zero touch marks the paper, and which cells it uses up."""
+"""Where zero touch marks the paper, and which patches it uses up."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SLACK_STEPS = 2
 """Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
 
 
-class Patch:
+class SpotGrid:
     """The spots around one point, to and fro from the lower left, so that consecutive touches are neighbours."""
 
     def __init__(
@@ -43,12 +43,12 @@ class Patch:
 
 
 def fine_count(config: CameraTouchConfig) -> int:
-    """Spots of one fine row."""
+    """SpotGrid of one fine row."""
     return 1 + 2 * SLACK_STEPS + math.ceil(config.coarse_step_mm / config.fine_step_mm)
 
 
 def coarse_count(config: CameraTouchConfig, reach: Reach) -> int:
-    """Spots of a whole coarse row, which ends early where ink is seen."""
+    """SpotGrid of a whole coarse row, which ends early where ink is seen."""
     return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / config.coarse_step_mm) + 1
 
 
@@ -81,18 +81,18 @@ def patch_spots(paper: PaperConfig, config: TouchConfig) -> list[int]:
     return [coarse_count(camera, reach) + config.touches * fine_count(camera) for reach in reaches]
 
 
-def used_cells(sheet: Sheet, paper: PaperConfig, config: TouchConfig) -> set[int]:
-    """The cells whose middle parts zero touch may ink; none for the taught height.
+def used_patches(sheet: Sheet, paper: PaperConfig, config: TouchConfig) -> set[int]:
+    """The patches whose middle parts zero touch may ink; none for the taught height.
 
-    A cell counts if a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no cell.
+    A patch counts if a mark reaches more than `MARK_MM` into it: touch points in the sheet's margin cost no patch.
     """
     m = MARK_MM
     rects = [(x - m, y - m, w + 2 * m, h + 2 * m) for x, y, w, h in touch_rects(paper, config)]
-    cells = [sheet.cell(index) for index in range(sheet.capacity)]
-    return {cell.index for cell in cells for rect in rects if _reaches_into(rect, cell.rect_mm)}
+    patches = [sheet.patch(index) for index in range(sheet.capacity)]
+    return {patch.index for patch in patches for rect in rects if _reaches_into(rect, patch.rect_mm)}
 
 
-def _reaches_into(rect: Rect, cell: Rect) -> bool:
-    (ax, ay, aw, ah), (bx, by, bw, bh) = rect, cell
+def _reaches_into(rect: Rect, patch: Rect) -> bool:
+    (ax, ay, aw, ah), (bx, by, bw, bh) = rect, patch
     across, along = min(ax + aw, bx + bw) - max(ax, bx), min(ay + ah, by + bh) - max(ay, by)
     return across > MARK_MM and along > MARK_MM

@@ -19,7 +19,7 @@ from brushloop.collect.motion.moves import CHECK_SPEED_MM_S, mark_moves
 from brushloop.collect.photograph.new_ink import before_and_after, new_marks
 from brushloop.collect.rig.config_touch import SelfCheckConfig
 from brushloop.collect.rig.devices import Rig
-from brushloop.collect.rig.paper import Cell, PaperPlane, Sheet
+from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.arm import Effector, TouchArm
 from brushloop.drivers.samples import Frame
 
@@ -31,7 +31,7 @@ UNEVEN = 0.2
 LEAST_SPAN_MM = 60.0
 """Least extent of a wide triangle along either axis."""
 MOST_OF_SHEET = 0.25
-"""Largest share of a sheet's cells that a check may take; smaller sheets are checked in one cell."""
+"""Largest share of a sheet's patches that a check may take; smaller sheets are checked in one patch."""
 MOST_MARK_MM2 = 400.0
 """More ink than any mark has: a brush that is pressed 10 mm deep leaves less."""
 MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
@@ -70,31 +70,31 @@ class SelfCheck:
         }
 
 
-def triangle_in(cell: Cell, config: SelfCheckConfig) -> Triangle:
-    """Three places in the middle of one spare cell; too close together to show a small error of scale."""
+def triangle_in(patch: Patch, config: SelfCheckConfig) -> Triangle:
+    """Three places in the middle of one spare patch; too close together to show a small error of scale."""
     x_mm, y_mm = config.legs_mm
-    if x_mm > cell.width_mm or y_mm > cell.height_mm:
-        raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into cell {cell.index}")
-    left, bottom = cell.x_mm + 0.5 * (cell.width_mm - x_mm), cell.y_mm + 0.5 * (cell.height_mm - y_mm)
+    if x_mm > patch.size_x_mm or y_mm > patch.size_y_mm:
+        raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into patch {patch.index}")
+    left, bottom = patch.x_mm + 0.5 * (patch.size_x_mm - x_mm), patch.y_mm + 0.5 * (patch.size_y_mm - y_mm)
     return (left, bottom), (left + x_mm, bottom), (left, bottom + y_mm)
 
 
-def triangle_of(cells: Sequence[Cell]) -> Triangle:
-    """One place in each of three spare cells, as far apart as the corners of the sheet."""
-    a, b, c = (cell.anchor_mm for cell in cells)
+def triangle_of(patches: Sequence[Patch]) -> Triangle:
+    """One place in each of three spare patches, as far apart as the corners of the sheet."""
+    a, b, c = (patch.anchor_mm for patch in patches)
     return a, b, c
 
 
-def partners(sheet: Sheet, cell: Cell, used: Set[int]) -> tuple[Cell, ...]:
-    """Two free cells that make a wide triangle with this one, along its row and its column; empty if there is no room.
+def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
+    """Two free patches that make a wide triangle with this one, along its row and its column; empty without room.
 
     With marks known to a few tenths of a millimetre, a wide triangle distinguishes an error of 2 % from one of 1 %.
     """
     if sheet.capacity * MOST_OF_SHEET < 3:
         return ()
-    row, column = divmod(cell.index, sheet.columns)
-    free = [sheet.cell(index) for index in range(sheet.capacity) if index not in used and index != cell.index]
-    x_mm, y_mm = cell.anchor_mm
+    row, column = divmod(patch.index, sheet.columns)
+    free = [sheet.patch(index) for index in range(sheet.capacity) if index not in used and index != patch.index]
+    x_mm, y_mm = patch.anchor_mm
     along_row = [c for c in free if c.index // sheet.columns == row and abs(c.anchor_mm[0] - x_mm) >= LEAST_SPAN_MM]
     along_column = [
         c for c in free if c.index % sheet.columns == column and abs(c.anchor_mm[1] - y_mm) >= LEAST_SPAN_MM
@@ -105,18 +105,18 @@ def partners(sheet: Sheet, cell: Cell, used: Set[int]) -> tuple[Cell, ...]:
         key=lambda pair: -abs(pair[0].anchor_mm[0] - x_mm) * abs(pair[1].anchor_mm[1] - y_mm),
     )
     for pair in pairs:
-        if _second_best(np.array(triangle_of((cell, *pair)))) >= UNEVEN:
+        if _second_best(np.array(triangle_of((patch, *pair)))) >= UNEVEN:
             return pair
     return ()
 
 
-def triangle_on(cells: Sequence[Cell], config: SelfCheckConfig) -> Triangle:
-    """The triangle over three cells, or within the only one."""
-    return triangle_of(cells) if len(cells) == 3 else triangle_in(cells[0], config)
+def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
+    """The triangle over three patches, or within the only one."""
+    return triangle_of(patches) if len(patches) == 3 else triangle_in(patches[0], config)
 
 
 async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
-    """Press the marks, photograph them and judge. The arm begins and ends at travel height; the cells are used up.
+    """Press the marks, photograph them and judge. The arm begins and ends at travel height; the patches are used up.
 
     Raises `StepError` with the figures if the marks are not found, mirrored, turned, stretched or displaced.
     """

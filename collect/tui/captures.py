@@ -1,4 +1,4 @@
-"""What the review shows of a session: its captures, their pictures, and how alike the presses of a cell are."""
+"""What the review shows of a session: its captures, their pictures, and how alike the presses of a patch are."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.session import lens_in_use
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.history import unlike, waits_of
@@ -45,7 +45,7 @@ class ReviewCapture:
     """One capture of a session."""
 
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     still: int
     kept: bool
@@ -124,15 +124,15 @@ class Review:
             self._pictures[capture.still] = self._make_pictures(capture)
         return self._pictures[capture.still]
 
-    def repeatability(self, height_mm: float, tilt_deg: float) -> tuple[float, int] | None:
-        """(mean CSIM of every pair, captures) of the counted presses of one cell; None for fewer than two.
+    def repeatability(self, depth_mm: float, tilt_deg: float) -> tuple[float, int] | None:
+        """(mean CSIM of every pair, captures) of the counted presses of one patch; None for fewer than two.
 
         CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
         """
         binaries = [
             pictures.binary.astype("float32")
             for capture in self.captures
-            if (capture.height_mm, capture.tilt_deg) == (height_mm, tilt_deg) and capture.counts
+            if (capture.depth_mm, capture.tilt_deg) == (depth_mm, tilt_deg) and capture.counts
             if (pictures := self.pictures(capture)).binary is not None
         ]
         if len(binaries) < 2:
@@ -148,11 +148,11 @@ class Review:
         try:
             if (found := current(self.folder, FITS)) is not None:
                 fit = load_artefact(found, BrushFit)
-                predicted = mark_of(fit.press(), capture.height_mm, capture.tilt_deg)
+                predicted = mark_of(fit.press(), capture.depth_mm, capture.tilt_deg)
                 model = f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
         except CalibrationError as error:
             model = str(error)
-        title = title_of(capture.stroke_id, capture.height_mm, capture.tilt_deg)
+        title = title_of(capture.stroke_id, capture.depth_mm, capture.tilt_deg)
         alike = likeness(pictures.binary, predicted)
         return LargeCapture(title, pictures.photo, pictures.binary, predicted, model, alike, pictures.checks)
 
@@ -172,8 +172,8 @@ class Review:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
             raise SessionDamaged(path, f"holds no still {capture.still}")
-        cell = self._cell(stroke)
-        if cell is None or self._board is None:
+        patch = self._cell(stroke)
+        if patch is None or self._board is None:
             return CapturePictures(image, None, log_ns, checks)
         if self._lens is not None:
             if image.shape[::-1] != self._lens.size_px:
@@ -184,14 +184,14 @@ class Review:
         except CalibrationError:
             if self._plane is None:
                 return CapturePictures(image, None, log_ns, checks)
-        photo, binary = pictures_of(image, self._plane, cell)
+        photo, binary = pictures_of(image, self._plane, patch)
         return CapturePictures(photo, binary, log_ns, checks)
 
-    def _cell(self, stroke: Stroke | None) -> Cell | None:
+    def _cell(self, stroke: Stroke | None) -> Patch | None:
         """Where the stroke lies; None for a take that does not count, which has no stroke record and is shown whole."""
         if stroke is None or stroke.cell_mm is None:
             return None
-        return Cell(0, *stroke.cell_mm)
+        return Patch(0, *stroke.cell_mm)
 
 
 def _capture_of(line: Line, remarks: dict[int, Remark]) -> ReviewCapture:
@@ -199,7 +199,7 @@ def _capture_of(line: Line, remarks: dict[int, Remark]) -> ReviewCapture:
     still = int(result["still"])
     return ReviewCapture(
         str(result["stroke_id"]),
-        float(result["height_mm"]),
+        float(result["depth_mm"]),
         float(result["tilt_deg"]),
         still,
         bool(result.get("kept", True)),

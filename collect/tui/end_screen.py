@@ -82,7 +82,7 @@ class EndScreen(ModalScreen[str]):
 
         try:
             review = await asyncio.to_thread(Review, Path(self._now.folder))
-            first = {(c.height_mm, c.tilt_deg): c for c in reversed(review.captures) if c.counts}
+            first = {(c.depth_mm, c.tilt_deg): c for c in reversed(review.captures) if c.counts}
             marks: dict[Cell, NDArray[np.bool_]] = {}
             alike: list[tuple[float, int]] = []
             for number, cell in enumerate(sorted(first), 1):

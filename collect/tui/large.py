@@ -80,15 +80,15 @@ class LargeCapture:
 
 def of_last(last: LastCapture) -> LargeCapture:
     """The newest capture of a run, with CCD-BSM as published."""
-    title = title_of(last.stroke_id, last.height_mm, last.tilt_deg)
+    title = title_of(last.stroke_id, last.depth_mm, last.tilt_deg)
     model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
     checks = () if last.verdict is None else last.verdict.checks
     return LargeCapture(title, last.photo, last.binary, last.model, model, last.likeness, checks)
 
 
-def title_of(stroke_id: str, height_mm: float, tilt_deg: float) -> str:
+def title_of(stroke_id: str, depth_mm: float, tilt_deg: float) -> str:
     """The stroke and its command."""
-    return f"{stroke_id}   H {height_mm:g} mm  α {tilt_deg:g}°"
+    return f"{stroke_id}   H {depth_mm:g} mm  α {tilt_deg:g}°"
 
 
 def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> Coloured:

@@ -139,8 +139,8 @@ def grid_content(cells: tuple[CellCount, ...], room: int) -> Content:
 
 
 def _table(cells: tuple[CellCount, ...], *, tilts_down: bool) -> list[Content]:
-    by_place = {(cell.height_mm, cell.tilt_deg): cell for cell in cells}
-    heights = sorted({cell.height_mm for cell in cells})
+    by_place = {(cell.depth_mm, cell.tilt_deg): cell for cell in cells}
+    heights = sorted({cell.depth_mm for cell in cells})
     tilts = sorted({cell.tilt_deg for cell in cells})
     names, heads, corner = [f"{a:g}°" for a in tilts], [f"{h:g} mm" for h in heights], "α \\ H"
     rows = [[by_place.get((h, a)) for h in heights] for a in tilts]
@@ -250,7 +250,7 @@ class CapturePane(Vertical):
 def _capture_words(last: LastCapture) -> Content:
     """Name, verdict, and the score of each check."""
     kept = ("✓ counts", "bold $text-success") if last.kept else ("! does not count", "bold $text-warning")
-    lines = [Content.assemble((last.stroke_id, "bold"), f"  H {last.height_mm:g} mm  α {last.tilt_deg:g}°  ", kept)]
+    lines = [Content.assemble((last.stroke_id, "bold"), f"  H {last.depth_mm:g} mm  α {last.tilt_deg:g}°  ", kept)]
     if last.verdict is None:
         lines.append(Content.styled("not judged: [quality] is switched off", "dim"))
     else:

@@ -232,7 +232,7 @@ class ReviewScreen(Screen[None]):
 
 
 def _cell(capture: ReviewCapture) -> tuple[float, float]:
-    return capture.height_mm, capture.tilt_deg
+    return capture.depth_mm, capture.tilt_deg
 
 
 def _row_content(capture: ReviewCapture) -> Content:
@@ -253,7 +253,7 @@ def _words(
         why = f"  not counted by the run{f': {capture.verdict}' if capture.verdict else ''}"
     elif not capture.counts:
         why = "  marked bad"
-    place = f"  H {capture.height_mm:g} mm  α {capture.tilt_deg:g}°"
+    place = f"  H {capture.depth_mm:g} mm  α {capture.tilt_deg:g}°"
     rows: list[tuple[str, str | tuple[str, str]]] = [
         ("MCAP", _where(capture, pictures, review.folder)),
         ("Repeats", _alike_text(alike, _cell(capture), review.not_compared)),

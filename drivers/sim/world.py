@@ -264,8 +264,8 @@ class World:
         return math.dist((x_mm, y_mm), self.config.table.well_mm) <= self.config.table.well_radius_mm
 
     def _is_on_sheet(self, x_mm: float, y_mm: float) -> bool:
-        width_mm, height_mm = self.config.table.sheet_mm
-        return 0.0 <= x_mm <= width_mm and 0.0 <= y_mm <= height_mm
+        size_x_mm, size_y_mm = self.config.table.sheet_mm
+        return 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
 
     def _lean(self, pose: Pose) -> tuple[float, float]:
         """(tilt_deg, heading_deg) in the paper frame; tilt from the sheet's normal."""

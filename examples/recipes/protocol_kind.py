@@ -39,8 +39,8 @@ class StairsConfig(ProtocolBase):
         """Every stroke exactly once, in order; the order is the point here, so nothing is spread over the sheet."""
         step_mm = (self.to_mm - self.from_mm) / (self.count - 1)
         depths_mm = [self.from_mm + step_mm * number for number in range(self.count)]
-        rounds = [(repeat, height_mm) for repeat in range(1, self.repeats + 1) for height_mm in depths_mm]
+        rounds = [(repeat, depth_mm) for repeat in range(1, self.repeats + 1) for depth_mm in depths_mm]
         return [
-            Planned(f"H{height_mm:g}-r{repeat:02d}", height_mm, 0.0, repeat, index)
-            for index, (repeat, height_mm) in enumerate(rounds)
+            Planned(f"H{depth_mm:g}-r{repeat:02d}", depth_mm, 0.0, repeat, index)
+            for index, (repeat, depth_mm) in enumerate(rounds)
         ]

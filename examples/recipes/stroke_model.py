@@ -18,8 +18,8 @@ PARAMETERS = (
 def models(basis: Basis) -> tuple[StrokeModel, ...]:
     """The models that this file adds, for one brush."""
 
-    def press(height_mm: Number, tilt_deg: Number) -> Values:
-        circle = baselines.circle(basis.mark(height_mm, tilt_deg))
+    def press(depth_mm: Number, tilt_deg: Number) -> Values:
+        circle = baselines.circle(basis.mark(depth_mm, tilt_deg))
         return {"centre_mm": circle.centre_mm, "half_length_mm": circle.semi_x_mm}
 
     return (

@@ -26,7 +26,7 @@ _TABLE = 64
 class Reach:
     """The brush's feasible range and the arm's limits along a trajectory."""
 
-    height_mm: tuple[float, float] = (0.5, 20.0)
+    depth_mm: tuple[float, float] = (0.5, 20.0)
     tilt_deg: tuple[float, float] = (0.0, 10.0)
     plunge: float = 1.0
     """Greatest change of depth per mm of path: 1 is a descent at 45 degrees."""
@@ -38,7 +38,7 @@ class Reach:
     """Least distance between neighbouring points: ARCS treats a shorter line as a turn on the spot."""
 
     def __post_init__(self) -> None:
-        bounds = (("height_mm", self.height_mm), ("tilt_deg", self.tilt_deg))
+        bounds = (("depth_mm", self.depth_mm), ("tilt_deg", self.tilt_deg))
         for name, (low, high) in bounds:
             if not 0 <= low < high < math.inf:
                 raise ValueError(f"{name} = ({low:g}, {high:g}): expected 0 <= low < high")
@@ -51,7 +51,7 @@ class Reach:
         """The feasible trajectory nearest to (N, 5) points on a cell of that side, found in one sweep each way."""
         out = points.copy()
         out[:, :2] = np.clip(out[:, :2], 0, side_mm)
-        out[:, 2] = np.clip(out[:, 2], *self.height_mm)
+        out[:, 2] = np.clip(out[:, 2], *self.depth_mm)
         out[:, 3] = np.clip(out[:, 3], *self.tilt_deg)
         out[:, 4] = np.clip(out[:, 4], -self.wrist_deg, self.wrist_deg)
         steps = np.linalg.norm(np.diff(out[:, :2], axis=0), axis=1)
@@ -80,7 +80,7 @@ class Reach:
 
 def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: Floats) -> Floats:
     """The depths at which presses have these half widths, clipped to the feasible range, (N,) -> (N,) mm."""
-    heights = np.linspace(*reach.height_mm, _TABLE)
+    heights = np.linspace(*reach.depth_mm, _TABLE)
     with torch.no_grad():
         widths = model.profile(torch.from_numpy(heights), tilt_deg).width_mm.numpy()
     return np.interp(2 * half_width_mm, np.maximum.accumulate(widths), heights)
@@ -88,12 +88,12 @@ def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: F
 
 def dragged_depth_of(drag: DragModel, reach: Reach, half_width_mm: Floats) -> Floats:
     """The depths at which dragged marks have these half widths, (N,) -> (N,) mm."""
-    heights = np.linspace(*reach.height_mm, _TABLE)
+    heights = np.linspace(*reach.depth_mm, _TABLE)
     half = drag.half_mm + drag.half_per_mm * heights + drag.half_per_mm2 * heights**2
     return np.interp(half_width_mm, np.maximum.accumulate(half), heights)
 
 
-def behind_of(model: StrokeModel, tilt_deg: float, height_mm: float) -> float:
+def behind_of(model: StrokeModel, tilt_deg: float, depth_mm: float) -> float:
     """How far a mark extends behind the brush axis, per mm of depth."""
     with torch.no_grad():
-        return -float(model.profile(height_mm, tilt_deg).x_min_mm[0]) / height_mm
+        return -float(model.profile(depth_mm, tilt_deg).x_min_mm[0]) / depth_mm

@@ -40,7 +40,7 @@ def first_lead(
 ) -> list[Floats]:
     """Trajectories (N, 5) with the depth of each width, whose tip is one lag ahead along the stroke."""
     reach = replace(reach, plunge=PLUNGE)
-    depths = np.linspace(*reach.height_mm, 64)
+    depths = np.linspace(*reach.depth_mm, 64)
     halves = np.maximum.accumulate(footprint.half_width_mm(depths))
     out: list[Floats] = []
     for path in paths:

@@ -52,12 +52,12 @@ class GeneratorModel:
         origin = self.target.origin_mm(inputs)
         return traced(drawn, origin, self.target.px_mm)
 
-    def of_press(self, height_mm: Number, tilt_deg: Number) -> Values:
+    def of_press(self, depth_mm: Number, tilt_deg: Number) -> Values:
         """See `StrokeModel.of_press`; DomainError outside the trained ranges or if a fixed parameter differs.
 
         A parameter that was fixed in training must have the value that the stroke model gives this press.
         """
-        values = self.target.model.of_press(height_mm, tilt_deg)
+        values = self.target.model.of_press(depth_mm, tilt_deg)
         trained = {spec.name for spec in self.network.inputs.specs}
         fixed = {spec.name: self.target.fixed.get(spec.name, spec.default) for spec in self.target.model.parameters}
         for name in fixed.keys() - trained:
@@ -66,9 +66,9 @@ class GeneratorModel:
                 raise DomainError(name, float(values[name][off][0]), f"the {fixed[name]:g} it was trained with")
         return {name: value for name, value in values.items() if name in trained}
 
-    def profile(self, height_mm: Number, tilt_deg: Number) -> Outline:
+    def profile(self, depth_mm: Number, tilt_deg: Number) -> Outline:
         """See `StrokeModel.profile`."""
-        return self.shape(self.of_press(height_mm, tilt_deg))
+        return self.shape(self.of_press(depth_mm, tilt_deg))
 
     def _inputs(self, values: Mapping[str, Number]) -> Tensor:
         """The inputs by name as (B, P) float32, checked."""

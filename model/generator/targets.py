@@ -29,7 +29,7 @@ class Placement(StrEnum):
     CENTRED = "centred"
     """Bounding box centred: the longest press of the paper's grid just fits at 0.2 mm/px."""
     ZERO_TOUCH = "zero-touch"
-    """The zero-touch point at ANCHOR_SHARE; O3 lies H tan(alpha) from it. Needs height_mm and tilt_deg."""
+    """The zero-touch point at ANCHOR_SHARE; O3 lies H tan(alpha) from it. Needs depth_mm and tilt_deg."""
     BASE = "base"
     """O3 at (base_x_mm, base_y_mm) from the left and the top: the paper's (x0, y0), fixed or inputs."""
 
@@ -61,10 +61,8 @@ class Target:
         known = {spec.name: spec for spec in self.model.parameters}
         if self.placement is Placement.BASE:
             known |= {spec.name: spec for spec in BASE_SPECS}
-        if self.placement is Placement.ZERO_TOUCH and not {"height_mm", "tilt_deg"} <= known.keys():
-            raise ValueError(
-                f"placement zero-touch needs height_mm and tilt_deg, which {self.model.name} does not have"
-            )
+        if self.placement is Placement.ZERO_TOUCH and not {"depth_mm", "tilt_deg"} <= known.keys():
+            raise ValueError(f"placement zero-touch needs depth_mm and tilt_deg, which {self.model.name} does not have")
         if not self.ranges:
             raise ValueError("ranges is empty: a generator needs an input")
         specs: list[ParameterSpec] = []
@@ -104,7 +102,7 @@ class Target:
                 return centred_origin(shape or self.shape(inputs), size_px=self.size_px, px_mm=self.px_mm)
             case Placement.ZERO_TOUCH:
                 side_mm = self.size_px * self.px_mm
-                x = ANCHOR_SHARE[0] * side_mm + values["height_mm"] * torch.tan(values["tilt_deg"] * (math.pi / 180))
+                x = ANCHOR_SHARE[0] * side_mm + values["depth_mm"] * torch.tan(values["tilt_deg"] * (math.pi / 180))
                 return torch.stack((x, torch.full_like(x, ANCHOR_SHARE[1] * side_mm)), dim=-1)
             case Placement.BASE:
                 return torch.stack((values["base_x_mm"], values["base_y_mm"]), dim=-1)
@@ -123,7 +121,7 @@ class Target:
         values = self.values(inputs)
         images = press_images(
             Brush(values["radius_mm"], values["length_mm"]),
-            values["height_mm"].numpy(),
+            values["depth_mm"].numpy(),
             values["tilt_deg"].numpy(),
             values["lam"].numpy(),
             origin_mm=None if self.placement is Placement.CENTRED else self.origin_mm(inputs).numpy(),
@@ -163,7 +161,7 @@ class Target:
         return torch.ones(len(inputs), dtype=torch.bool)
 
 
-_PRESS = {"height_mm": (11.0, 20.0), "tilt_deg": (0.0, 10.0)}
+_PRESS = {"depth_mm": (11.0, 20.0), "tilt_deg": (0.0, 10.0)}
 """The paper's ranges of H and alpha."""
 
 

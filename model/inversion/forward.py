@@ -13,7 +13,7 @@ from brushloop.model.inversion.jets import Jets
 Floats = NDArray[np.float64]
 Images = NDArray[np.float32]
 Rows = NDArray[np.int64]
-PARAMETERS: tuple[str, ...] = ("height_mm", "tilt_deg", "x_mm", "y_mm", "heading_deg")
+PARAMETERS: tuple[str, ...] = ("depth_mm", "tilt_deg", "x_mm", "y_mm", "heading_deg")
 BLOCK_PX = 16
 """Side of the squares within which residuals may be correlated."""
 

@@ -42,7 +42,7 @@ def analytic(radius_mm: float, length_mm: float, lam: float) -> Jets:
     theta = math.atan(radius_mm / length_mm)
     quarter = math.sqrt(0.5)
 
-    def jet(height_mm: Floats, tilt_deg: Floats) -> Jet:
+    def jet(depth_mm: Floats, tilt_deg: Floats) -> Jet:
         alpha = np.radians(tilt_deg)
         turn = math.pi / 180
         tangent, less = np.tan(alpha), np.tan(alpha - theta)
@@ -55,7 +55,7 @@ def analytic(radius_mm: float, length_mm: float, lam: float) -> Jets:
         # Unit lengths (B, 3) of heel, half width and tip, and their derivatives.
         unit = np.stack((heel, wide, tip), axis=-1)
         d_unit = np.stack((d_heel, d_wide, d_tip), axis=-1)
-        lengths = np.stack((height_mm[:, None] * unit, unit, height_mm[:, None] * d_unit), axis=1)
+        lengths = np.stack((depth_mm[:, None] * unit, unit, depth_mm[:, None] * d_unit), axis=1)
         spread = (lengths @ _SPREAD).reshape(len(lengths), 3, 4, 3, 2)
         weights = np.empty((len(lengths), 4))
         weights[:] = (quarter, 1.0, 1.0, quarter)
@@ -89,15 +89,15 @@ def of_model(model: StrokeModel) -> Jets:
     def outline(height: Tensor, tilt: Tensor) -> Outline:
         return model.profile(height, tilt).outline()
 
-    def jet(height_mm: Floats, tilt_deg: Floats) -> Jet:
-        count = len(height_mm)
+    def jet(depth_mm: Floats, tilt_deg: Floats) -> Jet:
+        count = len(depth_mm)
         # Both derivatives in one pass: the batch is repeated, and each half has a different tangent.
-        height, tilt = (torch.from_numpy(np.tile(part, 2)) for part in (height_mm, tilt_deg))
+        height, tilt = (torch.from_numpy(np.tile(part, 2)) for part in (depth_mm, tilt_deg))
         along_h = torch.cat((torch.ones(count), torch.zeros(count))).double()
         with torch.no_grad(), forward_ad.dual_level():
             made = outline(forward_ad.make_dual(height, along_h), forward_ad.make_dual(tilt, 1 - along_h))
             if forward_ad.unpack_dual(made.points).tangent is None:
-                return _differenced(outline, height_mm, tilt_deg)
+                return _differenced(outline, depth_mm, tilt_deg)
             points, velocities = _unpacked(made.points, count)
             weights, rates = _unpacked(made.weights, count)
         return Jet(points, weights, velocities, rates)
@@ -105,11 +105,11 @@ def of_model(model: StrokeModel) -> Jets:
     return jet
 
 
-def _differenced(outline: Callable[[Tensor, Tensor], Outline], height_mm: Floats, tilt_deg: Floats) -> Jet:
+def _differenced(outline: Callable[[Tensor, Tensor], Outline], depth_mm: Floats, tilt_deg: Floats) -> Jet:
     """A jet by finite differences: central in H, forward in alpha, which is never negative."""
-    zero = np.zeros_like(height_mm)
+    zero = np.zeros_like(depth_mm)
     at = [(zero, zero), (zero + _STEP_MM, zero), (zero - _STEP_MM, zero), (zero, zero + _STEP_DEG)]
-    made = [outline(torch.from_numpy(height_mm + dh), torch.from_numpy(tilt_deg + da)) for dh, da in at]
+    made = [outline(torch.from_numpy(depth_mm + dh), torch.from_numpy(tilt_deg + da)) for dh, da in at]
     points, weights = ([part.double().numpy() for part in parts] for parts in
                        ([o.points for o in made], [o.weights for o in made]))  # fmt: skip
 

@@ -57,11 +57,11 @@ class Known(StrEnum):
 class Range:
     """Range of depths and tilts to search."""
 
-    height_mm: tuple[float, float] = (2.0, 30.0)
+    depth_mm: tuple[float, float] = (2.0, 30.0)
     tilt_deg: tuple[float, float] = (0.0, 30.0)
 
     def __post_init__(self) -> None:
-        for name, (low, high), least in (("height_mm", self.height_mm, 1e-3), ("tilt_deg", self.tilt_deg, 0.0)):
+        for name, (low, high), least in (("depth_mm", self.depth_mm, 1e-3), ("tilt_deg", self.tilt_deg, 0.0)):
             if not (least <= low < high < math.inf):
                 raise ValueError(f"{name} = ({low:g}, {high:g}): expected {least:g} <= low < high")
 
@@ -85,7 +85,7 @@ class Recovered:
     flags: tuple[frozenset[Flag], ...]
 
     @property
-    def height_mm(self) -> Floats:
+    def depth_mm(self) -> Floats:
         """H, (B,)."""
         return self.values[:, 0]
 
@@ -129,7 +129,7 @@ class Inverter:
         place = (side, side)
         held = np.array([[0.0, 0.0, *place, 0.0]])
         coarse = Outlines(self.jets, PARAMETERS[:2], held, self.known is Known.ANCHOR, self.size_px, 2 * self.px_mm)
-        heights = np.geomspace(*self.within.height_mm, TABLE_DEPTHS)
+        heights = np.geomspace(*self.within.depth_mm, TABLE_DEPTHS)
         tilts = np.array([self.tilt_deg]) if self.tilt_deg is not None else np.linspace(low, high, TABLE_TILTS)
         object.__setattr__(self, "table", Table.of(coarse, heights, tilts, place, 2 * self.px_mm))
 
@@ -182,7 +182,7 @@ class Inverter:
         return target
 
     def _names(self) -> tuple[str, ...]:
-        names = ["height_mm"] if self.tilt_deg is not None else ["height_mm", "tilt_deg"]
+        names = ["depth_mm"] if self.tilt_deg is not None else ["depth_mm", "tilt_deg"]
         if self.known is Known.NOTHING:
             names += PARAMETERS[2:]
         elif self.anchor_sigma_mm > 0:
@@ -192,7 +192,7 @@ class Inverter:
     def _limits(self, names: tuple[str, ...]) -> Limits:
         # Beyond the image on every side, as an anchor may lie outside it.
         reach = (-self.size_px * self.px_mm, 2 * self.size_px * self.px_mm)
-        box = {"height_mm": self.within.height_mm, "tilt_deg": self.within.tilt_deg}
+        box = {"depth_mm": self.within.depth_mm, "tilt_deg": self.within.tilt_deg}
         box |= {"x_mm": reach, "y_mm": reach, "heading_deg": (-720.0, 720.0)}
         precision: dict[str, float] = {}
         if self.known is Known.ANCHOR and self.anchor_sigma_mm > 0:

@@ -73,24 +73,24 @@ def moments_of(images: Images, px_mm: float) -> Moments:
 class Table:
     """T presses of a model, drawn with the origin (or anchor) at `place_mm` and heading 0."""
 
-    height_mm: Floats
+    depth_mm: Floats
     tilt_deg: Floats
     place_mm: tuple[float, float]
     made: Moments
 
     @classmethod
     def of(
-        cls, forward: Forward, heights_mm: Floats, tilts_deg: Floats, place_mm: tuple[float, float], px_mm: float
+        cls, forward: Forward, depths_mm: Floats, tilts_deg: Floats, place_mm: tuple[float, float], px_mm: float
     ) -> Table:
         """Draw every depth at every tilt with a forward model of (H, alpha)."""
-        height, tilt = (grid.ravel() for grid in np.meshgrid(heights_mm, tilts_deg, indexing="ij"))
+        height, tilt = (grid.ravel() for grid in np.meshgrid(depths_mm, tilts_deg, indexing="ij"))
         return cls(height, tilt, place_mm, moments_of(forward.predict(np.column_stack((height, tilt))), px_mm))
 
     def nearest(self, seen: Moments, place_mm: Floats | None, heading_deg: Floats) -> Floats:
         """Starting points (H, alpha, x, y) of B fits, (B, 4). `place_mm` (B, 2): the origin, if known."""
         along, across = seen.spread(heading_deg)
         features = [np.sqrt(seen.area), along, across]
-        mine = [np.sqrt(self.made.area), *self.made.spread(np.zeros(len(self.height_mm)))]
+        mine = [np.sqrt(self.made.area), *self.made.spread(np.zeros(len(self.depth_mm)))]
         ahead = self.made.centroid[:, 0] - self.place_mm[0]
         c, s = np.cos(np.radians(heading_deg)), -np.sin(np.radians(heading_deg))
         if place_mm is not None:
@@ -99,8 +99,8 @@ class Table:
         distance = np.square(np.stack(features, -1)[:, None] - np.stack(mine, -1)[None]).sum(-1)
         best = np.argmin(distance, axis=1)
         # Between two depths of the table, interpolate by area, which grows as H^2.
-        height = self.height_mm[best] * np.sqrt(seen.area / np.maximum(self.made.area[best], 1e-12))
+        height = self.depth_mm[best] * np.sqrt(seen.area / np.maximum(self.made.area[best], 1e-12))
         if place_mm is None:
-            reach = ahead[best] * height / self.height_mm[best]
+            reach = ahead[best] * height / self.depth_mm[best]
             place_mm = seen.centroid - reach[:, None] * np.stack((c, s), axis=-1)
         return np.column_stack((height, self.tilt_deg[best], place_mm))

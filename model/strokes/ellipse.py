@@ -17,12 +17,12 @@ CIRCLE = (CENTRE, ParameterSpec("radius_mm", "mm", 0.001, 400, 12, "the radius")
 def models(basis: Basis) -> tuple[StrokeModel, ...]:
     """The bounding ellipse of the CCD-BSM mark, and the circle over its length."""
 
-    def press(height_mm: Number, tilt_deg: Number) -> Values:
-        shape = baselines.ellipse(basis.mark(height_mm, tilt_deg))
+    def press(depth_mm: Number, tilt_deg: Number) -> Values:
+        shape = baselines.ellipse(basis.mark(depth_mm, tilt_deg))
         return {"centre_mm": shape.centre_mm, "semi_x_mm": shape.semi_x_mm, "semi_y_mm": shape.semi_y_mm}
 
-    def press_circle(height_mm: Number, tilt_deg: Number) -> Values:
-        shape = baselines.circle(basis.mark(height_mm, tilt_deg))
+    def press_circle(depth_mm: Number, tilt_deg: Number) -> Values:
+        shape = baselines.circle(basis.mark(depth_mm, tilt_deg))
         return {"centre_mm": shape.centre_mm, "radius_mm": shape.semi_x_mm}
 
     def build_circle(values: Values) -> baselines.Ellipse:

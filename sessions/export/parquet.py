@@ -159,7 +159,7 @@ def _card(export: Export, counts: dict[str, int]) -> bytes:
         f"(SHA-256 `{export.recording.sha256}`).\n",
         f"Brush: {_text(header.brush)}. Ink: {_text(header.ink)}. Paper: {_text(header.paper)}. "
         f"Robot: {_text(header.robot)}. Licence: {_text(header.licence)}.\n",
-        "`strokes`: one row per stroke; `height_mm` is the commanded depth H, `tilt_deg` the tilt alpha. "
+        "`strokes`: one row per stroke; `depth_mm` is the commanded depth H, `tilt_deg` the tilt alpha. "
         + (
             "`image` is a crop seen straight from above, `px_per_mm_x` pixels per mm, gray and not corrected for the\n"
             "light; `mask` is 255 where the stroke's ink is. Ink of neighbouring strokes may show in `image`.\n"

@@ -206,7 +206,7 @@ class Export:
     def row(self, index: int, stroke: Stroke) -> Row:
         """Every value of a stroke that does not need its photograph."""
         header = self.recording.header
-        cell = stroke.cell_mm or (None, None, None, None)
+        patch = stroke.cell_mm or (None, None, None, None)
         return {
             "episode_index": index,
             "file": "",
@@ -214,17 +214,17 @@ class Export:
             "session_id": header.session_id,
             "source": str(header.source),
             "kind": stroke.kind,
-            "height_mm": stroke.height_mm,
+            "depth_mm": stroke.depth_mm,
             "tilt_deg": stroke.tilt_deg,
             **self._wait(stroke),
             "heading_deg": stroke.heading_deg,
             **_pair("anchor", "mm", stroke.anchor_mm),
             **_pair("anchor", "px", stroke.anchor_px),
             **_pair("px_per_mm", "", stroke.px_per_mm),
-            "cell_x_mm": cell[0],
-            "cell_y_mm": cell[1],
-            "cell_width_mm": cell[2],
-            "cell_height_mm": cell[3],
+            "cell_x_mm": patch[0],
+            "cell_y_mm": patch[1],
+            "cell_width_mm": patch[2],
+            "cell_depth_mm": patch[3],
             "quality": self.quality.get(stroke.stroke_id, ""),
             "marked_bad": "",
             "licence": header.licence,

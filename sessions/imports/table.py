@@ -24,8 +24,10 @@ ANGLE_UNITS = {"deg": 1.0, "rad": 180.0 / math.pi}
 FRACTIONS = ("frac", "px", "nominal", "ratio")
 """Suffixes of columns that are not converted: shares, pixels, and values that the source itself calls nominal."""
 PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
-SPECIAL = {"file", "name", "px_per_mm", "height_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
+SPECIAL = {"file", "name", "px_per_mm", "depth_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns that become fields of a stroke; all others are kept in `commanded`."""
+EARLIER_NAMES = {"height_mm": "depth_mm"}
+"""Columns of tables that were made when the depth was called a height."""
 DEPTHS = ("height", "depth")
 """Prefixes of the names of columns that hold a depth, measured downwards from where the tip touches the paper."""
 DEEPEST_MM = 500.0
@@ -86,7 +88,13 @@ def parse_table(
     """Hashes of the names: a third of the memory that the names take."""
     no_names: list[str] = []
     try:
-        columns = _columns(folder, table, kind, px_per_mm, [name.strip() for name in next(lines, no_names)])
+        columns = _columns(
+            folder,
+            table,
+            kind,
+            px_per_mm,
+            [EARLIER_NAMES.get(name.strip(), name.strip()) for name in next(lines, no_names)],
+        )
         for cells in filter(any, lines):
             if len(rows) == MAX_ROWS:
                 raise InputError(table, f"has more than {MAX_ROWS} rows")
@@ -121,7 +129,7 @@ def _columns(
         raise InputError(table, f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
     if "px_per_mm" not in names and "px_per_mm_x" not in names and px_per_mm is None:
         raise InputError(table, "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm")
-    required = [(name, "presses need it") for name in ("height_mm", "tilt_deg", "start_x_px") if kind == "press"]
+    required = [(name, "presses need it") for name in ("depth_mm", "tilt_deg", "start_x_px") if kind == "press"]
     for first, second in PAIRS:
         required += [(b, f"`{a}` needs it") for a, b in ((first, second), (second, first)) if a in names]
     for name, why in required:
@@ -182,7 +190,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
         else image.relative_to(columns.folder).with_suffix("").as_posix(),
         kind=columns.kind,
         still=still,
-        height_mm=value("height_mm") if "height_mm" in fields else None,
+        depth_mm=value("depth_mm") if "depth_mm" in fields else None,
         tilt_deg=value("tilt_deg") if "tilt_deg" in fields else None,
         anchor_px=pair(*PAIRS[1]),
         px_per_mm=scale,

@@ -53,13 +53,13 @@ def _is_time(value: Any) -> str:
     return "" if isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63 else "is not a time"
 
 
-def _is_cell(value: Any) -> str:
+def _is_patch(value: Any) -> str:
     return "" if value is None else _is_whole(value)
 
 
-def _are_cells(value: Any) -> str:
-    cells = cast("list[Any]", value) if isinstance(value, list) else [None]
-    return "is not a list of cells" if any(map(_is_whole, cells)) else ""
+def _are_patches(value: Any) -> str:
+    patches = cast("list[Any]", value) if isinstance(value, list) else [None]
+    return "is not a list of patches" if any(map(_is_whole, patches)) else ""
 
 
 def _is_number(value: Any) -> str:
@@ -114,7 +114,7 @@ VALUES: Checks = {
     "stroke_id": _is_text,
     "still": _is_whole,
     "sheet": _is_whole,
-    "height_mm": _is_number,
+    "depth_mm": _is_number,
     "tilt_deg": _is_number,
 }
 FIELDS: dict[str, tuple[Checks, Checks]] = {
@@ -125,10 +125,10 @@ FIELDS: dict[str, tuple[Checks, Checks]] = {
             "kind": _is_text,
             "attempt": _is_whole,
             "sheet": _is_whole,
-            "cell": _is_cell,
+            "patch": _is_patch,
             "file": _is_step_file,
         },
-        {"more_cells": _are_cells, "params": _are_values},
+        {"more_patches": _are_patches, "params": _are_values},
     ),
     "done": (
         {

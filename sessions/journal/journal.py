@@ -110,8 +110,8 @@ class Replay:
     segments: list[Line] = field(default_factory=list[Line])
     """`done` events in order of time; the merged file is made of their files."""
     attempts: dict[str, int] = field(default_factory=dict[str, int])
-    used_cells: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
-    """(sheet, cell) of every press that was begun, finished or not: never pressed again."""
+    used_patches: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
+    """(sheet, patch) of every press that was begun, finished or not: never pressed again."""
     doubtful_sheets: set[int] = field(default_factory=set[int])
     """Sheets that may hold an unrecorded press: nothing more is pressed on them."""
     repairs: list[Line] = field(default_factory=list[Line])
@@ -245,8 +245,8 @@ def _begin(state: Replay, line: Line) -> None:
     state.begun = max(state.begun + 1, _next_serial(line))
     state.attempts[key] = max(state.attempts.get(key, 0), line["attempt"])
     state.sheet = max(state.sheet, sheet)
-    if line["cell"] is not None:
-        state.used_cells |= {(sheet, cell) for cell in (line["cell"], *line.get("more_cells", ()))}
+    if line["patch"] is not None:
+        state.used_patches |= {(sheet, patch) for patch in (line["patch"], *line.get("more_patches", ()))}
 
 
 def _next_serial(line: Line) -> int:

@@ -86,12 +86,12 @@ class Stroke(Event):
     kind: Literal["press", "drag"]
     still: int = Field(ge=0)
     """`sequence` of the message on /camera/still that shows this stroke."""
-    height_mm: float | None = None
+    depth_mm: float | None = None
     """Commanded press depth H; None where the source has none."""
     tilt_deg: float | None = None
     heading_deg: float = 0.0
     cell_mm: tuple[float, float, float, float] | None = None
-    """x, y, width, height of the paper cell in the paper frame."""
+    """x, y, width, height of the paper patch in the paper frame."""
     anchor_mm: tuple[float, float] | None = None
     """Commanded zero-touch point in the paper frame."""
     anchor_px: tuple[float, float] | None = None

@@ -47,7 +47,7 @@ class Evidence:
     lost: int = 0
     """Number of damaged or missing lines of which no file holds a copy."""
     doubtful: list[str] = field(default_factory=list[str])
-    """Files of attempts whose sheet and cell are unknown."""
+    """Files of attempts whose sheet and patch are unknown."""
     strays: list[str] = field(default_factory=list[str])
     """Files that hold a step which the journal lists under another file."""
     session: str = ""
@@ -171,7 +171,7 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
     """
     begun = {str(line.get("file")) for line in found.lines if line["event"] == "begin"}
     done = {str(line.get("file")) for line in [*found.lines, *found.rebuilt] if line["event"] == "done"}
-    celled = {line["kind"] for line in found.lines if line["event"] == "begin" and line["cell"] is not None}
+    celled = {line["kind"] for line in found.lines if line["event"] == "begin" and line["patch"] is not None}
     uncelled = {line["kind"] for line in found.lines if line["event"] == "begin"} - celled
     doubted = {line.get("file") for line in found.lines if line["event"] == "doubt"}
     header: Header | None = None

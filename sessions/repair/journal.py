@@ -86,7 +86,7 @@ def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], 
         for name in evidence.doubtful:
             journal.append(now_ns(), {"event": "doubt", "file": name, "sheet": sheet})
             report.lost.append(
-                f"which cell {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
+                f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
                 f"go on with a fresh one, --sheet {sheet + 2}"
             )
 

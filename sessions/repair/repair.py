@@ -211,7 +211,7 @@ class FolderRepair:
             if begin["file"] == line["file"]:
                 return without_time(begin)
         known = {"event": "begin", "key": line["key"], "kind": line["kind"], "attempt": line.get("attempt", 1)}
-        return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "cell": None, "file": line["file"]}
+        return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "patch": None, "file": line["file"]}
 
     def _lose(self, path: Path, line: Line, why: str) -> None:
         kept = self._move_aside(path)

@@ -177,7 +177,7 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
     for name, session in evidence.foreign.items():
         verdict.findings.append(Finding(name, f"is of another session, {session[:100]!r}"))
     for name in evidence.doubtful:
-        verdict.findings.append(Finding(name, "the cell and the sheet that it pressed are unknown"))
+        verdict.findings.append(Finding(name, "the patch and the sheet that it pressed are unknown"))
 
 
 def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:

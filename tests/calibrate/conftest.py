@@ -67,7 +67,7 @@ def _photographed(
     for number, (stroke, image) in enumerate(presses, start=len(boards)):
         t_ns = T0_NS + number * MINUTE_NS
         marked = Outgoing(Topic.STROKE, t_ns, t_ns, number, stroke.model_copy(update={"still": number}))
-        pressed = {"stroke_id": stroke.stroke_id, "height_mm": stroke.height_mm, "tilt_deg": stroke.tilt_deg}
+        pressed = {"stroke_id": stroke.stroke_id, "depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
         _take(store, "capture", number, [_still(t_ns, number, image), marked], pressed | {"still": number})
     store.close()
     store.release()
@@ -77,7 +77,7 @@ def _photographed(
 def _take(
     store: SessionStore, kind: str, number: int, messages: list[Outgoing], result: dict[str, Any] | None = None
 ) -> None:
-    attempt = store.begin(f"{kind} {number}", kind, cell=None, notes={"params": {}})
+    attempt = store.begin(f"{kind} {number}", kind, patch=None, notes={"params": {}})
     event: dict[str, Any] = {"key": "k", "kind": kind, "index": number, "attempt": 1, "params": {}}
     begin, end = (
         Outgoing(Topic.STEP, message.log_ns, message.log_ns, number, StepEvent(**event, phase=phase))

@@ -40,7 +40,7 @@ def shot() -> Shot:
 def session(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory, shot: Shot) -> Path:
     """A closed session of two presses, not calibrated."""
     strokes = [
-        Stroke(stroke_id=f"s{k}", kind="press", still=0, height_mm=13.0, tilt_deg=5.0, anchor_mm=anchor)
+        Stroke(stroke_id=f"s{k}", kind="press", still=0, depth_mm=13.0, tilt_deg=5.0, anchor_mm=anchor)
         for k, anchor in enumerate(shot.anchors_mm)
     ]
     folder = tmp_path_factory.mktemp("crops") / "pressed"
@@ -92,7 +92,7 @@ def test_hugging_face_datasets_loads_crops_and_masks(session: Path, exported: Pa
     assert run("sessions", "export", session, out, "--crops", "--format", "parquet").exit_code == 0
     strokes = datasets.load_dataset(str(out), "strokes", split="train", cache_dir=str(tmp_path / "cache"))
     assert strokes[0]["image"].size == strokes[0]["mask"].size == (768, 768)
-    assert (strokes[0]["height_mm"], strokes[0]["source"]) == (13.0, "loopback rig")
+    assert (strokes[0]["depth_mm"], strokes[0]["source"]) == (13.0, "loopback rig")
     assert not (out / "poses").exists(), "none was recorded, and `datasets` refuses an empty table"
 
 
@@ -100,7 +100,7 @@ def imported(folder: Path, *strokes: bool) -> Path:
     """A session imported from photographs at 10 px/mm: each with a stroke of 12 x 4 mm, or blank."""
     photographs = folder / "photographs"
     photographs.mkdir()
-    lines = ["file,px_per_mm,height_mm"]
+    lines = ["file,px_per_mm,depth_mm"]
     for number, is_inked in enumerate(strokes):
         image = np.full((300, 400), 225, np.uint8)
         if is_inked:

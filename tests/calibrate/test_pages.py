@@ -100,10 +100,10 @@ def _loop(folder: Path) -> str:
     """The page of two presses of one cell, of which one was pressed again, a little shorter."""
     measured = Measured(length_mm=15.0, width_mm=4.0, mid_width_mm=4.0, breadth_mm=4.0, area_mm2=60.0)
 
-    def press(name: str, height_mm: float, end: int) -> CapturedPress:
+    def press(name: str, depth_mm: float, end: int) -> CapturedPress:
         image = np.zeros((128, 128), np.float32)
         image[58:70, 40:end] = 1.0
-        return CapturedPress(name, height_mm, 5.0, measured, dict.fromkeys(KEYS, image))
+        return CapturedPress(name, depth_mm, 5.0, measured, dict.fromkeys(KEYS, image))
 
     first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
     pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
@@ -155,11 +155,11 @@ def _written(folder: Path) -> str:
 
 def _pressed(folder: Path) -> Path:
     """An imported session of two presses at two depths."""
-    lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
-    for number, height_mm in enumerate((11.0, 15.0)):
-        mark = Brush(BrushSpec()).press(height_mm, 0.0, ink_load=1.0, press_seed=number)
+    lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    for number, depth_mm in enumerate((11.0, 15.0)):
+        mark = Brush(BrushSpec()).press(depth_mm, 0.0, ink_load=1.0, press_seed=number)
         photograph(folder / f"{number}.png", mark, (300, 480), (380, 150))
-        lines.append(f"{number}.png,{height_mm},0.0,10.0,380.0,150.0")
+        lines.append(f"{number}.png,{depth_mm},0.0,10.0,380.0,150.0")
     return imported(folder, lines, folder / "presses", "press")
 
 

@@ -124,7 +124,7 @@ class Lab:
         self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0]", repeats: int = 1, dwell_s: float = 0.0
     ) -> None:
         """A grid; two strokes unless more are asked for."""
-        text = f'kind = "grid"\nheights_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = {dwell_s}\n'
+        text = f'kind = "grid"\ndepths_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = {dwell_s}\n'
         (self.folder / "protocol.toml").write_text(text, encoding="utf-8")
 
 

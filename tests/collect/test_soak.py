@@ -1,4 +1,4 @@
-"""Kill -9 at random moments, again and again: every stroke exactly once, no cell twice, nothing lost.
+"""Kill -9 at random moments, again and again: every stroke exactly once, no patch twice, nothing lost.
 
 Judged by the journal, by the loopback world's own answer sheet, and by reading every file of the session again.
 """
@@ -205,9 +205,9 @@ def check(lab: Lab, toll: Toll, presses_before: int) -> None:
     assert not is_open(state)
     wanted = stroke_ids(lab)
     assert captures_done(path) == wanted
-    begun = [line for line in read_lines(path) if line["event"] == "begin" and line["cell"] is not None]
-    cells = [(line["sheet"], line["cell"]) for line in begun]
-    assert len(cells) == len(set(cells)), "a cell was used twice"
+    begun = [line for line in read_lines(path) if line["event"] == "begin" and line["patch"] is not None]
+    patches = [(line["sheet"], line["patch"]) for line in begun]
+    assert len(patches) == len(set(patches)), "a patch was used twice"
 
     verdict = verify_session(path.parent)
     assert verdict.sound, verdict.findings
@@ -215,7 +215,7 @@ def check(lab: Lab, toll: Toll, presses_before: int) -> None:
     recording = Recording(path.parent)
     strokes = [capture.stroke for capture in recording.captures() if capture.image().size]
     assert sorted(stroke.stroke_id for stroke in strokes) == wanted
-    check_paper(lab, strokes, presses_before, len(cells))
+    check_paper(lab, strokes, presses_before, len(patches))
     toll.sessions += 1
     toll.strokes += len(strokes)
     toll.files += verdict.files
@@ -230,6 +230,6 @@ def check_paper(lab: Lab, strokes: list[Stroke], presses_before: int, begun: int
     for stroke in strokes:
         assert stroke.anchor_mm is not None
         [press] = [p for p in presses if math.dist((p.x_mm, p.y_mm), stroke.anchor_mm) < SAME_SPOT_MM]
-        assert press.depth_mm == pytest.approx(stroke.height_mm, abs=0.1)
+        assert press.depth_mm == pytest.approx(stroke.depth_mm, abs=0.1)
         assert press.tilt_deg == pytest.approx(stroke.tilt_deg, abs=0.1)
         assert press.ink_load == 1.0, "not dipped before it"

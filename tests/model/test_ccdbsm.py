@@ -135,21 +135,21 @@ def test_gradients_are_exact_in_every_parameter() -> None:
 
 
 @pytest.mark.parametrize(
-    ("height_mm", "tilt_deg", "name", "value", "says"),
+    ("depth_mm", "tilt_deg", "name", "value", "says"),
     [
         (15, -5, "tilt_deg", -5, "heading + 180"),
         (15, 82.9, "tilt_deg", 82.9, "[0, 82.875) deg"),
         (15, math.nan, "tilt_deg", math.nan, "[0, 82.875) deg"),
-        (0, 5, "height_mm", 0, "(0, 47.8173] mm"),
-        (48, 5, "height_mm", 48, "(0, 47.8173] mm"),
-        (math.nan, 5, "height_mm", math.nan, "(0, 47.8173] mm"),
+        (0, 5, "depth_mm", 0, "(0, 47.8173] mm"),
+        (48, 5, "depth_mm", 48, "(0, 47.8173] mm"),
+        (math.nan, 5, "depth_mm", math.nan, "(0, 47.8173] mm"),
     ],
 )
 def test_presses_outside_the_domain_are_refused(
-    height_mm: float, tilt_deg: float, name: str, value: float, says: str
+    depth_mm: float, tilt_deg: float, name: str, value: float, says: str
 ) -> None:
     with pytest.raises(DomainError) as caught:
-        ccdbsm(BRUSH, torch.tensor([15.0, height_mm], dtype=torch.float64), tilt_deg)
+        ccdbsm(BRUSH, torch.tensor([15.0, depth_mm], dtype=torch.float64), tilt_deg)
     assert caught.value.name == name
     assert caught.value.value == pytest.approx(value, nan_ok=True)
     assert says in str(caught.value)

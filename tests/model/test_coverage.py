@@ -194,12 +194,12 @@ def test_the_tip_points_left_and_rows_grow_downwards() -> None:
 
 
 def test_images_of_a_batch_do_not_depend_on_each_other() -> None:
-    heights_mm = torch.linspace(11, 20, 19, dtype=torch.float64)
-    mark = ccdbsm(Brush(), heights_mm, 5.0)
+    depths_mm = torch.linspace(11, 20, 19, dtype=torch.float64)
+    mark = ccdbsm(Brush(), depths_mm, 5.0)
     origins_mm = centred_origin(mark)
     batch = coverage_at(mark, origins_mm)
     for k in (0, 7, 8, 18):
-        alone = coverage_at(ccdbsm(Brush(), heights_mm[k], 5.0), origins_mm[k])
+        alone = coverage_at(ccdbsm(Brush(), depths_mm[k], 5.0), origins_mm[k])
         torch.testing.assert_close(batch[k], alone[0], rtol=0, atol=1e-6)
 
 
@@ -223,23 +223,23 @@ def test_gradients_are_exact_even_with_the_axis_on_a_row_edge() -> None:
 @pytest.mark.parametrize("name", SHAPES)
 def test_gradients_stay_finite_at_the_ends_and_the_peak(name: str) -> None:
     # The axis lies on a row edge, and rows beyond the peak meet square roots that have no derivative.
-    height_mm = torch.tensor([15.0], dtype=torch.float64, requires_grad=True)
-    profile = SHAPES[name](ccdbsm(Brush(), height_mm, 5.0))
-    (slope,) = torch.autograd.grad(coverage_at(profile, (20.0, 12.8)).sum() * PX_MM**2, height_mm)
+    depth_mm = torch.tensor([15.0], dtype=torch.float64, requires_grad=True)
+    profile = SHAPES[name](ccdbsm(Brush(), depth_mm, 5.0))
+    (slope,) = torch.autograd.grad(coverage_at(profile, (20.0, 12.8)).sum() * PX_MM**2, depth_mm)
     assert slope.item() == pytest.approx(2 * profile.area_mm2.item() / 15.0, rel=1e-9)
 
 
 # torch itself compiles its forward-mode rules with torch.jit.script on first use, and warns about it.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_forward_derivatives_match_differences() -> None:
-    def image(height_mm: torch.Tensor) -> torch.Tensor:
-        return coverage_at(ccdbsm(Brush(), height_mm, 0.0), (20.0, 12.8))
+    def image(depth_mm: torch.Tensor) -> torch.Tensor:
+        return coverage_at(ccdbsm(Brush(), depth_mm, 0.0), (20.0, 12.8))
 
     # No height ends the heel on a column edge: the derivative jumps there.
-    heights_mm = torch.tensor([11.1, 13.3, 17.7, 19.9, 20.3], dtype=torch.float64)
-    slope = torch.func.jvp(image, (heights_mm,), (torch.ones_like(heights_mm),))[1]
+    depths_mm = torch.tensor([11.1, 13.3, 17.7, 19.9, 20.3], dtype=torch.float64)
+    slope = torch.func.jvp(image, (depths_mm,), (torch.ones_like(depths_mm),))[1]
     step = 1e-6
-    expected = (image(heights_mm + step) - image(heights_mm - step)) / (2 * step)
+    expected = (image(depths_mm + step) - image(depths_mm - step)) / (2 * step)
     torch.testing.assert_close(slope, expected, rtol=0, atol=1e-5)
 
 

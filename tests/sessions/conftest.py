@@ -78,9 +78,9 @@ class Make:
         header = self.header.model_copy(update=fields)
         return SessionStore.create(folder, header, self.snapshots, self.clock())
 
-    def perform(self, store: SessionStore, key: str, cell: int | None = None) -> None:
+    def perform(self, store: SessionStore, key: str, patch: int | None = None) -> None:
         """One step from begin to done, with a still and a stroke in it."""
-        attempt = store.begin(key, "capture", cell=cell, notes={})
+        attempt = store.begin(key, "capture", patch=patch, notes={})
         attempt.writer.write(self.still(attempt.serial))
         attempt.writer.write(self.stroke(attempt.serial, stroke_id=key))
         store.done(attempt, {"serial": attempt.serial})
@@ -88,12 +88,12 @@ class Make:
     def collect(self, store: SessionStore, strokes: int = 2) -> None:
         """A small grid as the engine collects it: a board, presses with poses, captures, and one press that was cut."""
         self.take(store, "board", "board", [self.still(1000)], {})
-        store.void(store.begin("H13-a05-r00 press", "press", cell=0, notes={"params": {}}), "stopped by the operator")
+        store.void(store.begin("H13-a05-r00 press", "press", patch=0, notes={"params": {}}), "stopped by the operator")
         for number in range(strokes):
-            stroke, sheet, cell = f"H13-a05-r{number:02d}", store.state.sheet, number + 1
+            stroke, sheet, patch = f"H13-a05-r{number:02d}", store.state.sheet, number + 1
             poses = [self.pose(100 * number + at) for at in range(5)]
-            pressed = {"stroke_id": stroke, "sheet": sheet, "cell": cell, "depth_mm": 13.0}
-            self.take(store, f"{stroke} press", "press", poses, pressed, cell)
+            pressed = {"stroke_id": stroke, "sheet": sheet, "patch": patch, "depth_mm": 13.0}
+            self.take(store, f"{stroke} press", "press", poses, pressed, patch)
             captured = {"stroke_id": stroke, "still": number}
             self.take(store, f"{stroke} capture", "capture", [self.still(number), self.stroke(number)], captured)
 
@@ -104,11 +104,11 @@ class Make:
         kind: str,
         messages: list[Outgoing],
         result: dict[str, Any],
-        cell: int | None = None,
+        patch: int | None = None,
     ) -> None:
         """One step from begin to done, with its step events around the messages."""
         params = {"stroke_id": result.get("stroke_id", "")}
-        attempt = store.begin(key, kind, cell=cell, notes={"params": params})
+        attempt = store.begin(key, kind, patch=patch, notes={"params": params})
         event = {"key": key, "kind": kind, "index": 0, "attempt": attempt.attempt, "params": params}
         times = (messages[0].log_ns - 1, messages[-1].log_ns + 1)
         begin, end = (

@@ -38,23 +38,23 @@ def test_png_and_csv_hold_the_photographs_byte_for_byte(make, session, to):
     assert [row["stroke_id"] for row in rows] == ["H13-a05-r00", "H13-a05-r01"]
     assert [(to / row["file"]).read_bytes() for row in rows] == [make.png(0), make.png(1)]
     assert {row["source"] for row in rows} == {"loopback rig"}
-    assert rows[0].keys() >= {"height_mm", "tilt_deg", "anchor_x_mm", "anchor_y_mm", "anchor_x_px", "px_per_mm_x"}
+    assert rows[0].keys() >= {"depth_mm", "tilt_deg", "anchor_x_mm", "anchor_y_mm", "anchor_x_px", "px_per_mm_x"}
     assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(session).sha256
 
 
 def test_values_that_were_commanded_are_columns_and_what_is_not_given_is_empty(make, tmp_path, to):
-    values = {"height_mm": 13.0, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
+    values = {"depth_mm": 13.0, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
     path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0, **values), make.still(1), make.stroke(1))
     export(path, to, "png")
     with (to / "strokes.csv").open(newline="") as file:
         first, second = csv.DictReader(file)
-    assert [first[c] for c in ("height_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")] == [
+    assert [first[c] for c in ("depth_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")] == [
         "13.0",
         "1.5",
         "2.5",
         "30.0",
     ]
-    assert [second[c] for c in ("height_mm", "anchor_x_mm", "commanded_length_mm")] == ["", "", ""]
+    assert [second[c] for c in ("depth_mm", "anchor_x_mm", "commanded_length_mm")] == ["", "", ""]
 
 
 def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, session, to):
@@ -128,7 +128,7 @@ def test_npz_loads_without_pickle(make, session, to):
     with np.load(to / "strokes.npz", allow_pickle=False) as arrays:
         assert arrays["stroke_id"].tolist() == ["H13-a05-r00", "H13-a05-r01"]
         np.testing.assert_array_equal(arrays["image_0001"], decode_gray(make.png(1), "made"))
-        assert np.isnan(arrays["height_mm"]).all()
+        assert np.isnan(arrays["depth_mm"]).all()
         assert arrays["pose_position_mm"].shape == (10, 3)
         assert arrays["pose_t_ns"].dtype == np.int64
         assert arrays["pose_episode_index"].tolist() == [0] * 5 + [1] * 5
@@ -141,7 +141,7 @@ def test_parquet_is_what_datasets_reads(make, session, to):
     assert [image["bytes"] for image in table["image"].to_pylist()] == [make.png(0), make.png(1)]
     features = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
     assert features["image"] == {"_type": "Image"}
-    assert features["height_mm"] == {"dtype": "float64", "_type": "Value"}
+    assert features["depth_mm"] == {"dtype": "float64", "_type": "Value"}
     assert list(features) == table.column_names
 
     poses = parquet.read_table(to / "poses" / "train-00000-of-00001.parquet")

@@ -8,7 +8,7 @@ from brushloop.sessions.history import ZeroTouch, history_of
 
 
 def did(store, key: str, kind: str, result: dict[str, object]) -> None:
-    store.done(store.begin(key, kind, cell=None, notes={}), result)
+    store.done(store.begin(key, kind, patch=None, notes={}), result)
 
 
 def test_takes_that_did_not_count_are_distinguished_from_strokes_that_were_given_up(store) -> None:

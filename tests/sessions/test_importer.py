@@ -17,8 +17,8 @@ from tests.command import brushloop
 
 START = {"start_x_px": "1", "start_y_px": "1"}
 ROWS = [
-    {"file": "a.png", "px_per_mm": "12.5", "height_mm": "13", "tilt_deg": "5"} | START,
-    {"file": "b.png", "px_per_mm": "12.5", "height_mm": "15", "tilt_deg": "10"} | START,
+    {"file": "a.png", "px_per_mm": "12.5", "depth_mm": "13", "tilt_deg": "5"} | START,
+    {"file": "b.png", "px_per_mm": "12.5", "depth_mm": "15", "tilt_deg": "10"} | START,
 ]
 
 
@@ -32,7 +32,7 @@ def test_presses_become_a_session_like_any_other(make, photos, out, run):
     captures = list(recording.captures())
     assert [capture.still_png for capture in captures] == [make.png(0), make.png(1)]
     stroke = captures[1].stroke
-    assert (stroke.stroke_id, stroke.kind, stroke.height_mm, stroke.tilt_deg) == ("b", "press", 15.0, 10.0)
+    assert (stroke.stroke_id, stroke.kind, stroke.depth_mm, stroke.tilt_deg) == ("b", "press", 15.0, 10.0)
     assert stroke.px_per_mm == (12.5, 12.5)
     assert [path.name for path in out.parent.iterdir()] == ["from-elsewhere"]
 

@@ -10,7 +10,7 @@ from brushloop.sessions.errors import SessionDamaged, SessionError
 from brushloop.sessions.journal.journal import Journal, replay
 from brushloop.sessions.journal.lines import read_lines
 
-BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "cell": 4, "file": "0000-k1.mcap"}
+BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "patch": 4, "file": "0000-k1.mcap"}
 DONE = {
     "event": "done",
     "key": "k1",
@@ -105,8 +105,8 @@ def test_damage_in_the_middle_names_the_line(path, line, message):
     [
         {"event": "begin"},
         {**BEGIN, "attempt": "many"},
-        {**BEGIN, "cell": [1]},
-        {**BEGIN, "cell": float("inf")},
+        {**BEGIN, "patch": [1]},
+        {**BEGIN, "patch": float("inf")},
         {"event": "done"},
         {**DONE, "counts": 3},
         {**DONE, "counts": {"/step": "2"}},
@@ -124,9 +124,9 @@ def test_an_event_without_a_field_is_damage_in_one_line(path, event):
 
 
 def test_replay_folds_begin_done_void_and_sheet(path):
-    other = {**BEGIN, "key": "k2", "cell": 5, "file": "0001-k2.mcap"}
+    other = {**BEGIN, "key": "k2", "patch": 5, "file": "0001-k2.mcap"}
     void = {"event": "void", "key": "k2", "attempt": 1, "why": "stopped"}
-    again = {**other, "attempt": 2, "sheet": 1, "cell": 0}
+    again = {**other, "attempt": 2, "sheet": 1, "patch": 0}
     state = replay(written(path, BEGIN, DONE, other, void, {"event": "sheet", "sheet": 1}, again))
     assert state.done["k1"]["result"] == {"depth_mm": 13.0}
     assert [line["file"] for line in state.segments] == ["0000-k1.mcap"]
@@ -136,7 +136,7 @@ def test_replay_folds_begin_done_void_and_sheet(path):
 
 def test_a_press_that_was_begun_and_never_done_has_used_its_cell(path):
     state = replay(written(path, BEGIN))
-    assert state.used_cells == {(0, 4)}
+    assert state.used_patches == {(0, 4)}
     assert state.done == {}
 
 

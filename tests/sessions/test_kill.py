@@ -1,4 +1,4 @@
-"""kill -9 at any moment: every step is done exactly once, and no paper cell is used twice."""
+"""kill -9 at any moment: every step is done exactly once, and no paper patch is used twice."""
 
 import random
 import subprocess
@@ -30,8 +30,8 @@ print("ready", flush=True)
 for key in keys:
     if key in store.state.done:
         continue
-    cell = max((cell for _, cell in store.state.used_cells), default=-1) + 1
-    attempt = store.begin(key, "press", cell=cell, notes={})
+    patch = max((patch for _, patch in store.state.used_patches), default=-1) + 1
+    attempt = store.begin(key, "press", patch=patch, notes={})
     for number in range(4):
         t_ns = time.time_ns()
         still = image_message(t_ns, random.randbytes(20_000))
@@ -39,7 +39,7 @@ for key in keys:
         time.sleep(random.uniform(0, 0.01))
     stroke = Stroke(stroke_id=key, kind="press", still=3)
     attempt.writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, 3, stroke))
-    store.done(attempt, {"cell": cell})
+    store.done(attempt, {"patch": patch})
 store.close()
 """
 
@@ -67,7 +67,7 @@ def test_a_session_killed_ten_times_is_whole_in_the_end(make, tmp_path):
     assert make.stroke_names(recording.path) == KEYS
     done = make.events(folder, "done")
     assert Counter(line["key"] for line in done) == Counter(KEYS)
-    cells = [line["cell"] for line in make.events(folder, "begin")]
-    assert len(cells) == len(set(cells)), "a cell was pressed twice"
+    patches = [line["patch"] for line in make.events(folder, "begin")]
+    assert len(patches) == len(set(patches)), "a patch was pressed twice"
     assert len(make.events(folder, "process")) > 3, "the kills came too late to test anything"
     assert sum(line["counts"]["/camera/still"] for line in done) == 48

@@ -65,7 +65,7 @@ def collect(make, folder):
     store.release()
     store = SessionStore(folder, None, make.clock())
     make.take(store, "touch", "zero_touch", [make.pose(2)], {"touch_z_mm": 1.1})
-    stroke = {"stroke_id": "H13-a05-r09", "sheet": 1, "cell": 0}
+    stroke = {"stroke_id": "H13-a05-r09", "sheet": 1, "patch": 0}
     make.take(store, "H13-a05-r09 press", "press", [make.pose(900 + n) for n in range(5)], stroke, 0)
     shown = [make.still(9), make.stroke(9)]
     make.take(store, "H13-a05-r09 capture", "capture", shown, {"stroke_id": "H13-a05-r09", "still": 9})

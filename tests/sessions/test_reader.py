@@ -139,7 +139,7 @@ def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damage
         ("/stroke", b"\xff", "Stroke"),
         ("/stroke", b'{"stroke_id":"a","kind":"press"}', r"Stroke\.still"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":-1}', r"Stroke\.still"),
-        ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"height_mm":NaN}', r"Stroke\.height_mm"),
+        ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"depth_mm":NaN}', r"Stroke\.depth_mm"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"px_per_mm":[0,0]}', r"Stroke\.px_per_mm"),
         ("/stroke", b'{"stroke_id":"a","kind":"press","still":0,"extra":0}', r"Stroke\.extra"),
         ("/camera/still", b"\xff\xff\xff", "a still cannot be read"),

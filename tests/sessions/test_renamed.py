@@ -97,7 +97,7 @@ LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, l
 
 @pytest.mark.parametrize("look", LOOKS)
 def test_an_unfinished_file_is_named_as_one(make, store, look):
-    store.begin("k", "press", cell=0, notes={"params": {}}).writer.abandon()
+    store.begin("k", "press", patch=0, notes={"params": {}}).writer.abandon()
     (part,) = store.folder.glob("*.part")
     before = make.tree(store.folder)
     with pytest.raises(InputError) as refused:

@@ -138,7 +138,7 @@ def test_a_journal_that_is_gone_is_rebuilt_from_the_files(make, folder, repair, 
     repair(folder)
     store = go_on(folder)
     assert store.header == make.header
-    assert store.state.used_cells == {(0, 0), (0, 1), (0, 2)}
+    assert store.state.used_patches == {(0, 0), (0, 1), (0, 2)}
     after = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] in ("begin", "done")]
     assert sorted(after, key=str) == sorted(before, key=str)
 
@@ -184,9 +184,9 @@ def test_where_nobody_knows_which_cell_was_pressed_the_sheet_is_not_used_again(m
     assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in report.lost[1]
     store = go_on(folder)
     with pytest.raises(SessionError, match="run the same command with --sheet 2"):
-        store.begin("H15-a05", "press", cell=7, notes={})
+        store.begin("H15-a05", "press", patch=7, notes={})
     store.fresh_sheet()
-    make.perform(store, "H15-a05", cell=0)
+    make.perform(store, "H15-a05", patch=0)
     store.release()
     assert verify_session(folder).sound
 
@@ -227,7 +227,7 @@ def test_where_steps_and_merged_file_are_damaged_the_better_one_is_taken(make, s
 
 def test_an_import_keeps_every_stroke_whose_photograph_is_whole(make, photos, out, run, repair, monkeypatch):
     monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
-    asked = {"px_per_mm": "10", "height_mm": "13", "tilt_deg": "5", "start_x_px": "1", "start_y_px": "1"}
+    asked = {"px_per_mm": "10", "depth_mm": "13", "tilt_deg": "5", "start_x_px": "1", "start_y_px": "1"}
     rows = [{"file": f"{n}.png"} | asked for n in range(5)]
     make.photographs(photos, *rows)
     final = run()
@@ -402,7 +402,7 @@ def test_a_line_without_a_field_is_damage_for_every_command(folder, repair, even
 
 
 def test_verify_calls_nothing_sound_that_show_refuses(make, tmp_path):
-    store = make.store(tmp_path / "s", protocol='{"heights_mm": ["deep"], "tilts_deg": [0], "repeats": 1}')
+    store = make.store(tmp_path / "s", protocol='{"depths_mm": ["deep"], "tilts_deg": [0], "repeats": 1}')
     make.perform(store, "a")
     store.release()
     with pytest.raises(SessionDamaged, match="makes no sense"):

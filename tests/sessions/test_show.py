@@ -13,7 +13,7 @@ from brushloop.sessions.show import GridCell, Sheet, details
 from brushloop.sessions.show_text import ranges
 from brushloop.sessions.store import SessionStore
 
-PROTOCOL = '{"kind":"grid","heights_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
+PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
 
 
 @pytest.fixture
@@ -24,24 +24,24 @@ def store(make, tmp_path):
     made.release()
 
 
-def press(make, store, stroke_id, height_mm, cell):
-    params = {"stroke_id": stroke_id, "height_mm": height_mm, "tilt_deg": 5.0}
-    attempt = store.begin(f"press {stroke_id}", "press", cell=cell, notes={"params": params})
-    store.done(attempt, {"stroke_id": stroke_id, "sheet": store.state.sheet, "cell": cell})
-    attempt = store.begin(f"capture {stroke_id}", "capture", cell=None, notes={"params": params})
+def press(make, store, stroke_id, depth_mm, cell):
+    params = {"stroke_id": stroke_id, "depth_mm": depth_mm, "tilt_deg": 5.0}
+    attempt = store.begin(f"press {stroke_id}", "press", patch=cell, notes={"params": params})
+    store.done(attempt, {"stroke_id": stroke_id, "sheet": store.state.sheet, "patch": cell})
+    attempt = store.begin(f"capture {stroke_id}", "capture", patch=None, notes={"params": params})
     attempt.writer.write(make.still(attempt.serial))
-    attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, height_mm=height_mm, tilt_deg=5.0))
-    store.done(attempt, {"stroke_id": stroke_id, "height_mm": height_mm, "tilt_deg": 5.0, "still": attempt.serial})
+    attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, depth_mm=depth_mm, tilt_deg=5.0))
+    store.done(attempt, {"stroke_id": stroke_id, "depth_mm": depth_mm, "tilt_deg": 5.0, "still": attempt.serial})
 
 
 @pytest.fixture
 def collected(make, store):
     """Two strokes of four, one press that was stopped, one that the process did not survive."""
     press(make, store, "H13-a5-r01", 13.0, 0)
-    store.void(store.begin("v", "press", cell=1, notes={"params": {"stroke_id": "H15-a5-r01"}}), "stopped")
+    store.void(store.begin("v", "press", patch=1, notes={"params": {"stroke_id": "H15-a5-r01"}}), "stopped")
     press(make, store, "H15-a5-r01", 15.0, 2)
     store.fresh_sheet()
-    store.begin("k", "press", cell=0, notes={"params": {"stroke_id": "H13-a5-r02"}}).writer.abandon()
+    store.begin("k", "press", patch=0, notes={"params": {"stroke_id": "H13-a5-r02"}}).writer.abandon()
     return store
 
 
@@ -111,11 +111,11 @@ def test_what_is_not_there_is_refused(tmp_path):
 
 
 def test_a_recording_of_the_earlier_protocol_adaptive_is_shown_closed_and_verified(make, tmp_path):
-    protocol = '{"kind":"adaptive","heights_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":10,"enough_points":1.0}'
+    protocol = '{"kind":"adaptive","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":10,"enough_points":1.0}'
     header = make.header.model_copy(update={"protocol": protocol})
     store = SessionStore.create(tmp_path / header.session_id, header, make.snapshots, make.clock())
-    chosen = {"number": 0, "points": 9.0, "ink_sha256": "0" * 64, "stop": False, "height_mm": 13.0, "tilt_deg": 5.0}
-    store.done(store.begin("choose 0", "choose", cell=None, notes={"params": {}}), chosen)
+    chosen = {"number": 0, "points": 9.0, "ink_sha256": "0" * 64, "stop": False, "depth_mm": 13.0, "tilt_deg": 5.0}
+    store.done(store.begin("choose 0", "choose", patch=None, notes={"params": {}}), chosen)
     press(make, store, "001-H13-a5", 13.0, 0)
     shown = details(store.folder)
     assert (shown.strokes, shown.planned, shown.finished["choose"]) == (1, None, 1)

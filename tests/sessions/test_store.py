@@ -82,12 +82,12 @@ def test_a_lock_is_given_back_from_any_thread(make, store, resume):
 
 
 def test_attempts_cells_and_results_are_kept_across_processes(make, store, resume):
-    make.perform(store, "H13-a05", cell=0)
-    store.void(store.begin("H15-a05", "press", cell=1, notes={}), "stopped by the operator")
+    make.perform(store, "H13-a05", patch=0)
+    store.void(store.begin("H15-a05", "press", patch=1, notes={}), "stopped by the operator")
     second = resume(store)
     assert second.state.done["H13-a05"]["result"] == {"serial": 0}
-    assert second.state.used_cells == {(0, 0), (0, 1)}
-    attempt = second.begin("H15-a05", "press", cell=2, notes={})
+    assert second.state.used_patches == {(0, 0), (0, 1)}
+    attempt = second.begin("H15-a05", "press", patch=2, notes={})
     assert (attempt.attempt, attempt.serial) == (2, 2)
     second.done(attempt, {})
     assert [line["why"] for line in make.events(store.folder, "void")] == ["stopped by the operator"]
@@ -95,28 +95,28 @@ def test_attempts_cells_and_results_are_kept_across_processes(make, store, resum
 
 
 def test_a_fresh_sheet_frees_its_cells_and_stays_fresh(make, store, resume):
-    make.perform(store, "H13-a05", cell=0)
+    make.perform(store, "H13-a05", patch=0)
     store.fresh_sheet()
-    make.perform(store, "H15-a05", cell=0)
+    make.perform(store, "H15-a05", patch=0)
     state = resume(store).state
-    assert (state.sheet, state.used_cells) == (1, {(0, 0), (1, 0)})
+    assert (state.sheet, state.used_patches) == (1, {(0, 0), (1, 0)})
 
 
 def test_a_process_that_dies_after_begin_has_burnt_the_cell(make, store, resume):
-    store.begin("H13-a05", "press", cell=3, notes={}).writer.abandon()
+    store.begin("H13-a05", "press", patch=3, notes={}).writer.abandon()
     second = resume(store)
-    assert second.state.used_cells == {(0, 3)}
-    make.perform(second, "H13-a05", cell=4)
+    assert second.state.used_patches == {(0, 3)}
+    make.perform(second, "H13-a05", patch=4)
     assert make.stroke_names(second.close()) == ["H13-a05"]
 
 
 def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, store, resume):
-    attempt = store.begin("H13-a05", "press", cell=3, notes={})
+    attempt = store.begin("H13-a05", "press", patch=3, notes={})
     attempt.writer.write(make.stroke(0, stroke_id="never journalled"))
     attempt.writer.finish()
     second = resume(store)
     assert second.state.done == {}
-    make.perform(second, "H13-a05", cell=4)
+    make.perform(second, "H13-a05", patch=4)
     assert make.stroke_names(second.close()) == ["H13-a05"]
 
 
@@ -237,6 +237,6 @@ def test_session_ids_count_up_until_the_day_is_full(tmp_path):
 
 
 def test_an_attempt_that_marks_several_cells_burns_them_all(make, store, resume):
-    store.begin("check", "self_check", cell=0, notes={"more_cells": [5, 36]}).writer.abandon()
-    assert store.state.used_cells == {(0, 0), (0, 5), (0, 36)}
-    assert resume(store).state.used_cells == store.state.used_cells
+    store.begin("check", "self_check", patch=0, notes={"more_patches": [5, 36]}).writer.abandon()
+    assert store.state.used_patches == {(0, 0), (0, 5), (0, 36)}
+    assert resume(store).state.used_patches == store.state.used_patches

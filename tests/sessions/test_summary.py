@@ -15,7 +15,7 @@ def root(make, tmp_path, out, photos, run):
     root = out.parent
     make.photographs(
         photos,
-        {"file": "a.png", "px_per_mm": "10", "height_mm": "13", "tilt_deg": "5"}
+        {"file": "a.png", "px_per_mm": "10", "depth_mm": "13", "tilt_deg": "5"}
         | {"start_x_px": "1", "start_y_px": "1"},
     )
     run()

@@ -49,10 +49,10 @@ def test_a_step_is_not_begun_where_its_files_might_not_fit(make, store, monkeypa
     free(monkeypatch, 1_000_000)
     assert store.free_bytes() == 1_000_000
     with pytest.raises(DiskFull, match="the disk has 1 MB left, 84 MB are needed; make room") as caught:
-        store.begin("b", "press", cell=0, notes={})
+        store.begin("b", "press", patch=0, notes={})
     assert (caught.value.exit_code, caught.value.free_bytes) == (4, 1_000_000)
     assert make.tree(store.folder) == before
-    assert store.state.used_cells == set(), "no cell is burnt"
+    assert store.state.used_patches == set(), "no patch is burnt"
 
 
 def test_the_engine_may_ask_before_each_step(store, monkeypatch):
@@ -76,7 +76,7 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
     make, store, go_on, monkeypatch
 ):
     """Neither the step's file nor its `void` fits; with room again, the session goes on with the next attempt."""
-    make.perform(store, "a", cell=0)
+    make.perform(store, "a", patch=0)
     open_, write = Path.open, os.write
 
     class Full(io.FileIO):
@@ -90,7 +90,7 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
         return io.BufferedWriter(Full(path, mode)) if mode == "xb" else open_(path, mode, **options)
 
     monkeypatch.setattr(Path, "open", open_on_it)
-    attempt = store.begin("b", "press", cell=1, notes={})
+    attempt = store.begin("b", "press", patch=1, notes={})
     monkeypatch.setattr(os, "write", no_room)
 
     def finish():
@@ -106,8 +106,8 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
 
     again = go_on(store)
     assert set(again.state.done) == {"a"}
-    assert again.state.used_cells == {(0, 0), (0, 1)}
-    make.perform(again, "b", cell=2)
+    assert again.state.used_patches == {(0, 0), (0, 1)}
+    make.perform(again, "b", patch=2)
     assert make.stroke_names(again.close()) == ["a", "b"]
     assert verify_session(store.folder).sound
 

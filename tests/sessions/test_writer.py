@@ -96,7 +96,7 @@ def test_our_own_events_carry_their_json_schema(make, path):
     with path.open("rb") as file:
         [(schema, channel, _)] = make_reader(file).iter_messages()
     assert (schema.name, schema.encoding, channel.message_encoding) == ("brushloop.Stroke", "jsonschema", "json")
-    assert set(json.loads(schema.data)["properties"]) >= {"stroke_id", "height_mm", "tilt_deg"}
+    assert set(json.loads(schema.data)["properties"]) >= {"stroke_id", "depth_mm", "tilt_deg"}
 
 
 def test_the_header_reads_back_as_it_was(make, path):

@@ -120,7 +120,7 @@ class Extreme(Frozen):
 
     session_id: str
     stroke_id: str
-    height_mm: float
+    depth_mm: float
     tilt_deg: float
     model: str
     csim: float

@@ -24,7 +24,7 @@ from brushloop.calibrate.validate.run import REPEATED, Outcome
 from brushloop.sessions.cells import CsvWriter
 from brushloop.sessions.terminal import narrow
 
-COLUMNS = ("session_id", "stroke_id", "height_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
+COLUMNS = ("session_id", "stroke_id", "depth_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
 GROUP = 500
 """Strokes per row group of the Parquet file."""
 MAX_REFUSED = 20
@@ -47,7 +47,7 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
                     yield (
                         header.session_id,
                         press.stroke_id,
-                        press.height_mm,
+                        press.depth_mm,
                         press.tilt_deg,
                         model,
                         str(alignment),
@@ -89,7 +89,7 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
         pq: Any = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise CalibrationError("--parquet", "needs pyarrow: pip install 'brushloop[parquet]'") from None
-    kinds = [pa.float64() if name in ("height_mm", "tilt_deg", "csim", "ssim") else pa.string() for name in COLUMNS]
+    kinds = [pa.float64() if name in ("depth_mm", "tilt_deg", "csim", "ssim") else pa.string() for name in COLUMNS]
     label = source_label(outcome.sessions[0].header.source, (one.header.brush for one in outcome.sessions))
     schema: Any = pa.schema(list(zip(COLUMNS, kinds, strict=True)), metadata={"source": label})
     with replacing(path) as part, pq.ParquetWriter(part, schema) as writer:
@@ -100,7 +100,7 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
 
 def summary_csv(report: Report) -> str:
     """Return every statistic, per cell and overall; “robot writing” is what `brushloop loop` pressed again."""
-    head = ("model", "alignment", "tone", "measure", "height_mm", "tilt_deg", "n", "max", "min", "avg")
+    head = ("model", "alignment", "tone", "measure", "depth_mm", "tilt_deg", "n", "max", "min", "avg")
     ends = ("avg_low", "avg_high", "median", "median_low", "median_high", "below_ceiling", "source")
     rows = [(*_stat_row(stat), report.label) for stat in report.stats]
     return csv_text((*head, *ends), [*rows, *_loop_rows(report)])

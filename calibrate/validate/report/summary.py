@@ -167,7 +167,7 @@ def _extreme(outcome: Outcome, k: int, model: str) -> Extreme:
     return Extreme(
         session_id=outcome.sessions[row.session].header.session_id,
         stroke_id=row.press.stroke_id,
-        height_mm=row.press.height_mm,
+        depth_mm=row.press.depth_mm,
         tilt_deg=row.press.tilt_deg,
         model=model,
         csim=_round(100.0 * float(csim)),

@@ -16,10 +16,10 @@ from brushloop.collect.engine.steps.context import RunContext, StepContext, mean
 from brushloop.collect.engine.steps.retake import decide
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
 from brushloop.collect.protocols.steps import MARKING, Result, StepKind
-from brushloop.collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
+from brushloop.collect.quality.checks import check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.quality.verdict import Check, Family, Verdict
 from brushloop.collect.rig.optics import undistorted
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.samples import Frame
 from brushloop.sessions.history import limit_s, unlike, waits_of
 from brushloop.sessions.recording import schemas
@@ -97,7 +97,7 @@ def _sheet_corners_mm(size_mm: tuple[float, float]) -> NDArray[np.float64]:
 
 
 async def look_at_sheet(context: StepContext) -> None:
-    """Once for each sheet, check that every free cell is blank. Raises `NeedsOperator`.
+    """Once for each sheet, check that every free patch is blank. Raises `NeedsOperator`.
 
     The operator says that a fresh sheet is in; the camera confirms it, so that no press lands on old ink. A brush that
     was full of ink counts as dry afterwards.
@@ -109,21 +109,23 @@ async def look_at_sheet(context: StepContext) -> None:
     run.memory.left_ink_ns = None
     with run.progress.meanwhile("check that the sheet is blank"):
         image = await photograph(context)
-        inked = await uninterrupted(_inked_cells, run, image, context.cell.index if context.cell is not None else None)
+        inked = await uninterrupted(
+            _inked_patches, run, image, context.patch.index if context.patch is not None else None
+        )
     if inked:
         raise NeedsOperator(
-            f"{len(inked)} cells of sheet {sheet + 1} that should be blank are not: {inked[0]} "
+            f"{len(inked)} patches of sheet {sheet + 1} that should be blank are not: {inked[0]} "
             "Put in a blank sheet, or the one that belongs here."
         )
     run.memory.looked_at_sheet = sheet
 
 
-def _inked_cells(run: RunContext, image: Gray, begun: int | None) -> list[str]:
+def _inked_patches(run: RunContext, image: Gray, begun: int | None) -> list[str]:
     plane = run.image_plane(image)
-    used = run.used_cells() - {begun}  # this attempt's own cell is not pressed yet
-    free = [run.sheet.cell(index) for index in range(run.sheet.capacity) if index not in used]
+    used = run.used_patches() - {begun}  # this attempt's own patch is not pressed yet
+    free = [run.sheet.patch(index) for index in range(run.sheet.capacity) if index not in used]
     limits, sheet_mm = run.rig.config.quality, run.rig.config.paper.size_mm
-    checks = [cell_is_blank(image, plane, cell, limits=limits, sheet_mm=sheet_mm) for cell in free]
+    checks = [patch_is_blank(image, plane, patch, limits=limits, sheet_mm=sheet_mm) for patch in free]
     return [check.reason for check in checks if not check.passed]
 
 
@@ -157,7 +159,7 @@ def _camera_delay(context: StepContext) -> Result:
 
 
 async def capture(context: StepContext) -> Result:
-    """The CAPTURE step: `kept` if the stroke counts, `retake` if it must be pressed again on another cell.
+    """The CAPTURE step: `kept` if the stroke counts, `retake` if it must be pressed again on another patch.
 
     Once the frame is there, the arm goes where the next dip begins, if another stroke is planned, while the frame is
     recorded and judged. The brush is empty and stays so until the decision is in the journal: only the next step may
@@ -166,23 +168,23 @@ async def capture(context: StepContext) -> Result:
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if int(context.number("sheet")) != run.store.state.sheet:
         raise StepError(f"{stroke_id} is not on the sheet that is in")
-    cell = run.sheet.cell(int(context.number("cell")))
+    patch = run.sheet.patch(int(context.number("patch")))
     frame = await _fresh_frame(context)
     waited = _wait_check(context)
-    looking = _looked_at(context, frame, cell, waited)
+    looking = _looked_at(context, frame, patch, waited)
     if run.progress.more_than(stroke_id):
         image, verdict = await meanwhile(context.guard.guarded(run.procedures.set_out()), looking)
     else:
         image, verdict = await looking  # a dip for a retake goes to the well by itself
-    kept, retake = await decide(context, verdict, image, cell)
+    kept, retake = await decide(context, verdict, image, patch)
     if not kept:
         run.progress.not_kept()
     if kept:
-        context.recorder.stroke(_stroke(context, cell, None if waited is None else waited.score))
+        context.recorder.stroke(_stroke(context, patch, None if waited is None else waited.score))
     return {
         "stroke_id": stroke_id,
         "still": context.attempt.serial,
-        "height_mm": context.number("height_mm"),
+        "depth_mm": context.number("depth_mm"),
         "tilt_deg": context.number("tilt_deg"),
         "kept": kept,
         "retake": retake,
@@ -192,14 +194,14 @@ async def capture(context: StepContext) -> Result:
 
 
 async def _looked_at(
-    context: StepContext, frame: Frame, cell: Cell, waited: schemas.Check | None
+    context: StepContext, frame: Frame, patch: Patch, waited: schemas.Check | None
 ) -> tuple[Gray, Verdict | None]:
     """Record the frame, judge the stroke in it, and show both; nothing moves here."""
     image = await _recorded(context, frame)
-    verdict = await _judged(context, image, cell, waited)
+    verdict = await _judged(context, image, patch, waited)
     context.run.memory.sound_frame = image
     if context.run.asker.watched:
-        await uninterrupted(_show, context, verdict, image, cell)
+        await uninterrupted(_show, context, verdict, image, patch)
     return image, verdict
 
 
@@ -218,7 +220,7 @@ def _wait_check(context: StepContext) -> schemas.Check | None:
     return schemas.Check(name="dip_to_touch", score=waits[still], threshold=threshold, passed=not reason, reason=reason)
 
 
-async def _judged(context: StepContext, image: Gray, cell: Cell, waited: schemas.Check | None) -> Verdict | None:
+async def _judged(context: StepContext, image: Gray, patch: Patch, waited: schemas.Check | None) -> Verdict | None:
     """Judge the capture and record the checks; None where captures are not judged."""
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if waited is not None and not waited.passed:
@@ -226,7 +228,7 @@ async def _judged(context: StepContext, image: Gray, cell: Cell, waited: schemas
     if not run.rig.config.quality.enabled:
         return None
     with context.recorder.sections.timed("judge the capture"):
-        verdict = await uninterrupted(_judge, context, image, cell)
+        verdict = await uninterrupted(_judge, context, image, patch)
     checks = tuple(
         schemas.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
         for c in verdict.checks
@@ -244,44 +246,44 @@ def _drawn(context: StepContext) -> bool:
     return bool(context.step.params.get("drawn"))
 
 
-def _judge(context: StepContext, image: Gray, cell: Cell) -> Verdict:
-    run, height_mm = context.run, context.number("height_mm")
+def _judge(context: StepContext, image: Gray, patch: Patch) -> Verdict:
+    run, depth_mm = context.run, context.number("depth_mm")
     config, previous, plane = run.rig.config, run.memory.sound_frame, run.image_plane(image)
     if _drawn(context):
-        return check_drawing(image, plane, cell, height_mm=height_mm, limits=config.quality, previous=previous)
+        return check_drawing(image, plane, patch, depth_mm=depth_mm, limits=config.quality, previous=previous)
     return check_capture(
         image,
         plane,
-        cell,
-        height_mm=height_mm,
+        patch,
+        depth_mm=depth_mm,
         limits=config.quality,
         previous=previous,
         sheet_mm=config.paper.size_mm,
     )
 
 
-def _show(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell) -> None:
+def _show(context: StepContext, verdict: Verdict | None, image: Gray, patch: Patch) -> None:
     photo = binary = None
     with contextlib.suppress(BadPicture):
-        photo, binary = pictures_of(image, context.run.image_plane(image), cell)
+        photo, binary = pictures_of(image, context.run.image_plane(image), patch)
     stroke_id, still = str(context.step.params["stroke_id"]), context.attempt.serial
-    height_mm, tilt_deg = context.number("height_mm"), context.number("tilt_deg")
+    depth_mm, tilt_deg = context.number("depth_mm"), context.number("tilt_deg")
     brush = context.run.rig.config.brush
     sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
-    model = None if _drawn(context) else published_mark(height_mm, tilt_deg, **sizes)
-    context.run.progress.show(LastCapture(stroke_id, height_mm, tilt_deg, still, True, verdict, photo, binary, model))
+    model = None if _drawn(context) else published_mark(depth_mm, tilt_deg, **sizes)
+    context.run.progress.show(LastCapture(stroke_id, depth_mm, tilt_deg, still, True, verdict, photo, binary, model))
 
 
-def _stroke(context: StepContext, cell: Cell, dip_to_touch_s: float | None) -> schemas.Stroke:
+def _stroke(context: StepContext, patch: Patch, dip_to_touch_s: float | None) -> schemas.Stroke:
     again_of = context.step.params.get("again_of")
     return schemas.Stroke(
         stroke_id=str(context.step.params["stroke_id"]),
         kind="drag" if _drawn(context) else "press",
         still=context.attempt.serial,
-        height_mm=context.number("height_mm"),
+        depth_mm=context.number("depth_mm"),
         tilt_deg=context.number("tilt_deg"),
-        cell_mm=cell.rect_mm,
-        anchor_mm=cell.anchor_mm,
+        cell_mm=patch.rect_mm,
+        anchor_mm=patch.anchor_mm,
         again_of=None if again_of is None else str(again_of),
         dip_to_touch_s=dip_to_touch_s,
     )

@@ -19,8 +19,8 @@ from brushloop.collect.operator import Asker, OperatorRequests
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Step
 from brushloop.collect.rig.devices import Rig
-from brushloop.collect.rig.paper import Cell, Sheet
-from brushloop.collect.touch.places import used_cells as touched_cells
+from brushloop.collect.rig.paper import Patch, Sheet
+from brushloop.collect.touch.places import used_patches as touched_patches
 from brushloop.drivers.cancellation import finished
 from brushloop.sessions.store import Attempt, SessionStore
 
@@ -45,7 +45,7 @@ class RunMemory:
     sound_frame: Gray | None = None
     """Newest valid gray photograph of the current sheet."""
     looked_at_sheet: int | None = None
-    """Sheet whose free cells were seen to be blank."""
+    """Sheet whose free patches were seen to be blank."""
     dips: int = 0
     """Dips since the run began, where doses are counted by dips."""
     dosed_ml: float = 0.0
@@ -68,11 +68,11 @@ class RunContext:
     requests: OperatorRequests = field(default_factory=OperatorRequests)
     memory: RunMemory = field(default_factory=RunMemory)
 
-    def used_cells(self) -> set[int]:
+    def used_patches(self) -> set[int]:
         """Cells of the current sheet on which any mark was started, or which zero touch may ink."""
         state, config = self.store.state, self.rig.config
-        marked = {cell for sheet, cell in state.used_cells if sheet == state.sheet}
-        return marked | touched_cells(self.sheet, config.paper, config.touch)
+        marked = {patch for sheet, patch in state.used_patches if sheet == state.sheet}
+        return marked | touched_patches(self.sheet, config.paper, config.touch)
 
     def image_plane(self, image: Gray) -> Plane:
         """Where the paper lies in this frame: from the board in it, else from the newest frame that showed one.
@@ -107,10 +107,10 @@ class StepContext:
 
     run: RunContext
     step: Step
-    cell: Cell | None
-    """Cell to press."""
-    more_cells: tuple[Cell, ...]
-    """Further cells that this step marks."""
+    patch: Patch | None
+    """Patch to press."""
+    more_patches: tuple[Patch, ...]
+    """Further patches that this step marks."""
     attempt: Attempt
     recorder: Recorder
     guard: ForceGuard

@@ -112,7 +112,7 @@ class DipToTouch:
             yield self
 
     async def begin(self, first: Move) -> None:
-        """Start timing a stroke that begins with the move `first`; wait above the cell if the protocol asks for a
+        """Start timing a stroke that begins with the move `first`; wait above the patch if the protocol asks for a
         fixed time after the dip."""
         run = self._context.run
         left_ns, run.memory.left_ink_ns = run.memory.left_ink_ns, None

@@ -1,4 +1,4 @@
-"""The steps that leave ink on a cell: a press, and a drawn figure."""
+"""The steps that leave ink on a patch: a press, and a drawn figure."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from brushloop.collect.motion.procedures import check_drawn, draw_stroke
 from brushloop.collect.protocols.plan import Drawn
 from brushloop.collect.protocols.steps import Result
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 from brushloop.sessions.history import WAIT
 
 
 async def press(context: StepContext) -> Result:
     """The PRESS step."""
-    cell, procedures = await _ready(context), context.run.procedures
-    height_mm, tilt_deg = context.number("height_mm"), context.number("tilt_deg")
-    down, _ = press_moves(context.run.rig.config, procedures.plane, cell, height_mm, tilt_deg)
+    patch, procedures = await _ready(context), context.run.procedures
+    depth_mm, tilt_deg = context.number("depth_mm"), context.number("tilt_deg")
+    down, _ = press_moves(context.run.rig.config, procedures.plane, patch, depth_mm, tilt_deg)
     with DipToTouch(context).watching() as timing:
         await timing.begin(down[0])
-        pressing = procedures.press(cell, height_mm, tilt_deg, context.number("dwell_s"))
-        depth_mm = await context.guard.guarded(pressing)
-    return _marked(context, depth_mm, context.guard.peak_n, timing)
+        pressing = procedures.press(patch, depth_mm, tilt_deg, context.number("dwell_s"))
+        reached_mm = await context.guard.guarded(pressing)
+    return _marked(context, reached_mm, context.guard.peak_n, timing)
 
 
 async def draw(context: StepContext) -> Result:
     """The DRAW step: every stroke of a figure, with dips in between if the protocol asks for them."""
     run, drawn = context.run, Drawn.of(context.step)
-    cell = await _ready(context)
+    patch = await _ready(context)
     plane = run.procedures.plane
     config = run.rig.config
-    await asyncio.to_thread(check_drawn, config, plane, limits_of(config), [cell], drawn)
+    await asyncio.to_thread(check_drawn, config, plane, limits_of(config), [patch], drawn)
     depths_mm: list[float] = []
     peaks_n: list[float] = []
     with DipToTouch(context).watching() as timing:
@@ -42,12 +42,12 @@ async def draw(context: StepContext) -> Result:
             if drawn.dips_before(number):
                 await fill_brush(context)
             if run.memory.left_ink_ns is not None:
-                await timing.begin(stroke_moves(config, plane, cell, points, drawn.speed_mm_s).down[0])
+                await timing.begin(stroke_moves(config, plane, patch, points, drawn.speed_mm_s).down[0])
             stroke = draw_stroke(
                 run.rig.robot,
                 run.rig.config,
                 plane,
-                cell,
+                patch,
                 points,
                 speed_mm_s=drawn.speed_mm_s,
                 blend_mm=drawn.blend_mm,
@@ -57,23 +57,23 @@ async def draw(context: StepContext) -> Result:
     return {**_marked(context, max(depths_mm), max(peaks_n), timing), "depths_mm": depths_mm}
 
 
-async def _ready(context: StepContext) -> Cell:
-    """Check the sheet, fill the brush if its ink is old, and return the cell to press, which was seen to be blank."""
-    assert context.cell is not None
+async def _ready(context: StepContext) -> Patch:
+    """Check the sheet, fill the brush if its ink is old, and return the patch to press, which was seen to be blank."""
+    assert context.patch is not None
     await look_at_sheet(context)
     if must_dip(context):
         # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
         context.recorder.log("dip again before the press")
         await fill_brush(context)
-    return context.cell
+    return context.patch
 
 
 def _marked(context: StepContext, depth_mm: float, peak_n: float, timing: DipToTouch) -> Result:
-    assert context.cell is not None
+    assert context.patch is not None
     result: Result = {
         "stroke_id": context.step.params["stroke_id"],
         "sheet": context.run.store.state.sheet,
-        "cell": context.cell.index,
+        "patch": context.patch.index,
         "depth_mm": depth_mm,
     }
     if timing.longest_s is not None:

@@ -1,4 +1,4 @@
-"""Decides which strokes count, are pressed again on another cell, or are left out: after a capture, and in review.
+"""Decides which strokes count, are pressed again on another patch, or are left out: after a capture, and in review.
 
 That a photograph is taken again, and a failed step done again, is decided in `collect.engine.policy`.
 """
@@ -12,15 +12,15 @@ from brushloop.collect.engine.steps.context import RunContext, StepContext
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols.steps import Result, StepKind
 from brushloop.collect.quality.verdict import Verdict
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 from brushloop.sessions.remarks import remarks_of
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
-"""Margin around the cell in the picture that goes with a question."""
+"""Margin around the patch in the picture that goes with a question."""
 
 
-async def decide(context: StepContext, verdict: Verdict | None, image: Gray, cell: Cell) -> tuple[bool, bool]:
+async def decide(context: StepContext, verdict: Verdict | None, image: Gray, patch: Patch) -> tuple[bool, bool]:
     """Return (kept, retake) of the stroke in `image`, by the operator's request if there is one, else the verdict."""
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if run.requests.take(OperatorRequest.RETAKE):
@@ -31,10 +31,10 @@ async def decide(context: StepContext, verdict: Verdict | None, image: Gray, cel
         return False, False
     if verdict is None or verdict.passed:
         return True, False
-    return await _after_failure(context, verdict, image, cell)
+    return await _after_failure(context, verdict, image, patch)
 
 
-async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, cell: Cell) -> tuple[bool, bool]:
+async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, patch: Patch) -> tuple[bool, bool]:
     """Retake while takes are left, then let a person decide; without a screen, leave the stroke out.
 
     Raises `NeedsOperator` if the screen went away: the step stays open, and is done and asked about again on resume.
@@ -45,7 +45,7 @@ async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, ce
         return False, True
     stroke_id = str(context.step.params["stroke_id"])
     text = f"{stroke_id}, take {take}: {verdict.reason}"
-    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, cell))
+    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, patch))
     if not run.asker.attended:
         run.progress.log(f"{stroke_id}: left out", warning=True)
         return False, False
@@ -54,12 +54,12 @@ async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, ce
     return answer == KEEP.key, answer == AGAIN.key
 
 
-def _cut_out(run: RunContext, image: Gray, cell: Cell) -> Gray:
-    """The cell and a margin around it."""
+def _cut_out(run: RunContext, image: Gray, patch: Patch) -> Gray:
+    """The patch and a margin around it."""
     plane = run.memory.image_plane
     assert plane is not None
-    x_mm, y_mm, width_mm, height_mm = cell.rect_mm
-    corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + width_mm) for y in (y_mm, y_mm + height_mm)])
+    x_mm, y_mm, size_x_mm, size_y_mm = patch.rect_mm
+    corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm)])
     seen = corners @ np.linalg.inv(plane.image_to_paper).T
     px = seen[:, :2] / seen[:, 2:]
     (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)

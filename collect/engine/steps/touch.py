@@ -99,12 +99,12 @@ async def _visited(run: RunContext, point: tuple[float, float]) -> float:
 
 async def check_rig(context: StepContext) -> Result:
     """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
-    run, cell = context.run, context.cell
-    assert cell is not None
-    cells = (cell, *context.more_cells)
-    places_mm = triangle_on(cells, run.rig.config.self_check)
+    run, patch = context.run, context.patch
+    assert patch is not None
+    patches = (patch, *context.more_patches)
+    places_mm = triangle_on(patches, run.rig.config.self_check)
     checked = await context.guard.guarded(self_check(run.rig, _Effector(context), places_mm, run.procedures.plane))
-    marked = {"sheet": run.store.state.sheet, "cell": cell.index, "cells": [one.index for one in cells]}
+    marked = {"sheet": run.store.state.sheet, "patch": patch.index, "patches": [one.index for one in patches]}
     return {**checked.as_dict(), **marked}
 
 

@@ -43,15 +43,15 @@ class SheetFit:
     origin_sigma_mm: float
     """Standard error of the origin in each axis, at worst."""
     yaw_sigma_deg: float
-    height_sigma_mm: float
+    depth_sigma_mm: float
     """Standard error of the plane's height in the middle of the sheet."""
     scale: float
     """Touched over printed size of the board."""
 
 
-def corners_of(width_mm: float, height_mm: float) -> Floats:
+def corners_of(size_x_mm: float, size_y_mm: float) -> Floats:
     """(4, 2) corners of a rectangle in the order of `CORNERS`, from its lower left one."""
-    return np.array([[0.0, 0.0], [width_mm, 0.0], [width_mm, height_mm], [0.0, height_mm]])
+    return np.array([[0.0, 0.0], [size_x_mm, 0.0], [size_x_mm, size_y_mm], [0.0, size_y_mm]])
 
 
 def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
@@ -70,9 +70,9 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
     distances = _distances(printed * scale, touched)
     if max(distances) > WORST_CORNER_MM:
         listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, distances, strict=True))
-        width_mm, height_mm = size_mm(spec)
+        size_x_mm, size_y_mm = size_mm(spec)
         raise CannotTeach(
-            f"the corners of the board do not form its rectangle of {width_mm:g} x {height_mm:g} mm (off by, in mm: "
+            f"the corners of the board do not form its rectangle of {size_x_mm:g} x {size_y_mm:g} mm (off by, in mm: "
             f"{listed}).",
             "Touch the corner that is off again, or correct the description of the print in the camera step.",
         )
@@ -137,7 +137,7 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
     plane = fit_plane([(float(x), float(y), float(z)) for x, y, z in level])
     names = [f"board {CORNERS[k]}" for k in bk] + [f"sheet {CORNERS[k]}" for k in sk]
     lengths = [float(v) for v in np.linalg.norm(residuals, axis=1)]
-    height_mm = max(math.sqrt(sum(r * r for r in plane.residuals_mm) / max(len(points) - 3, 1)), HAND_MM)
+    above_mm = max(math.sqrt(sum(r * r for r in plane.residuals_mm) / max(len(points) - 3, 1)), HAND_MM)
     return SheetFit(
         (float(origin[0]), float(origin[1])),
         math.degrees(math.remainder(yaw, math.tau)),
@@ -147,7 +147,7 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
         {f"{name} {number}": length for number, (name, length) in enumerate(zip(names, lengths, strict=True), 1)},
         math.sqrt(float(np.diag(origin_spread).max())),
         math.degrees(math.sqrt(float(spread[0, 0]))),
-        height_mm / math.sqrt(len(points)),
+        above_mm / math.sqrt(len(points)),
         _scale(printed[bk], b),
     )
 

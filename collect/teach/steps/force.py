@@ -109,10 +109,10 @@ class ForceStep(Step):
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """How zero touch is done: by force, or by jogging, at four points."""
-        width_mm, height_mm = notebook.numbers("paper.size_mm")
+        size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
         sensor = bool(notebook.get("aside.bus"))
-        middle = np.array([width_mm, height_mm]) / 2.0
-        points = middle + (corners_of(width_mm, height_mm) - middle) * (1.0 - INSET_MM / middle)
+        middle = np.array([size_x_mm, size_y_mm]) / 2.0
+        points = middle + (corners_of(size_x_mm, size_y_mm) - middle) * (1.0 - INSET_MM / middle)
 
         def taught(value: str | float | list[list[float]], how: str) -> Taught:
             return Taught(value=value, how=how, at=now_utc(), step="force")

@@ -191,8 +191,8 @@ def paper_of(notebook: Notebook) -> PaperConfig:
 def sheet_heights(notebook: Notebook) -> list[float]:
     """Touch height at the four corners of the sheet, in the base frame."""
     z0_mm, slope_x, slope_y = notebook.numbers("aside.plane")
-    width_mm, height_mm = notebook.numbers("paper.size_mm")
-    return [z0_mm + slope_x * x + slope_y * y for x, y in corners_of(width_mm, height_mm).tolist()]
+    size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
+    return [z0_mm + slope_x * x + slope_y * y for x, y in corners_of(size_x_mm, size_y_mm).tolist()]
 
 
 def sheet_corners(notebook: Notebook) -> list[Point]:

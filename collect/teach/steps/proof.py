@@ -49,7 +49,7 @@ class ProofStep(Step):
         rig = rig_of(day.notebook, day.rig_path)
         await self._doctor(day, rig)
         depth_mm = min(PRESS_SHARE * rig.brush.max_depth_mm, DEEPEST_DRY_MM)
-        protocol = f'kind = "grid"\nheights_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = {PRESSES}\n'
+        protocol = f'kind = "grid"\ndepths_mm = [{depth_mm:g}]\ntilts_deg = [0.0]\nrepeats = {PRESSES}\n'
         await day.may_move(f"Dry run, {ABOVE_MM:g} mm above the sheet")
         with tempfile.TemporaryDirectory(prefix="brushloop-proof-") as folder:
             await self._run(day, Path(folder), protocol, dry=True)
@@ -185,7 +185,7 @@ class Proven:
     passed: int
     """Presses that count."""
     again: int
-    """Presses that failed a quality check and were repeated on another cell."""
+    """Presses that failed a quality check and were repeated on another patch."""
 
 
 def read_proof(session: Path) -> Proven:

@@ -42,7 +42,7 @@ EASY_MM = (250.0, 700.0)
 """Distances from the foot of the arm at which it holds a brush upright without being folded up or stretched out."""
 VIEW, SEEN = "sheet-view", "aside.sheet_seen"
 INSET_MM = 2.0
-"""Distance of the touch point from the sheet's edges: beside every cell."""
+"""Distance of the touch point from the sheet's edges: beside every patch."""
 
 
 class SheetStep(Step):
@@ -113,16 +113,16 @@ class SheetStep(Step):
             "paper.origin_mm": taught(list(fit.origin_mm), "mm", fit.origin_sigma_mm),
             "paper.yaw_deg": taught(fit.yaw_deg, "deg", fit.yaw_sigma_deg),
             "paper.size_mm": taught(list(fit.size_mm), "mm", fit.origin_sigma_mm),
-            "paper.touch_point_mm": taught(list(point), "mm", None, "beside every cell", ""),
+            "paper.touch_point_mm": taught(list(point), "mm", None, "beside every patch", ""),
             "paper.touch_z_mm": taught(
                 fit.plane.plane.touch_z_mm(*point),
                 "mm",
-                fit.height_sigma_mm,
+                fit.depth_sigma_mm,
                 more=f"the sheet leans by {fit.plane.plane.slope_deg:.2f} deg; not yet measured by touch",
             ),
             "board.origin_mm": taught(list(fit.board_origin_mm), "mm", fit.origin_sigma_mm),
             "aside.plane": taught(
-                [fit.plane.plane.z0_mm, fit.plane.plane.slope_x, fit.plane.plane.slope_y], "mm", fit.height_sigma_mm
+                [fit.plane.plane.z0_mm, fit.plane.plane.slope_x, fit.plane.plane.slope_y], "mm", fit.depth_sigma_mm
             ),
         }
 

@@ -118,10 +118,10 @@ PX_PER_MM = 10.0
 class Paper:
     """Ink per area on a sheet of (width, height) mm; row 0 is the far edge (largest y), as a camera sees it."""
 
-    def __init__(self, width_mm: float, height_mm: float) -> None:
-        self.width_mm = width_mm
-        self.height_mm = height_mm
-        shape = (round(height_mm * PX_PER_MM), round(width_mm * PX_PER_MM))
+    def __init__(self, size_x_mm: float, size_y_mm: float) -> None:
+        self.size_x_mm = size_x_mm
+        self.size_y_mm = size_y_mm
+        shape = (round(size_y_mm * PX_PER_MM), round(size_x_mm * PX_PER_MM))
         self._density: NDArray[np.float32] = np.zeros(shape, np.float32)
         self._coming: deque[tuple[Callable[[], Footprint], float, float, float]] = deque()
         self._lock = threading.Lock()
@@ -161,7 +161,7 @@ class Paper:
         cos, sin = scale * math.cos(phi), scale * math.sin(phi)
         # Rows run against y, so a counter-clockwise heading is clockwise in row and column.
         linear = np.array([[cos, sin], [-sin, cos]])
-        anchor = np.array([x_mm * PX_PER_MM, (self.height_mm - y_mm) * PX_PER_MM])
+        anchor = np.array([x_mm * PX_PER_MM, (self.size_y_mm - y_mm) * PX_PER_MM])
         # cv2 puts pixel centres on integers, our coordinates put them on halves.
         half = np.array([0.5, 0.5])
         offset = anchor - linear @ (np.array(footprint.origin_px) - half) - half

@@ -35,8 +35,8 @@ def held_picture(
     board: cv2.aruco.CharucoBoard, table: Table, view: View, optics: Optics, held: Held
 ) -> NDArray[np.float32]:
     """(h, w) float32 gray levels of the board in hand, under the light of the table."""
-    width_mm, height_mm = (n * table.board_square_mm for n in table.board_squares)
-    inner = board.generateImage((round(width_mm * PX_PER_MM), round(height_mm * PX_PER_MM)))
+    size_x_mm, size_y_mm = (n * table.board_square_mm for n in table.board_squares)
+    inner = board.generateImage((round(size_x_mm * PX_PER_MM), round(size_y_mm * PX_PER_MM)))
     edge = round(EDGE_MM * PX_PER_MM)
     columns, rows = inner.shape[1] + 2 * edge, inner.shape[0] + 2 * edge
     paper = np.full((rows, columns), WHITE, np.uint8)

@@ -86,9 +86,9 @@ class Aims:
         facts, rng = self._facts(), self._drawn("hold-board", index, "")
         view, table = facts.config.view, facts.config.table
         pose = HELD[index] if index < len(HELD) else _any_way(rng)
-        width_mm, height_mm = board_size_mm(table)
+        size_x_mm, size_y_mm = board_size_mm(table)
         high = view.height_px / view.width_px
-        longest = max(width_mm, height_mm / high) if abs(pose.turn_deg) < 45.0 else max(height_mm, width_mm / high)
+        longest = max(size_x_mm, size_y_mm / high) if abs(pose.turn_deg) < 45.0 else max(size_y_mm, size_x_mm / high)
         across_mm = longest / float(rng.uniform(0.85, 0.95))
         toward = math.radians(pose.toward_deg + float(rng.uniform(-15, 15)))
         slant_deg = pose.slant_deg + float(rng.uniform(-3, 3))

@@ -16,20 +16,20 @@ CORNERS = ("lower left", "lower right", "upper right", "upper left")
 """Of the board and of the sheet, with the print upright before the reader."""
 
 
-def in_base(table: Table, x_mm: float, y_mm: float, height_mm: float = 0.0) -> Place:
-    """A point of the paper frame, `height_mm` above the sheet's plane."""
+def in_base(table: Table, x_mm: float, y_mm: float, above_mm: float = 0.0) -> Place:
+    """A point of the paper frame, `above_mm` above the sheet's plane."""
     yaw = math.radians(table.yaw_deg)
     return (
         table.origin_mm[0] + math.cos(yaw) * x_mm - math.sin(yaw) * y_mm,
         table.origin_mm[1] + math.sin(yaw) * x_mm + math.cos(yaw) * y_mm,
-        table.surface_z_mm(x_mm, y_mm) + height_mm,
+        table.surface_z_mm(x_mm, y_mm) + above_mm,
     )
 
 
-def over_sheet(table: Table, height_mm: float = 0.0) -> Place:
+def over_sheet(table: Table, above_mm: float = 0.0) -> Place:
     """The middle of the sheet, or a place above it."""
     width, height = table.sheet_mm
-    return in_base(table, width / 2, height / 2, height_mm)
+    return in_base(table, width / 2, height / 2, above_mm)
 
 
 def board_size_mm(table: Table) -> tuple[float, float]:

@@ -76,7 +76,7 @@ def collected(photographed: Photographed, folder: Path, shot: Shot, optics: Lens
             stroke_id=f"s{k}",
             kind="press",
             still=0,
-            height_mm=13.0,
+            depth_mm=13.0,
             tilt_deg=5.0,
             anchor_mm=anchor,
             cell_mm=(anchor[0] - 30.0, anchor[1] - 12.0, 40.0, 24.0),

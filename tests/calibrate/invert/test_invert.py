@@ -31,17 +31,17 @@ PX = 12.0  # of the pretended scan, per mm
 START = (34.0, 20.0)  # mm from the left and top edge
 
 
-def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
+def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
     """A 50 x 40 mm photograph at 12 px/mm of CCD-BSM's own mark, touched at START, ferrule to the right."""
-    origin = (START[0] + height_mm * math.tan(math.radians(tilt_deg)), START[1])
-    ink = coverage_at(ccdbsm(Brush(), height_mm, tilt_deg), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
+    origin = (START[0] + depth_mm * math.tan(math.radians(tilt_deg)), START[1])
+    ink = coverage_at(ccdbsm(Brush(), depth_mm, tilt_deg), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 
 def session(folder: Path, *, kind: str = "press") -> Path:
     photos = folder / "photos"
     photos.mkdir()
-    rows = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+    rows = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(PRESSES):
         cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt))
         rows.append(f"p{k}.png,{height},{tilt},{PX},{START[0] * PX},{START[1] * PX}")
@@ -56,18 +56,18 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
     assert made.refused == []
     for row, (height, tilt) in zip(made.rows, PRESSES, strict=True):
         # The preprocessing's own threshold is what is left: .03 mm of depth.
-        assert row.height_mm == pytest.approx(height, abs=0.08)
+        assert row.depth_mm == pytest.approx(height, abs=0.08)
         assert row.tilt_deg == pytest.approx(tilt, abs=0.6)
-        assert 0 < row.height_sd_mm < 0.2
+        assert 0 < row.depth_sd_mm < 0.2
     protocol = load_protocol(write_inversion(made, tmp_path / "out" / "recovered.csv"))
     assert isinstance(protocol, ReplayConfig)
     assert protocol.of == "shots"
     assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
-    assert protocol.presses[1].height_mm == pytest.approx(made.rows[1].height_mm, abs=1e-3)
-    assert "height_sd_mm" in protocol.ignored_columns
+    assert protocol.presses[1].depth_mm == pytest.approx(made.rows[1].depth_mm, abs=1e-3)
+    assert "depth_sd_mm" in protocol.ignored_columns
     with (tmp_path / "out" / "recovered.csv").open() as file:
         first = next(csv.DictReader(file))
-    assert first["commanded_height_mm"] == "12"
+    assert first["commanded_depth_mm"] == "12"
     assert first["source"] == "imported photographs"
 
 
@@ -85,7 +85,7 @@ def test_another_model_inverts_the_same_session(tmp_path: Path) -> None:
     made = invert_recording(tmp_path / "sessions" / "shots", Settings(model="ellipse"), None)
     # The ellipse is regressed on CCD-BSM's marks: it has their length, so their depth, nearly.
     for row, (height, _) in zip(made.rows, PRESSES, strict=True):
-        assert row.height_mm == pytest.approx(height, abs=3.0)
+        assert row.depth_mm == pytest.approx(height, abs=3.0)
         assert row.rms > 0.05
 
 

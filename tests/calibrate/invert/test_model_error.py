@@ -73,7 +73,7 @@ def test_an_interval_is_cut_to_what_was_commanded(value: float, sd: float, vague
 
 def test_alpha_is_less_certain_where_the_brush_is_pressed_less() -> None:
     made = with_model_error(rows(CELLS, 0.3, 2.0))
-    shallow, deep = ([r.tilt_sd_deg or 0.0 for r in made if r.commanded_height_mm == h] for h in (11.0, 20.0))
+    shallow, deep = ([r.tilt_sd_deg or 0.0 for r in made if r.commanded_depth_mm == h] for h in (11.0, 20.0))
     assert np.mean(shallow) == pytest.approx(np.mean(deep) * 20.0 / 11.0, rel=0.1)
 
 

@@ -25,10 +25,10 @@ ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
 STRICT = (Alignment.MM, Tone.BINARY)
 
 
-def photograph(height_mm: float, tilt_deg: float) -> np.ndarray:
+def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
     """100 x 80 mm at 10 px/mm, straight from above, with the model's mark at the anchor."""
-    axis_x = ANCHOR[0] + height_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage_at(MODEL.profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    axis_x = ANCHOR[0] + depth_mm * math.tan(math.radians(tilt_deg))
+    mark = coverage_at(MODEL.profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
     return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
 
 
@@ -37,7 +37,7 @@ def capture(name: str, shown: tuple[float, float], asked: tuple[float, float], o
         stroke_id=name,
         kind="press",
         still=0,
-        height_mm=asked[0],
+        depth_mm=asked[0],
         tilt_deg=asked[1],
         cell_mm=CELL,
         anchor_mm=ANCHOR,

@@ -18,9 +18,9 @@ TOUCH = (380, 150)
 MakeSession = Callable[..., Path]
 
 
-def photograph(height_mm: float, tilt_deg: float, seed: int, brush: Brush) -> np.ndarray:
+def photograph(depth_mm: float, tilt_deg: float, seed: int, brush: Brush) -> np.ndarray:
     """A press on white paper at 10 px/mm, its tip touching at TOUCH."""
-    mark = brush.press(height_mm, tilt_deg, ink_load=1.0, press_seed=seed)
+    mark = brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=seed)
     page = np.full((300, 480), 235, np.uint8)
     rows, columns = mark.density.shape
     left, top = TOUCH[0] - round(mark.origin_px[0]), TOUCH[1] - round(mark.origin_px[1])
@@ -36,7 +36,7 @@ def make_session() -> MakeSession:
         photos = under / f"{name}-photos"
         photos.mkdir(parents=True)
         brush = Brush(BrushSpec())
-        lines = ["file,height_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
+        lines = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
         for k, (height, tilt) in enumerate(CELLS * repeats):
             file = f"{k:03d}.png"
             cv2.imwrite(str(photos / file), photograph(height, tilt, seed + k, brush))

@@ -34,7 +34,7 @@ checkpoint_every = 125
 picture_every = 250
 learning_rate = 0.01
 [target]
-ranges = { height_mm = [11, 20], tilt_deg = [0, 10] }
+ranges = { depth_mm = [11, 20], tilt_deg = [0, 10] }
 px_mm = 1.0
 size_px = 32
 placement = "PLACEMENT"

@@ -26,19 +26,19 @@ CELL = (30.0, 28.0, 40.0, 24.0)
 PX = 10.0  # of the pretended camera, per mm
 
 
-def drawn(height_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
+def drawn(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
     """A 100 x 80 mm page, photographed straight from above at 10 px/mm, with a model's mark at the anchor."""
-    axis_x = ANCHOR[0] + height_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage_at(MODELS[model].profile(height_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    axis_x = ANCHOR[0] + depth_mm * math.tan(math.radians(tilt_deg))
+    mark = coverage_at(MODELS[model].profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
     return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
 
 
-def capture(stroke_id: str, image: np.ndarray, height_mm: float, tilt_deg: float) -> Capture:
+def capture(stroke_id: str, image: np.ndarray, depth_mm: float, tilt_deg: float) -> Capture:
     stroke = Stroke(
         stroke_id=stroke_id,
         kind="press",
         still=0,
-        height_mm=height_mm,
+        depth_mm=depth_mm,
         tilt_deg=tilt_deg,
         cell_mm=CELL,
         anchor_mm=ANCHOR,
@@ -65,7 +65,7 @@ def validate(captures: list[Capture]) -> tuple[list[Press], list[Score]]:
     refused = [press for press in presses if press.refused]
     if not used:
         return refused, []
-    cell = used[0].height_mm, used[0].tilt_deg
+    cell = used[0].depth_mm, used[0].tilt_deg
     pixels = tuple(press.pixels for press in used)
     predicted_by = tuple(tuple(k for k in range(len(used)) if k != n) for n in range(len(used)))
     predictions = tuple(pack(simulated_pixels(model, *cell, Field())) for model in MODELS.values())
@@ -82,9 +82,9 @@ def validate(captures: list[Capture]) -> tuple[list[Press], list[Score]]:
 
 
 @pytest.mark.parametrize("model", ["ccd-bsm", "ellipse", "line"])
-@pytest.mark.parametrize(("height_mm", "tilt_deg"), [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
-def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, height_mm: float, tilt_deg: float) -> None:
-    refused, scores = validate([capture("one", drawn(height_mm, tilt_deg, model), height_mm, tilt_deg)])
+@pytest.mark.parametrize(("depth_mm", "tilt_deg"), [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
+def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, depth_mm: float, tilt_deg: float) -> None:
+    refused, scores = validate([capture("one", drawn(depth_mm, tilt_deg, model), depth_mm, tilt_deg)])
     assert refused == []
     for score in scores:
         if score.model == model and score.tone is Tone.BINARY:
@@ -93,10 +93,10 @@ def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, height_mm: floa
             assert score.csim < 0.98, score
 
 
-@pytest.mark.parametrize("height_mm", [11.0, 13.0, 15.0, 17.0, 20.0])
+@pytest.mark.parametrize("depth_mm", [11.0, 13.0, 15.0, 17.0, 20.0])
 @pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
-def test_nothing_is_lost_by_moving_a_stroke_to_the_middle(height_mm: float, tilt_deg: float) -> None:
-    refused, scores = validate([capture("one", drawn(height_mm, tilt_deg), height_mm, tilt_deg)])
+def test_nothing_is_lost_by_moving_a_stroke_to_the_middle(depth_mm: float, tilt_deg: float) -> None:
+    refused, scores = validate([capture("one", drawn(depth_mm, tilt_deg), depth_mm, tilt_deg)])
     [score] = [
         s for s in scores if s.model == "ccd-bsm" and s.alignment is Alignment.SIZE_NORMALISED and s.tone is Tone.BINARY
     ]
@@ -163,11 +163,11 @@ def test_best_shift_finds_a_shift_of_up_to_six_pixels_and_no_more() -> None:
 
 
 def test_the_field_holds_every_cell_of_the_grid() -> None:
-    for height_mm in (11.0, 13.0, 15.0, 17.0, 20.0):
+    for depth_mm in (11.0, 13.0, 15.0, 17.0, 20.0):
         for tilt_deg in (0.0, 5.0, 10.0):
-            image = simulated(MODELS["ccd-bsm"], height_mm, tilt_deg, Field())[Alignment.MM, Tone.GRAY]
+            image = simulated(MODELS["ccd-bsm"], depth_mm, tilt_deg, Field())[Alignment.MM, Tone.GRAY]
             edges = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
             assert edges.max() == 0.0
-            area_mm2 = float(MODELS["ccd-bsm"].profile(height_mm, tilt_deg).area_mm2[0])
+            area_mm2 = float(MODELS["ccd-bsm"].profile(depth_mm, tilt_deg).area_mm2[0])
             assert image.sum() * 0.3**2 == pytest.approx(area_mm2, rel=1e-5)
     assert cv2.countNonZero(image) > 0

@@ -39,12 +39,12 @@ def calibrated(photographed: Photographed, tmp_path_factory: pytest.TempPathFact
             stroke_id=f"s{k}",
             kind="press",
             still=0,
-            height_mm=height_mm,
+            depth_mm=depth_mm,
             tilt_deg=tilt_deg,
             anchor_mm=anchor,
             cell_mm=(anchor[0] - 30.0, anchor[1] - 12.0, 40.0, 24.0),
         )
-        for k, ((height_mm, tilt_deg), anchor) in enumerate(zip(PRESSED, shot.anchors_mm, strict=True))
+        for k, ((depth_mm, tilt_deg), anchor) in enumerate(zip(PRESSED, shot.anchors_mm, strict=True))
     ]
     folder = tmp_path_factory.mktemp("lab") / "grid-01"
     photographed(folder, shot.board, [shot.image], [(stroke, shot.image) for stroke in strokes])

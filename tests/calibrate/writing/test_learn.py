@@ -119,8 +119,8 @@ def test_a_correction_stays_within_reach(plan: PlanRecord) -> None:
     blob[0:20, 0:20] = 1.0
     made, _ = learned(session(plan, ink=blob), gain=1.5)
     [command], reach = arrays(made.figures[0].commanded), reach_of(BY)
-    assert command[:, 2].min() >= reach.height_mm[0]
-    assert command[:, 2].max() <= reach.height_mm[1]
+    assert command[:, 2].min() >= reach.depth_mm[0]
+    assert command[:, 2].max() <= reach.depth_mm[1]
     assert np.all((command[:, :2] >= 0.0) & (command[:, :2] <= SIDE_MM))
     assert np.all(np.linalg.norm(np.diff(command[:, :3], axis=0), axis=1) >= 1.0)
 

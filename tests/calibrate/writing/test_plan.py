@@ -47,7 +47,7 @@ def test_the_command_writes_a_protocol_and_a_picture(tmp_path: Path) -> None:
 
 
 def test_every_shipped_character_becomes_a_protocol_within_reach(tmp_path: Path) -> None:
-    reach = Reach(height_mm=(1.0, 5.0), tilt_deg=(0.0, 6.0))
+    reach = Reach(depth_mm=(1.0, 5.0), tilt_deg=(0.0, 6.0))
     figures = plan("字永", None, MODEL, Settings(reach=reach, steps=2))
     protocol = load_protocol(write_plan(figures, Settings(reach=reach), BY, "CCD-BSM", 1, tmp_path))
     assert isinstance(protocol, WriteConfig)
@@ -129,8 +129,8 @@ def test_with_a_drag_fit_the_plan_makes_up_for_the_lag(tmp_path: Path) -> None:
         (("no.csv",), "no.csv: no such file"),
         (("字", "--tilt-range", "0", "45"), "tilts end at 30 deg"),
         (("字", "--tilt", "12"), "--tilt: 12 deg is outside 0 to 10"),
-        (("字", "--height-range", "5", "5"), "height_mm = (5, 5)"),
-        (("字", "--height-range", "1", "60"), "height_mm = 60 is outside"),
+        (("字", "--depth-range", "5", "5"), "depth_mm = (5, 5)"),
+        (("字", "--depth-range", "1", "60"), "depth_mm = 60 is outside"),
         (("字", "--model", "x"), "unknown stroke model 'x'"),
     ],
 )

@@ -21,7 +21,7 @@ from tests.waiting import wait_until
 if TYPE_CHECKING:
     from tests.collect.chains.conftest import Bench
 
-GRID = 'kind = "grid"\nheights_mm = [11.0, 15.0, 20.0]\ntilts_deg = [0.0, 8.0]\nrepeats = 1\n'
+GRID = 'kind = "grid"\ndepths_mm = [11.0, 15.0, 20.0]\ntilts_deg = [0.0, 8.0]\nrepeats = 1\n'
 """Six presses: as few as tell depth and tilt to the fit."""
 
 
@@ -73,7 +73,7 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     rows = read_loop(session / "loop").table_1
     assert {row.what for row in rows} == {"re-pressed", "recovered, simulated"}
     assert all(row.n == 6 and row.source == "loopback rig" for row in rows)
-    # No cell was pressed twice: the brush's repeatability is not known, and nothing is claimed.
+    # No patch was pressed twice: the brush's repeatability is not known, and nothing is claimed.
     assert report["verdicts"] == []
     with (session / "loop" / "loop.csv").open(encoding="utf-8") as file:
         single = [row for row in csv.DictReader(file) if row["what"] == "re-pressed" and row["tone"] == "binary"]

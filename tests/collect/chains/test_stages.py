@@ -27,7 +27,7 @@ SETTINGS = Settings(
     original="grid-01",
     original_sha256="ab",
     fit="cd",
-    height_range_mm=(2.0, 22.0),
+    depth_range_mm=(2.0, 22.0),
     tilt_range_deg=(0.0, 15.0),
     repeats=1,
     seed=1,
@@ -40,7 +40,7 @@ def test_a_loop_goes_on_with_what_it_was_begun_with_and_nothing_else(tmp_path: P
     keep_settings(SETTINGS, folder)
     keep_settings(SETTINGS, folder)
     assert begun_with(folder) == SETTINGS
-    for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("height_range_mm", (2.0, 20.0)), ("presses", 5)):
+    for name, value in (("fit", "ef"), ("original_sha256", "xy"), ("depth_range_mm", (2.0, 20.0)), ("presses", 5)):
         with pytest.raises(ConfigError, match=f"{name}: this loop was begun with"):
             keep_settings(SETTINGS.model_copy(update={name: value}), folder)
     (folder / FILE).write_text("{}")
@@ -64,7 +64,7 @@ def test_a_fit_that_does_not_describe_the_brush_is_not_pressed(tmp_path: Path) -
 def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path: Path) -> None:
     """The same protocol was pressed with two inks: each rig.toml finds its own session, and a third ink finds none."""
     protocol = tmp_path / "protocol.toml"
-    protocol.write_text('kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n')
+    protocol.write_text('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 1\nseed = 1\n')
     rigs = {ink: tmp_path / f"{ink}.toml" for ink in ("sumi", "walnut", "red")}
     text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
     for ink, path in rigs.items():

@@ -29,8 +29,8 @@ async def press_for_ever(path: Path, seed: int) -> None:
     sys.stdout.flush()
     sheet = Sheet(config.paper)
     for number in itertools.count():
-        cell = sheet.cell(number % sheet.capacity)
-        await procedures.press(cell, rng.uniform(5.0, 20.0), rng.uniform(0.0, 14.0), rng.choice([0.0, 0.2, 0.5]))
+        patch = sheet.patch(number % sheet.capacity)
+        await procedures.press(patch, rng.uniform(5.0, 20.0), rng.uniform(0.0, 14.0), rng.choice([0.0, 0.2, 0.5]))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from brushloop.collect.errors import StepVoid
 from brushloop.collect.motion.procedures import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import connected
-from brushloop.collect.rig.paper import Cell, Sheet, to_base
+from brushloop.collect.rig.paper import Patch, Sheet, to_base
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import ArmMoved, PathDisturbed
 from brushloop.drivers.geometry import brush_pose, to_wire
@@ -113,11 +113,11 @@ async def pressed(lab: Lab, seed: int, presses: int) -> Counter[str]:
         procedures = Procedures(rig)
         await lifted(procedures)
         for number in range(presses):
-            cell: Cell = sheet.cell(number % sheet.capacity)
-            intruder.begin(to_base(config.paper, *cell.anchor_mm))
+            patch: Patch = sheet.patch(number % sheet.capacity)
+            intruder.begin(to_base(config.paper, *patch.anchor_mm))
             named, counted = False, False
             try:
-                await procedures.press(cell, DEPTH_MM, 0.0, 0.2)
+                await procedures.press(patch, DEPTH_MM, 0.0, 0.2)
                 counted = True
                 await rig.robot.confirm()  # as a run does before its next step
             except (PathDisturbed, ArmMoved) as error:

@@ -46,8 +46,8 @@ def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_c
     assert finished.items() <= {(line["file"], line["sha256"]) for line in replay(folder / JOURNAL_NAME).segments}
     assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 2
     begun = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == "begin"]
-    cells = [line["cell"] for line in begun if line["cell"] is not None]
-    assert len(cells) == len(set(cells))
+    patches = [line["patch"] for line in begun if line["patch"] is not None]
+    assert len(patches) == len(set(patches))
     assert verify_session(folder).sound
 
 

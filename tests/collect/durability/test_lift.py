@@ -85,7 +85,7 @@ def test_killed_with_the_brush_in_the_paper_it_lifts_by_itself(own_rig: OwnRig, 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
 def test_fifty_random_moments_of_presses(own_rig: OwnRig):
-    """A third at any moment, the way to the cell included; the others from the beginning of the descent on."""
+    """A third at any moment, the way to the patch included; the others from the beginning of the descent on."""
     rng, at, deep = random.Random(50), Counter[str](), 0
     for number in range(50):
         anywhere = number % 3 == 0

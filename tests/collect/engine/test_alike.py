@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from conftest import Lab
 
-LIST = 'kind = "list"\npresses = [{height_mm = 11.0}, {height_mm = 13.0}]\ndwell_s = 0.0\n'
+LIST = 'kind = "list"\npresses = [{depth_mm = 11.0}, {depth_mm = 13.0}]\ndwell_s = 0.0\n'
 FIGURE = (
     'kind = "write"\ncell_mm = [60.0, 60.0]\n[[figures]]\nname = "a"\n'
     "[[figures.strokes]]\npoints = [[15.0, 15.0, 5.0, 0.0, 0.0], [40.0, 15.0, 5.0, 0.0, 0.0]]\n"
@@ -151,7 +151,7 @@ def keys(protocol: Any) -> list[str]:
     try:
         while True:
             found.append(step.key)
-            step = generator.send({"sheet": 0, "cell": 1} if step.kind is StepKind.PRESS else {})
+            step = generator.send({"sheet": 0, "patch": 1} if step.kind is StepKind.PRESS else {})
     except StopIteration:
         return found
 

@@ -45,7 +45,7 @@ def test_a_whole_session_is_collected_merged_and_reported(collected: Collected) 
     recording = Recording(collected.folder)
     assert recording.header.source == "loopback rig"
     captures = list(recording.captures())
-    assert sorted((c.stroke.height_mm, c.stroke.tilt_deg) for c in captures) == [(11, 0), (11, 10), (15, 0), (15, 10)]
+    assert sorted((c.stroke.depth_mm, c.stroke.tilt_deg) for c in captures) == [(11, 0), (11, 10), (15, 0), (15, 10)]
     assert all(c.image().shape == (384, 512) for c in captures)
 
 
@@ -55,7 +55,7 @@ def test_the_arm_presses_what_the_protocol_says_where_the_cell_lies(collected: C
     strokes = {c.stroke.still: c.stroke for c in Recording(collected.folder).captures()}
     pressed = [p for p in collected.lab.rig.world.presses if p.depth_mm > 1.0]
     for press, stroke in zip(pressed, (strokes[k] for k in sorted(strokes)), strict=True):
-        assert stroke.height_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
+        assert stroke.depth_mm == pytest.approx(press.depth_mm + 0.03, abs=0.01)
         assert stroke.tilt_deg == pytest.approx(press.tilt_deg, abs=0.01)
         assert stroke.anchor_mm == pytest.approx((press.x_mm, press.y_mm), abs=0.05)
         assert press.heading_deg == pytest.approx(0.0, abs=0.01)
@@ -84,8 +84,8 @@ def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab)
     assert state.voids >= 1
     ids = [c.stroke.stroke_id for c in Recording(folder).captures()]
     assert len(ids) == len(set(ids)) == 2
-    # The cut press burnt its cell: three presses (one of them cut) touched three places.
-    assert len(state.used_cells) == 3
+    # The cut press burnt its patch: three presses (one of them cut) touched three places.
+    assert len(state.used_patches) == 3
 
 
 def test_stop_before_anything_has_moved(lab: Lab) -> None:
@@ -138,7 +138,7 @@ def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
     run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
 
     lab.write_protocol(heights="[11.0, 16.0]")
-    with pytest.raises(ConfigError, match=r"(?s)protocol.toml: heights_mm: \[11.0, 15.0\] -> \[11.0, 16.0\]\n.*--new"):
+    with pytest.raises(ConfigError, match=r"(?s)protocol.toml: depths_mm: \[11.0, 15.0\] -> \[11.0, 16.0\]\n.*--new"):
         lab.engine()
     with pytest.raises(ConfigError, match="--sheet 1"):
         lab.engine(new=True)
@@ -149,7 +149,7 @@ def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
 def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None:
     text = (lab.folder / "rig.toml").read_text().replace("cell_mm = [40.0, 24.0]", "cell_mm = [120.0, 80.0]")
     (lab.folder / "rig.toml").write_text(text)
-    lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0, 10.0]")  # 6 presses, 4 cells
+    lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0, 10.0]")  # 6 presses, 4 patches
 
     from brushloop.collect.errors import SheetFull
 
@@ -165,7 +165,7 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
     [folder] = lab.sessions.iterdir()
     assert sum(1 for _ in Recording(folder).captures()) == 6
     pressed = [
-        (line["sheet"], line["cell"]) for line in read_lines(folder / "journal.jsonl") if line.get("cell") is not None
+        (line["sheet"], line["patch"]) for line in read_lines(folder / "journal.jsonl") if line.get("patch") is not None
     ]
     assert len(pressed) == len(set(pressed))
     assert {sheet for sheet, _ in pressed} == {0, 1}

@@ -112,8 +112,8 @@ def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab
     assert lab.rig.world.motion.exec_id(lab.rig.world.clock.now_s()) == -1
 
 
-@pytest.mark.parametrize("height_mm", [24.0, 46.0])
-def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, tmp_path: Path, height_mm: float) -> None:
+@pytest.mark.parametrize("depth_mm", [24.0, 46.0])
+def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, tmp_path: Path, depth_mm: float) -> None:
     lab.write_protocol("[20.0]", "[0.0]")
     with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
-        Opening.load(tmp_path / "out", lab.folder / "rig.toml", lab.folder / "protocol.toml", dry_run_mm=height_mm)
+        Opening.load(tmp_path / "out", lab.folder / "rig.toml", lab.folder / "protocol.toml", dry_run_mm=depth_mm)

@@ -51,7 +51,7 @@ def answered(engine: Engine, answer: str, *, over: Callable[[Snapshot], bool]) -
 
 def used(lab: Lab) -> int:
     [folder] = lab.sessions.iterdir()
-    return len(replay(folder / "journal.jsonl").used_cells)
+    return len(replay(folder / "journal.jsonl").used_patches)
 
 
 def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
@@ -111,7 +111,7 @@ def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(s
     ink_ml = world.well.ml
     world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 67.0, 0.0)
     world.version += 1
-    with pytest.raises(NeedsOperator, match=r"cells? of sheet 1 that should be blank"):
+    with pytest.raises(NeedsOperator, match=r"patches? of sheet 1 that should be blank"):
         run(sharp_lab.engine())
     assert not [press for press in world.presses if press.depth_mm > 1.0]
     assert world.well.ml == ink_ml

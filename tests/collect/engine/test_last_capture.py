@@ -13,12 +13,12 @@ from brushloop.model.strokes import stroke_model
 BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}
 
 
-@pytest.mark.parametrize("height_mm", [11.0, 15.0, 20.0])
+@pytest.mark.parametrize("depth_mm", [11.0, 15.0, 20.0])
 @pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
-def test_the_mark_is_the_one_of_the_closed_form(height_mm: float, tilt_deg: float) -> None:
-    mark = published_mark(height_mm, tilt_deg, **BRUSH)
+def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float) -> None:
+    mark = published_mark(depth_mm, tilt_deg, **BRUSH)
     model = stroke_model("ccd-bsm", type("Brush", (), BRUSH)())
-    exact = simulated(model, height_mm, tilt_deg, Field())[Alignment.MM, Tone.BINARY] > 0.5
+    exact = simulated(model, depth_mm, tilt_deg, Field())[Alignment.MM, Tone.BINARY] > 0.5
     assert mark is not None
     assert exact.sum() > 100
     assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()

@@ -81,14 +81,14 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert made.lens is not None
     assert made.lens.source == f"lens file {lens.stem}"
 
-    # The self-check spent three cells far apart, and the press lies on a fourth.
+    # The self-check spent three patches far apart, and the press lies on a fourth.
     lines = read_lines(folder / "journal.jsonl")
     [check] = [line for line in lines if line["event"] == "done" and line["kind"] == "self_check"]
-    assert check["result"]["cells"] == [0, 5, 36]
+    assert check["result"]["patches"] == [0, 5, 36]
     assert max(abs(scale - 1.0) for scale in check["result"]["scale"]) < 0.005
     state = replay(folder / "journal.jsonl")
-    assert {(0, 0), (0, 5), (0, 36), (0, 1)} <= state.used_cells
-    assert len(state.used_cells) == 4 + 3 * state.voids
+    assert {(0, 0), (0, 5), (0, 36), (0, 1)} <= state.used_patches
+    assert len(state.used_patches) == 4 + 3 * state.voids
 
 
 def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
@@ -97,7 +97,7 @@ def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent
     with pytest.raises(StepError, match=r"the lens bends straight lines: .*camera\.lens_file"):
         wait_for_end(engine)
     [folder] = bent_lab.sessions.iterdir()
-    assert replay(folder / "journal.jsonl").used_cells == set()
+    assert replay(folder / "journal.jsonl").used_patches == set()
 
 
 def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:

@@ -40,7 +40,7 @@ def test_the_snapshot_says_for_how_long_no_pose_has_come(tmp_path: Path) -> None
     config, clock = load_rig(tmp_path / "rig.toml"), HandClock()
     robot = make_robot(config, clock, print)
     devices: Any = robot
-    engine = Engine(config, GridConfig(kind="grid", heights_mm=[11.0], tilts_deg=[0.0]), devices, clock)
+    engine = Engine(config, GridConfig(kind="grid", depths_mm=[11.0], tilts_deg=[0.0]), devices, clock)
     assert engine.snapshot().no_pose_s is None, "not connected yet"
     engine._rig = Rig(config, clock, robot, devices, WHO, WHO)
     assert engine.snapshot().no_pose_s is None, "no pose yet"

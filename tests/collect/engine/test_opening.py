@@ -25,7 +25,7 @@ from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
-GRID = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
+GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def test_both_files_and_the_environment_are_distinguished(lab: Path, monkeypatch
 
 
 def test_another_kind_of_protocol_fits_on_a_small_terminal(lab: Path) -> None:
-    Path("protocol.toml").write_text('kind = "list"\npresses = [{height_mm = 11.0}, {height_mm = 12.0}]\n')
+    Path("protocol.toml").write_text('kind = "list"\npresses = [{depth_mm = 11.0}, {depth_mm = 12.0}]\n')
     lines = refused()
     assert lines[1] == 'protocol.toml: kind: "grid" -> "list"'
     assert lines[-2].startswith("and ")
@@ -125,22 +125,22 @@ def test_another_kind_of_protocol_fits_on_a_small_terminal(lab: Path) -> None:
 
 
 def test_a_changed_row_of_a_side_file_is_named_by_its_number(lab: Path) -> None:
-    Path("p.csv").write_text("height_mm\n11\n12\n")
+    Path("p.csv").write_text("depth_mm\n11\n12\n")
     Path("protocol.toml").write_text('kind = "list"\nfile = "p.csv"\n')
     (lab / "sessions/grid-01").rename(lab / "elsewhere")
     begin()
-    Path("p.csv").write_text("height_mm\n11\n13\n")
+    Path("p.csv").write_text("depth_mm\n11\n13\n")
     assert refused()[1:] == [
-        "protocol.toml: presses.1.height_mm: 12.0 -> 13.0",
+        "protocol.toml: presses.1.depth_mm: 12.0 -> 13.0",
         "Go on with the old one: with the environment, and the files that it names, as they were then; "
         "or start a new session with --new.",
     ]
-    Path("p.csv").write_text("height_mm\n11\n")
+    Path("p.csv").write_text("depth_mm\n11\n")
     assert refused()[1] == "protocol.toml: presses: 2 items -> 1 item"
 
 
 def test_an_old_file_that_names_others_must_lie_beside_them(lab: Path) -> None:
-    Path("p.csv").write_text("height_mm\n11\n")
+    Path("p.csv").write_text("depth_mm\n11\n")
     Path("protocol.toml").write_text('kind = "list"\nfile = "p.csv"\n')
     (lab / "sessions/grid-01").rename(lab / "elsewhere")
     begin()

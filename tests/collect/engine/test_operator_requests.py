@@ -108,7 +108,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     now = again.snapshot()
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 1)
     assert len(lab.rig.world.presses) == 1
-    assert sum(cell.left_out for cell in now.grid) == 1
+    assert sum(patch.left_out for patch in now.grid) == 1
 
 
 def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(lab: Lab) -> None:
@@ -129,7 +129,7 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
 
     now = again.snapshot()
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 2, 2)
-    assert sum(cell.bad for cell in now.grid) == 1
+    assert sum(patch.bad for patch in now.grid) == 1
     assert len(lab.rig.world.presses) == 3 + now.voids
     captures = {capture.stroke.stroke_id: capture.bad for capture in Recording(folder).captures()}
     assert len(captures) == 3

@@ -27,7 +27,7 @@ FAST = 300.0
 CONFIRM_S = 1.2
 CAMERA_TIMEOUT_S = 15.0
 """Long enough for a busy machine; whoever waits for a time-out makes it short."""
-PROTOCOL = 'kind = "grid"\nheights_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\ndwell_s = 1.0\n'
+PROTOCOL = 'kind = "grid"\ndepths_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\ndwell_s = 1.0\n'
 
 
 class Gears(SimClock):

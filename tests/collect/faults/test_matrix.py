@@ -1,4 +1,4 @@
-"""Ten faults in ten phases of a session: each cell has its outcome, and in every one the arm ends at rest.
+"""Ten faults in ten phases of a session: each patch has its outcome, and in every one the arm ends at rest.
 
 A run is fast up to its phase. As that begins, simulated time slows to half real speed, and the fault strikes a
 move that is under way. docs/faults.md holds the same table.
@@ -142,7 +142,7 @@ TABLE: dict[str, list[Outcome]] = {
 }
 
 CUT: dict[str, tuple[list[str], str | None]] = {
-    # the steps that are done and kept, and the one whose attempt is void; a void press has burnt its cell
+    # the steps that are done and kept, and the one whose attempt is void; a void press has burnt its patch
     "connecting": ([], None),
     "powering": ([], None),
     "retreat": ([], None),
@@ -158,7 +158,7 @@ CUT: dict[str, tuple[list[str], str | None]] = {
 ALL_DONE = ["zero_touch", "board", "dip", "press", "capture"]
 
 
-def cells() -> list[Any]:
+def patches() -> list[Any]:
     """One phase of each fault by default, each phase once; the other ninety in the soak."""
     chosen: list[Any] = []
     for row, fault in enumerate(FAULTS):
@@ -239,7 +239,7 @@ def end_of(engine: Engine) -> BaseException | None:
     return None
 
 
-@pytest.mark.parametrize(("name", "phase"), cells())
+@pytest.mark.parametrize(("name", "phase"), patches())
 def test_a_fault_in_a_phase_ends_as_the_table_says(
     stage: Stage, monkeypatch: pytest.MonkeyPatch, name: str, phase: str
 ) -> None:
@@ -318,8 +318,8 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
         assert done == kept
         assert [line["kind"] for line in voids] == ([] if cut is None else [cut])
     for line in voids:
-        assert (line["cell"] is not None) is (line["kind"] == "press")
-        assert line["cell"] is None or (line["sheet"], line["cell"]) in state.used_cells, "burnt"
+        assert (line["patch"] is not None) is (line["kind"] == "press")
+        assert line["patch"] is None or (line["sheet"], line["patch"]) in state.used_patches, "burnt"
         assert (folder / f"{line['file']}.part").is_file(), "its evidence is kept"
     store = SessionStore(folder, None, time.time_ns)
     store.verify()
@@ -343,7 +343,7 @@ def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: s
     assert end_of(again) is None
     [folder] = stage.sessions.iterdir()
     state = replay(folder / "journal.jsonl")
-    assert len(state.used_cells) == 2, "the press that was cut lies on one, its repetition on another"
+    assert len(state.used_patches) == 2, "the press that was cut lies on one, its repetition on another"
 
 
 def test_the_documentation_holds_this_table() -> None:

@@ -51,9 +51,9 @@ def made(rig_file: Path, robot: MadeUpRobot) -> Procedures:
     return Procedures(Rig(config, nothing, cast(Any, robot), nothing, NOBODY, nothing))
 
 
-async def pressed(rig_file: Path, robot: MadeUpRobot, height_mm: float = 13.0, dwell_s: float = 0.2) -> float:
+async def pressed(rig_file: Path, robot: MadeUpRobot, depth_mm: float = 13.0, dwell_s: float = 0.2) -> float:
     procedures = made(rig_file, robot)
-    return await procedures.press(Sheet(load_rig(rig_file).paper).cell(7), height_mm, 10.0, dwell_s)
+    return await procedures.press(Sheet(load_rig(rig_file).paper).patch(7), depth_mm, 10.0, dwell_s)
 
 
 async def test_the_way_into_the_paper_and_out_again_is_handed_over_as_one(rig_file: Path):
@@ -66,12 +66,12 @@ async def test_the_way_into_the_paper_and_out_again_is_handed_over_as_one(rig_fi
     assert [line.least_s for line in robot.queued if line.least_s] == [0.2]
 
 
-@pytest.mark.parametrize(("height_mm", "dwell_s", "lasts_s"), [(13.0, 0.0, 0.1), (0.04, 2.0, 2.0)])
+@pytest.mark.parametrize(("depth_mm", "dwell_s", "lasts_s"), [(13.0, 0.0, 0.1), (0.04, 2.0, 2.0)])
 async def test_every_press_stays_long_enough_to_be_seen(
-    rig_file: Path, height_mm: float, dwell_s: float, lasts_s: float
+    rig_file: Path, depth_mm: float, dwell_s: float, lasts_s: float
 ):
     robot = MadeUpRobot()
-    assert await pressed(rig_file, robot, height_mm, dwell_s) == pytest.approx(height_mm)
+    assert await pressed(rig_file, robot, depth_mm, dwell_s) == pytest.approx(depth_mm)
     near, deep = (line for line in robot.queued if line.target.z_mm < load_rig(rig_file).paper.touch_z_mm - 1e-6)
     assert deep.least_s == lasts_s
     assert 0.0 < near.target.z_mm - deep.target.z_mm <= 0.051
@@ -92,7 +92,9 @@ async def test_a_depth_that_nobody_saw_is_not_believed(rig_file: Path, seen: sli
 
 def test_every_move_of_a_press_lies_within_the_limits_and_ends_high(rig_file: Path):
     config = load_rig(rig_file)
-    before, pressing = press_moves(config, made(rig_file, MadeUpRobot()).plane, Sheet(config.paper).cell(0), 20.0, 15.0)
+    before, pressing = press_moves(
+        config, made(rig_file, MadeUpRobot()).plane, Sheet(config.paper).patch(0), 20.0, 15.0
+    )
     for move in before + pressing:
         limits_of(config).check("robot", move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
     assert pressing[-1].target.z_mm == config.motion.safe_z_mm

@@ -62,14 +62,14 @@ def first_drawn(config: RigConfig) -> Drawn:
 
 async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None:
     drawn = first_drawn(desk.config)
-    cell = sheet_of(desk.config, load_protocol(WRITE)).cell(0)
-    depth_mm = await draw_stroke(desk.arm, desk.config, PLANE, cell, drawn.strokes[0], speed_mm_s=15.0, blend_mm=1.0)
+    patch = sheet_of(desk.config, load_protocol(WRITE)).patch(0)
+    depth_mm = await draw_stroke(desk.arm, desk.config, PLANE, patch, drawn.strokes[0], speed_mm_s=15.0, blend_mm=1.0)
     assert depth_mm == pytest.approx(drawn.strokes[0][0][2], abs=0.05)
     [drag] = desk.world.drags
     assert not desk.world.presses
-    for x_mm, y_mm, height_mm, *_ in drawn.strokes[0]:
+    for x_mm, y_mm, depth_mm, *_ in drawn.strokes[0]:
         near = min(
-            abs(w.x_mm - cell.x_mm - x_mm) + abs(w.y_mm - cell.y_mm - y_mm) + abs(w.depth_mm - height_mm)
+            abs(w.x_mm - patch.x_mm - x_mm) + abs(w.y_mm - patch.y_mm - y_mm) + abs(w.depth_mm - depth_mm)
             for w in drag.path
         )
         assert near < 0.8
@@ -78,25 +78,25 @@ async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None
 
 
 async def test_a_stroke_that_leaves_the_limits_somewhere_moves_nothing(desk: Desk) -> None:
-    cell = sheet_of(desk.config, load_protocol(WRITE)).cell(0)
+    patch = sheet_of(desk.config, load_protocol(WRITE)).patch(0)
     points = [*first_drawn(desk.config).strokes[0], (30.0, 30.0, 40.0, 0.0, 0.0)]
     with pytest.raises(LimitExceeded):
-        await draw_stroke(desk.arm, desk.config, PLANE, cell, points, speed_mm_s=15.0, blend_mm=1.0)
+        await draw_stroke(desk.arm, desk.config, PLANE, patch, points, speed_mm_s=15.0, blend_mm=1.0)
     assert desk.world.motion._next_id == 0
 
 
 def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
     """Points above the paper: a flying start. The brush is as far above it as asked when the way begins."""
-    cell = sheet_of(config, load_protocol(WRITE)).cell(0)
+    patch = sheet_of(config, load_protocol(WRITE)).patch(0)
     points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
-    moves = stroke_moves(config, PLANE, cell, points, 15.0)
+    moves = stroke_moves(config, PLANE, patch, points, 15.0)
     assert [move.target.z_mm for move in moves.down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
     assert [pose.z_mm for pose in moves.way.poses] == pytest.approx([115.0, 124.0])
 
 
 def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) -> None:
-    cell = sheet_of(config, load_protocol(WRITE)).cell(0)
-    [high, clear, *_] = stroke_moves(config, PLANE, cell, first_drawn(config).strokes[1], 15.0).down
+    patch = sheet_of(config, load_protocol(WRITE)).patch(0)
+    [high, clear, *_] = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0).down
     assert high.target.quaternion == pytest.approx(clear.target.quaternion)
 
 

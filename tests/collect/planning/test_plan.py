@@ -50,9 +50,9 @@ def grid_plan(tmp_path: Path) -> Plan:
 
 
 def test_the_grid_of_the_paper_needs_four_sheets_and_a_dip_for_each_press(grid_plan: Plan) -> None:
-    assert (len(grid_plan.placed), grid_plan.cells_per_sheet, grid_plan.sheets, grid_plan.dips) == (150, 42, 4, 150)
+    assert (len(grid_plan.placed), grid_plan.patches_per_sheet, grid_plan.sheets, grid_plan.dips) == (150, 42, 4, 150)
     assert [p.order for p in grid_plan.placed] == list(range(1, 151))
-    assert len({(p.sheet, p.cell) for p in grid_plan.placed}) == 150
+    assert len({(p.sheet, p.patch) for p in grid_plan.placed}) == 150
     assert list(grid_plan.sheet_changes) == [grid_plan.placed[i].stroke_id for i in (42, 84, 126)]
     assert sum(grid_plan.seconds_by_kind.values()) == pytest.approx(grid_plan.seconds)
     assert grid_plan.warnings == ()
@@ -74,7 +74,7 @@ def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
 
 def test_figures_take_cells_of_their_own_size_and_dip_between_strokes(tmp_path: Path) -> None:
     plan = make_plan(rig(tmp_path), example("protocol-write.toml"))
-    assert (plan.cells_per_sheet, plan.dips, plan.steps["dip"]) == (6, 4, 2)
+    assert (plan.patches_per_sheet, plan.dips, plan.steps["dip"]) == (6, 4, 2)
     assert all(p.drawn for p in plan.placed)
 
 
@@ -84,8 +84,8 @@ def test_a_calibration_marks_nothing_and_shows_where_it_touches(tmp_path: Path) 
     assert len(plan.touches_mm) == 6
 
 
-def figure(*points: list[float], cell: str = "[60.0, 60.0]") -> str:
-    return f'kind = "write"\ncell_mm = {cell}\n[[figures]]\nname = "a"\n[[figures.strokes]]\npoints = {list(points)}\n'
+def figure(*points: list[float], patch: str = "[60.0, 60.0]") -> str:
+    return f'kind = "write"\ncell_mm = {patch}\n[[figures]]\nname = "a"\n[[figures.strokes]]\npoints = {list(points)}\n'
 
 
 HERE, THERE = [9.0, 9.0, 9.0, 0.0, 0.0], [20.0, 9.0, 9.0, 0.0, 0.0]
@@ -97,15 +97,15 @@ NARROW = ("y_mm = [-260.0, 260.0]", "y_mm = [-260.0, 100.0]")
 @pytest.mark.parametrize(
     ("text", "change", "message"),
     [
-        ('kind = "list"\npresses = [{height_mm = 23.0}]\n', (), r"presses: 001-H23-a0-r01: 23 mm is deeper"),
+        ('kind = "list"\npresses = [{depth_mm = 23.0}]\n', (), r"presses: 001-H23-a0-r01: 23 mm is deeper"),
         (
-            'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", height_mm = 23.0, tilt_deg = 1.0}]\n',
+            'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 23.0, tilt_deg = 1.0}]\n',
             (),
             r"b~1: 23",
         ),
         (figure(HERE, TOO_DEEP), (), r"figures: a: 23 mm is deeper than brush.max_depth_mm = 22 mm"),
-        (figure(HERE, THERE, cell="[300.0, 60.0]"), (), r"protocol.toml: cell_mm: .* does not fit"),
-        (figure(HERE, TOO_TILTED), (), r"tilt = 20.000 deg is outside .*\(a-r01 on cell 0\)"),
+        (figure(HERE, THERE, patch="[300.0, 60.0]"), (), r"protocol.toml: cell_mm: .* does not fit"),
+        (figure(HERE, TOO_TILTED), (), r"tilt = 20.000 deg is outside .*\(a-r01 on patch 0\)"),
         (figure(NEAR_TOUCH, THERE), TOUCH, r"\[4.0, 26.0\] lies within 5 mm of a drawn point at \[3.0, 26.0\]"),
         ('kind = "calibration"\ntouches_mm = [[250.0, 9.0]]\n', (), r"touches_mm: \[250, 9\] lies off the sheet"),
         ('kind = "calibration"\ntouches_mm = [[240.0, 9.0]]\n', NARROW, r"y = 130.000 mm is outside .*\(touch\)"),
@@ -125,7 +125,7 @@ DEEP_TOUCH = MOTION, '\n[touch]\nmethod = "force"\ntravel_mm = 20.0\npoints_mm =
 DEEP_CHECK = MOTION, "\n[self_check]\nenabled = true\ndepth_mm = 10.0\n" + MOTION
 SOFT = "max_depth_mm = 22.0", "max_depth_mm = 9.5"
 FAR_POT = MOTION, "\n[ink.wash]\npot_mm = [360.0, 20.0]\ndip_z_mm = 125.0\nevery_dips = 2\n" + MOTION
-LISTED = 'kind = "list"\npresses = [{height_mm = 9.0}]\n'
+LISTED = 'kind = "list"\npresses = [{depth_mm = 9.0}]\n'
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ LISTED = 'kind = "list"\npresses = [{height_mm = 9.0}]\n'
     [
         (LISTED, (BY_JOG, ("260.0]\nz_mm", "100.0]\nz_mm")), r"y = 130.000 mm is outside .*\(zero_touch\)"),
         (LISTED, (DEEP_TOUCH,), r"z = 96\.\d+ mm is outside .*\(zero_touch\)"),
-        (LISTED, (DEEP_CHECK, SOFT), r"z = 110.030 mm is outside .*\(self_check on cell 0\)"),
+        (LISTED, (DEEP_CHECK, SOFT), r"z = 110.030 mm is outside .*\(self_check on patch 0\)"),
         (LISTED, (FAR_POT, ("260.0]\nz_mm", "240.0]\nz_mm")), r"y = 250.000 mm is outside .*\(dip\)"),
         (figure(HERE, THERE), (FAR_POT, ("260.0]\nz_mm", "240.0]\nz_mm")), r"y = 250.000 mm is outside .*\(dip\)"),
         (
@@ -169,7 +169,7 @@ def test_washes_are_counted_where_they_fall_also_within_a_figure(tmp_path: Path)
 def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
     config, wanted, plane = rig(tmp_path), example("protocol.toml"), PaperPlane(120.0, 0.01, -0.02)
     corners = [pose for pose, _, _ in all_poses(config, wanted, plane)]
-    everywhere = [pose for pose, _, _ in all_poses(config, wanted, plane, every_cell=True)]
+    everywhere = [pose for pose, _, _ in all_poses(config, wanted, plane, every_patch=True)]
     assert len(everywhere) > 8 * len(corners)
     for axis in range(3):
         for extreme in (min, max):
@@ -181,7 +181,7 @@ def test_the_outermost_cells_stand_for_all(tmp_path: Path) -> None:
 def test_a_sheet_that_leans_is_checked_as_it_lies(tmp_path: Path) -> None:
     config, wanted = rig(tmp_path), example("protocol.toml")
     check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0))
-    with pytest.raises(ConfigError, match=r"z = 88\.\d+ mm is outside .* on cell \d+\)"):
+    with pytest.raises(ConfigError, match=r"z = 88\.\d+ mm is outside .* on patch \d+\)"):
         check_poses(tmp_path / "rig.toml", config, wanted, PaperPlane(120.0, -0.05))
 
 
@@ -191,10 +191,10 @@ def test_the_walk_goes_where_the_steps_say(tmp_path: Path) -> None:
     for before, after in itertools.pairwise(walked):
         if before.step.kind in MARKING:
             assert after.step.kind == StepKind.CAPTURE
-            assert (after.cell, after.sheet) == (before.cell, before.sheet)
+            assert (after.patch, after.sheet) == (before.patch, before.sheet)
     press = next(w for w in walked if w.step.kind == StepKind.PRESS)
     deepest = min(pose.z_mm for pose, _ in press.moves.poses)
-    assert deepest == pytest.approx(config.paper.touch_z_mm - float(press.step.params["height_mm"] or 0))
+    assert deepest == pytest.approx(config.paper.touch_z_mm - float(press.step.params["depth_mm"] or 0))
 
 
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) -> None:
@@ -203,11 +203,11 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) ->
     ways = [part for part in draw.moves.parts if isinstance(part, Way)]
     drawn = Drawn.of(draw.step)
     assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
-    cell = sheet_of(config, wanted).cell(0)
+    patch = sheet_of(config, wanted).patch(0)
     # paper x is base y, paper y is base -x
     x_mm, y_mm, depth_mm, *_ = drawn.strokes[0][1]
     assert ways[0].poses[0].position_mm == pytest.approx(
-        (460.0 - cell.y_mm - y_mm, -110.0 + cell.x_mm + x_mm, config.paper.touch_z_mm - depth_mm)
+        (460.0 - patch.y_mm - y_mm, -110.0 + patch.x_mm + x_mm, config.paper.touch_z_mm - depth_mm)
     )
     assert draw.moves.dips == 1
 
@@ -253,9 +253,9 @@ def test_marks_that_leave_their_cells_and_columns_that_are_not_used_are_reported
     narrow = rig(tmp_path, "cell_mm = [40.0, 24.0]", "cell_mm = [24.0, 24.0]")
     [warning] = make_plan(narrow, example("protocol.toml")).warnings
     assert warning.startswith("H20-a0-r")
-    assert "beyond its cell of 24 x 24 mm" in warning
+    assert "beyond its patch of 24 x 24 mm" in warning
     assert make_plan(rig(tmp_path), example("protocol-replay.toml")).warnings == (
-        "recovered.csv: columns that are not used: height_sd_mm",
+        "recovered.csv: columns that are not used: depth_sd_mm",
     )
     edge = protocol(tmp_path, figure([9.0, 1.0, 9.0, 0.0, 0.0], [20.0, 1.0, 9.0, 0.0, 0.0]))
     assert "a may reach 2.5 mm beyond" in make_plan(rig(tmp_path), edge).warnings[0]
@@ -271,8 +271,8 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
         StepKind.SELF_CHECK,
         StepKind.DIP,
     ]
-    assert (len(plan.placed), plan.placed[0].cell, plan.placed[41].sheet, plan.dips) == (150, 1, 2, 153)
-    first = {placed.cell for placed in plan.placed if placed.sheet == 1}
+    assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 2, 153)
+    first = {placed.patch for placed in plan.placed if placed.sheet == 1}
     assert first == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
     assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
@@ -281,9 +281,9 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
 
 
 def test_a_plan_says_beforehand_what_the_self_check_of_an_armed_run_adds(tmp_path: Path) -> None:
-    full = 'kind = "grid"\nheights_mm = [11.0, 13.0]\ntilts_deg = [0.0]\nrepeats = {}\n'
+    full = 'kind = "grid"\ndepths_mm = [11.0, 13.0]\ntilts_deg = [0.0]\nrepeats = {}\n'
     tight, roomy = (protocol(tmp_path, full.format(repeats)) for repeats in (21, 19))
-    warning = "with --arm the self-check first takes 3 cells: 2 sheets instead of 1 (`collect plan --arm`)"
+    warning = "with --arm the self-check first takes 3 patches: 2 sheets instead of 1 (`collect plan --arm`)"
     assert make_plan(rig(tmp_path), tight).warnings == (warning,)
     assert make_plan(rig(tmp_path), roomy).warnings == ()
     assert make_plan(rig(tmp_path).checking_itself(False), tight).warnings == ()

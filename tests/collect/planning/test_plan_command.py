@@ -62,7 +62,7 @@ def plan(rig_path: Path, name: str, *options: str) -> str:
 
 def test_the_table_says_what_it_takes(rig_path: Path) -> None:
     words = " ".join(plan(rig_path, "protocol.toml").split())
-    for expected in ("4 of 42 cells", "a fresh one before", "150 press", "not counting", "at most"):
+    for expected in ("4 of 42 patches", "a fresh one before", "150 press", "not counting", "at most"):
         assert expected in words
 
 

@@ -36,11 +36,11 @@ FIGURE = "[[figures]]\nname = 'a'\n" + "".join(
     f"[[figures.strokes]]\npoints = [[12.0, {y}, 6.0, 4.0, 30.0], [24.0, {y}, 8.0, 0.0, 60.0]]\n" for y in (12.0, 24.0)
 )
 JOG = '\n[touch]\nmethod = "jog"\ntouches = 1\nresidual_mm = 3.0\npoints_mm = [[2.0, 2.0], [150.0, 3.0]]\n'
-TWO_PRESSES = "presses = [{height_mm = 9.0, tilt_deg = 5.0}, {height_mm = 11.0}]\n"
+TWO_PRESSES = "presses = [{depth_mm = 9.0, tilt_deg = 5.0}, {depth_mm = 11.0}]\n"
 KINDS = {
-    "grid": 'kind = "grid"\nheights_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
-    "replay": 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", height_mm = 9.0, tilt_deg = 1.0}]\n',
-    "few-strokes": 'kind = "few-strokes"\nheights_mm = [9.0, 11.0]\ntilts_deg = [5.0]\nstrokes = 1\n',
+    "grid": 'kind = "grid"\ndepths_mm = [9.0]\ntilts_deg = [5.0]\nrepeats = 2\nboard_every = 1\n',
+    "replay": 'kind = "replay"\nof = "s"\npresses = [{stroke_id = "b", depth_mm = 9.0, tilt_deg = 1.0}]\n',
+    "few-strokes": 'kind = "few-strokes"\ndepths_mm = [9.0, 11.0]\ntilts_deg = [5.0]\nstrokes = 1\n',
     "write": f'kind = "write"\ncell_mm = [60.0, 60.0]\n{FIGURE}',
     "calibration": 'kind = "calibration"\ntouches_mm = [[20.0, 20.0], [200.0, 20.0]]\n',
 }
@@ -105,14 +105,14 @@ def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
     check_protocol(rig_path, path, config, protocol)
     last = [one for one in made if one.step.kind is StepKind.CAPTURE][-1:]
     for one in made:
-        cell, more = one.context.cell, one.context.more_cells
-        planned = moves_of(config, one.plane, one.step, cell, more, dips=one.dips)
+        patch, more = one.context.patch, one.context.more_patches
+        planned = moves_of(config, one.plane, one.step, patch, more, dips=one.dips)
         # Where the ink had to wait, a press dips again.
         again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
         assert not not_checked(config, one.sent, [*planned.parts, *again]), one.step
         if one not in last:  # after the last capture the arm does not set out for a dip
             assert not not_sent(config, planned, one.sent), one.step
-        checked = {rounded(pose) for pose, _, _ in all_poses(config, protocol, one.plane, every_cell=True)}
+        checked = {rounded(pose) for pose, _, _ in all_poses(config, protocol, one.plane, every_patch=True)}
         assert {rounded(pose) for pose, _ in planned.poses} <= checked, one.step
 
 

@@ -5,11 +5,11 @@ from pydantic import ValidationError
 
 from brushloop.collect.protocols.presses import FewStrokesConfig
 
-GRID = {"kind": "few-strokes", "heights_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
+GRID = {"kind": "few-strokes", "depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
 
 
 def pressed(**changed: object) -> list[tuple[float, float]]:
-    return [(p.height_mm, p.tilt_deg) for p in FewStrokesConfig.model_validate(GRID | changed).planned()]
+    return [(p.depth_mm, p.tilt_deg) for p in FewStrokesConfig.model_validate(GRID | changed).planned()]
 
 
 def test_the_first_four_presses_are_the_corners_of_the_grid() -> None:

@@ -39,41 +39,41 @@ def test_the_examples_are_valid(path: Path) -> None:
 @pytest.mark.parametrize(
     ("protocol", "csv", "message"),
     [
-        (LIST, "height_mm\n11\nx\n", r"p.csv: line 3: height_mm: .*, more than 0 and at most 100 \(given: 'x'\)$"),
-        (LIST, "height_mm\n1_1\n", r"p.csv: line 2: height_mm: .*, more than 0 and at most 100 \(given: '1_1'\)$"),
-        (LIST, "height_mm,dwell_s\n11,1_0\n", r"p.csv: line 2: dwell_s: must be a number.* \(given: '1_0'\)$"),
-        (LIST, "height_mm,tilt_deg\n11,31\n", r"p.csv: line 2: tilt_deg: must be a number, at least 0 and at most 30"),
-        (LIST, "height_mm\nnan\n", r"line 2: height_mm: must be a number"),
-        (LIST, "height_mm\ninf\n", r"line 2: height_mm: must be a number"),
-        (LIST, "height_mm\n0\n", r"line 2: height_mm: must be a number, more than 0"),
-        (LIST, "height_mm,dwell_s\n11,61\n", r"line 2: dwell_s: must be a number, at least 0 and at most 60"),
-        (LIST, "height_mm,tilt_deg\n,5\n", r"line 2: height_mm: is empty"),
-        (LIST, "height_mm,tilt_deg\n11\n", r"line 2: 1 cells under 2 columns"),
-        (LIST, "height_mm,tilt\n11,5\n", r"p.csv: line 1: unknown column tilt; known are height_mm, tilt_deg"),
-        (LIST, "tilt_deg\n5\n", r"line 1: the column height_mm is missing"),
-        (LIST, "height_mm,height_mm\n5,5\n", r"line 1: the column height_mm occurs twice"),
-        (LIST, "height_mm\n", r"p.csv: has no rows"),
-        (LIST, "", r"p.csv: line 1: the column height_mm is missing"),
-        (LIST, b"height_mm\n\xff\n", r"p.csv: is not UTF-8 at byte 10"),
-        (LIST, 'height_mm\n"11', r"p.csv: line 2: is not CSV"),
-        (LIST, "height_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
-        (LIST, "height_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
-        (LIST, "height_mm,stroke_id\n11,a\n12,a\n", r"presses: 'a' occurs twice"),
+        (LIST, "depth_mm\n11\nx\n", r"p.csv: line 3: depth_mm: .*, more than 0 and at most 100 \(given: 'x'\)$"),
+        (LIST, "depth_mm\n1_1\n", r"p.csv: line 2: depth_mm: .*, more than 0 and at most 100 \(given: '1_1'\)$"),
+        (LIST, "depth_mm,dwell_s\n11,1_0\n", r"p.csv: line 2: dwell_s: must be a number.* \(given: '1_0'\)$"),
+        (LIST, "depth_mm,tilt_deg\n11,31\n", r"p.csv: line 2: tilt_deg: must be a number, at least 0 and at most 30"),
+        (LIST, "depth_mm\nnan\n", r"line 2: depth_mm: must be a number"),
+        (LIST, "depth_mm\ninf\n", r"line 2: depth_mm: must be a number"),
+        (LIST, "depth_mm\n0\n", r"line 2: depth_mm: must be a number, more than 0"),
+        (LIST, "depth_mm,dwell_s\n11,61\n", r"line 2: dwell_s: must be a number, at least 0 and at most 60"),
+        (LIST, "depth_mm,tilt_deg\n,5\n", r"line 2: depth_mm: is empty"),
+        (LIST, "depth_mm,tilt_deg\n11\n", r"line 2: 1 cells under 2 columns"),
+        (LIST, "depth_mm,tilt\n11,5\n", r"p.csv: line 1: unknown column tilt; known are depth_mm, tilt_deg"),
+        (LIST, "tilt_deg\n5\n", r"line 1: the column depth_mm is missing"),
+        (LIST, "depth_mm,depth_mm\n5,5\n", r"line 1: the column depth_mm occurs twice"),
+        (LIST, "depth_mm\n", r"p.csv: has no rows"),
+        (LIST, "", r"p.csv: line 1: the column depth_mm is missing"),
+        (LIST, b"depth_mm\n\xff\n", r"p.csv: is not UTF-8 at byte 9"),
+        (LIST, 'depth_mm\n"11', r"p.csv: line 2: is not CSV"),
+        (LIST, "depth_mm,stroke_id\n11,a/b\n", r"line 2: stroke_id: a name has no .*slashes"),
+        (LIST, "depth_mm,stroke_id\n11,\x1b[2J\n", r"line 2: stroke_id: .*control"),
+        (LIST, "depth_mm,stroke_id\n11,a\n12,a\n", r"presses: 'a' occurs twice"),
         (LIST, None, r"p.csv: no such file"),
         (LIST.replace("p.csv", "../p.csv"), None, r"protocol.toml: file: must be the plain name of a file next to it"),
         (LIST.replace("p.csv", "/etc/passwd"), None, r"file: must be the plain name"),
         (LIST.replace('"p.csv"', "3"), None, r"file: must be the plain name"),
-        (LIST + "presses = []\n", "height_mm\n11\n", r"presses: a file is named too"),
+        (LIST + "presses = []\n", "depth_mm\n11\n", r"presses: a file is named too"),
         ('kind = "list"\n', None, r"protocol.toml: presses: Field required"),
         ('kind = "list"\npresses = []\n', None, r"presses: .*at least 1"),
-        (REPLAY, "stroke_id,height_mm\na,11\n", r"line 1: the column tilt_deg is missing"),
-        (REPLAY, "stroke_id,height_mm,tilt_deg\na,11,-0.2\n", r"line 2: tilt_deg: must be a number, at least 0"),
-        (REPLAY + 'ignored_columns = ["x"]\n', "stroke_id,height_mm,tilt_deg\na,11,0\n", r"ignored_columns: a file"),
-        (REPLAY.replace("old", "a b"), "stroke_id,height_mm,tilt_deg\na,11,0\n", r"of = 'a b'"),
+        (REPLAY, "stroke_id,depth_mm\na,11\n", r"line 1: the column tilt_deg is missing"),
+        (REPLAY, "stroke_id,depth_mm,tilt_deg\na,11,-0.2\n", r"line 2: tilt_deg: must be a number, at least 0"),
+        (REPLAY + 'ignored_columns = ["x"]\n', "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"ignored_columns: a file"),
+        (REPLAY.replace("old", "a b"), "stroke_id,depth_mm,tilt_deg\na,11,0\n", r"of = 'a b'"),
         (WRITE + 'file = "p.csv"\n' + POINTS, None, r"figures.0.strokes.0.file: points are given too"),
-        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
-        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n1.5,1,3\n", r"point 2 is less than 1 mm from"),
-        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,height_mm\n1,1,3\n", r"figures.0.strokes.0.points: .*at least 2"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n70,1,3\n", r"the point \[70, 1\] lies outside"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n1.5,1,3\n", r"point 2 is less than 1 mm from"),
+        (WRITE + 'file = "p.csv"\n', "x_mm,y_mm,depth_mm\n1,1,3\n", r"figures.0.strokes.0.points: .*at least 2"),
         (WRITE + POINTS.replace("5.0,", "-1.0,"), None, r"nothing would be drawn"),
         (WRITE + POINTS.replace("20.0", "nan"), None, r"figures.0.strokes.0.points.1.0: "),
         (WRITE.replace('"a"', '"a b"') + POINTS, None, r"figure 'a b': .*spaces"),
@@ -81,12 +81,12 @@ def test_the_examples_are_valid(path: Path) -> None:
         (CALIBRATION + "touches_mm = [[1.0, 1.0], [1.0, 1.0]]\n", None, r"touches_mm contains the same point twice"),
         (CALIBRATION + "board_every = 3\n", None, r"use board_views"),
         (CALIBRATION + "wait_after_dip_s = 3.0\n", None, r"wait_after_dip_s: this protocol has no dips"),
-        (LIST + "wait_after_dip_s = 601\n", "height_mm\n11\n", r"wait_after_dip_s: .*600 \(given: 601\)$"),
+        (LIST + "wait_after_dip_s = 601\n", "depth_mm\n11\n", r"wait_after_dip_s: .*600 \(given: 601\)$"),
         ('kind = "teapot"\n', None, r"kind: .*'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'"),
-        ('kind = "adaptive"\nheights_mm = [11.0]\n', None, r"protocol.toml: kind: 'adaptive' is no .*'few-strokes'"),
+        ('kind = "adaptive"\ndepths_mm = [11.0]\n', None, r"protocol.toml: kind: 'adaptive' is no .*'few-strokes'"),
         ("x = 1\n", None, r"protocol.toml: kind: "),
-        ('kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nspeed = 3\n', None, r"speed: unknown field"),
-        ('kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 0\n', None, r"repeats: .*1 \(given: 0\)$"),
+        ('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nspeed = 3\n', None, r"speed: unknown field"),
+        ('kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 0\n', None, r"repeats: .*1 \(given: 0\)$"),
         ("kind = ", None, r"is not TOML"),
         ("x = " + "[" * 5000, None, r"is not TOML"),
     ],
@@ -104,33 +104,33 @@ def test_a_protocol_that_cannot_be_used_is_one_line(
 def test_rows_become_part_of_the_protocol_and_an_empty_cell_is_left_out(tmp_path: Path) -> None:
     listed = load(tmp_path, LIST, "\ufeffheight_mm , tilt_deg,stroke_id\r\n 11.5,,deep\r\n\r\n12,3,\r\n")
     assert isinstance(listed, ListConfig)
-    assert [(row.height_mm, row.tilt_deg, row.stroke_id) for row in listed.presses] == [
+    assert [(row.depth_mm, row.tilt_deg, row.stroke_id) for row in listed.presses] == [
         (11.5, 0, "deep"),
         (12, 3, None),
     ]
-    assert '"height_mm":11.5' in listed.model_dump_json()
-    (tmp_path / "p.csv").write_text("height_mm\n13\n")
+    assert '"depth_mm":11.5' in listed.model_dump_json()
+    (tmp_path / "p.csv").write_text("depth_mm\n13\n")
     assert load_protocol(tmp_path / "protocol.toml").model_dump_json() != listed.model_dump_json()
 
 
 def test_rows_and_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match=r"p.csv: line 10002: more than 10000 rows"):
-        load(tmp_path, LIST, "height_mm\n" + "11\n" * 10_001)
+        load(tmp_path, LIST, "depth_mm\n" + "11\n" * 10_001)
     monkeypatch.setattr(protocol_config, "MAX_TABLE_BYTES", 1000)
     with pytest.raises(ConfigError, match=r"p.csv: is larger than 1000 bytes"):
-        load(tmp_path, LIST, "height_mm\n" + "11\n" * 1000)
+        load(tmp_path, LIST, "depth_mm\n" + "11\n" * 1000)
     monkeypatch.setattr(protocol_config, "MAX_PROTOCOL_BYTES", 100)
     with pytest.raises(ConfigError, match=r"protocol.toml: is larger than 100 bytes"):
-        load(tmp_path, LIST + "#" * 200, "height_mm\n11\n")
+        load(tmp_path, LIST + "#" * 200, "depth_mm\n11\n")
 
 
 def test_strokes_and_points_are_bounded_over_the_whole_protocol(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"12000 strokes with repeats, at most 10000"):
-        load(tmp_path, LIST + "repeats = 1000\n", "height_mm\n" + "11\n" * 12)
+        load(tmp_path, LIST + "repeats = 1000\n", "depth_mm\n" + "11\n" * 12)
     rows = "".join(f"{1 + k % 50},{1 + k // 50 % 50},5\n" for k in range(900))
     figures = "".join(f'[[figures]]\nname = "f{k}"\n[[figures.strokes]]\nfile = "p.csv"\n' for k in range(12))
     with pytest.raises(ConfigError, match=r"more than \d+ rows"):
-        load(tmp_path, f'kind = "write"\ncell_mm = [60.0, 60.0]\n{figures}', "x_mm,y_mm,height_mm\n" + rows)
+        load(tmp_path, f'kind = "write"\ncell_mm = [60.0, 60.0]\n{figures}', "x_mm,y_mm,depth_mm\n" + rows)
 
 
 def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
 
 def test_names_of_a_list_may_not_meet_those_of_its_own_repeats(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"'a-r02' occurs twice"):
-        load(tmp_path, LIST + "repeats = 2\n", "height_mm,stroke_id\n11,a\n12,a-r02\n")
+        load(tmp_path, LIST + "repeats = 2\n", "depth_mm,stroke_id\n11,a\n12,a-r02\n")
 
 
 def test_chinese_names_are_names(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_chinese_names_are_names(tmp_path: Path) -> None:
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_whatever_stands_in_the_files_is_read_or_refused(tmp_path: Path, rubbish: bytes) -> None:
-    for csv in (rubbish, b"height_mm,stroke_id\n" + rubbish):
+    for csv in (rubbish, b"depth_mm,stroke_id\n" + rubbish):
         with contextlib.suppress(ConfigError):
             load(tmp_path, LIST, csv)
     (tmp_path / "protocol.toml").write_bytes(rubbish)

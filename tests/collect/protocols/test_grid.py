@@ -1,4 +1,4 @@
-"""The grid: every cell as often as asked, in an order that does not depend on the process."""
+"""The grid: every patch as often as asked, in an order that does not depend on the process."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ heights = st.lists(st.integers(1, 30).map(float), min_size=1, max_size=5, unique
 tilts = st.lists(st.integers(0, 15).map(float), min_size=1, max_size=4, unique=True)
 
 
-def config(heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: int = 1) -> GridConfig:
-    return GridConfig(kind="grid", heights_mm=heights_mm, tilts_deg=tilts_deg, repeats=repeats, seed=seed)
+def config(depths_mm: list[float], tilts_deg: list[float], repeats: int, seed: int = 1) -> GridConfig:
+    return GridConfig(kind="grid", depths_mm=depths_mm, tilts_deg=tilts_deg, repeats=repeats, seed=seed)
 
 
 @given(heights, tilts, st.integers(1, 5), st.integers(0, 99))
 def test_every_cell_is_pressed_as_often_as_asked_and_once_a_round(
-    heights_mm: list[float], tilts_deg: list[float], repeats: int, seed: int
+    depths_mm: list[float], tilts_deg: list[float], repeats: int, seed: int
 ) -> None:
-    planned = config(heights_mm, tilts_deg, repeats, seed).planned()
-    cells = Counter((p.height_mm, p.tilt_deg) for p in planned)
-    assert set(cells.values()) == {repeats}
-    assert len(cells) == len(heights_mm) * len(tilts_deg)
+    planned = config(depths_mm, tilts_deg, repeats, seed).planned()
+    patches = Counter((p.depth_mm, p.tilt_deg) for p in planned)
+    assert set(patches.values()) == {repeats}
+    assert len(patches) == len(depths_mm) * len(tilts_deg)
     assert [p.repeat for p in planned] == sorted(p.repeat for p in planned)
     assert len({p.stroke_id for p in planned}) == len(planned)
 
@@ -41,25 +41,25 @@ def test_steps_of_a_stroke_follow_each_other_and_a_capture_belongs_to_the_cell_t
     try:
         while True:
             kinds.append(step.kind)
-            result = {"sheet": 0, "cell": 7} if step.kind == StepKind.PRESS else {}
+            result = {"sheet": 0, "patch": 7} if step.kind == StepKind.PRESS else {}
             step = protocol.send(result)
             if step.kind == StepKind.CAPTURE:
-                assert step.params["cell"] == 7
+                assert step.params["patch"] == 7
     except StopIteration:
         pass
     assert kinds == ["zero_touch", "board", "dip", "press", "capture"]
 
 
 def test_keys_are_stable_across_processes_and_tell_steps_apart() -> None:
-    step = Step(StepKind.PRESS, 3, {"height_mm": 11.0, "tilt_deg": 5.0})
+    step = Step(StepKind.PRESS, 3, {"depth_mm": 11.0, "tilt_deg": 5.0})
     program = (
         "from brushloop.collect.protocols.steps import *;"
-        "print(Step(StepKind.PRESS, 3, {'tilt_deg': 5.0, 'height_mm': 11.0}).key)"
+        "print(Step(StepKind.PRESS, 3, {'tilt_deg': 5.0, 'depth_mm': 11.0}).key)"
     )
     other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip()
     assert other == step.key
     assert step.key != Step(StepKind.PRESS, 4, step.params).key
-    assert step.key != Step(StepKind.PRESS, 3, {"height_mm": 11.0, "tilt_deg": 6.0}).key
+    assert step.key != Step(StepKind.PRESS, 3, {"depth_mm": 11.0, "tilt_deg": 6.0}).key
 
 
 def paper(**changes: object) -> PaperConfig:
@@ -70,15 +70,15 @@ def paper(**changes: object) -> PaperConfig:
 def test_cells_tile_the_sheet_without_overlap() -> None:
     sheet = Sheet(paper())
     assert (sheet.columns, sheet.rows, sheet.capacity) == (6, 7, 42)
-    corners = {sheet.cell(i).rect_mm[:2] for i in range(sheet.capacity)}
+    corners = {sheet.patch(i).rect_mm[:2] for i in range(sheet.capacity)}
     assert len(corners) == 42
     for index in range(sheet.capacity):
-        x, y, width, height = sheet.cell(index).rect_mm
+        x, y, width, height = sheet.patch(index).rect_mm
         assert x >= 0.0
         assert x + width <= 244.0
         assert y >= 0.0
         assert y + height <= 172.0
-        anchor_x, anchor_y = sheet.cell(index).anchor_mm
+        anchor_x, anchor_y = sheet.patch(index).anchor_mm
         assert x < anchor_x < x + width
         assert y < anchor_y < y + height
 
@@ -87,9 +87,9 @@ def test_a_used_cell_is_never_handed_out_again() -> None:
     sheet = Sheet(paper())
     used: set[int] = set()
     for _ in range(sheet.capacity):
-        cell = sheet.free(used)
-        assert cell.index not in used
-        used.add(cell.index)
+        patch = sheet.free(used)
+        assert patch.index not in used
+        used.add(patch.index)
 
 
 def test_paper_axes_turn_with_the_yaw() -> None:

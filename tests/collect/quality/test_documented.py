@@ -15,7 +15,7 @@ UNITS = {"_mm": "mm", "_mm2": "mm²", "_mm2_per_mm": "mm²/mm", "_deg": "deg", "
 
 def rows() -> list[list[str]]:
     text = DOCUMENT.read_text(encoding="utf-8").split("\n## [quality]\n")[1].split("\n## ")[0]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:3] == "| `"]
+    return [[patch.strip() for patch in line.strip("|").split("|")] for line in text.splitlines() if line[:3] == "| `"]
 
 
 def test_the_table_has_every_field_in_order_with_its_default() -> None:

@@ -14,15 +14,15 @@ from pydantic import ValidationError
 
 from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.collect.quality.checks import cell_is_blank, check_capture, check_drawing, check_frame
+from brushloop.collect.quality.checks import check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.quality.measure import blur_px, glare, paper_level
 from brushloop.collect.quality.verdict import Failure, Family
 from brushloop.collect.rig.config_quality import QualityConfig
-from brushloop.collect.rig.paper import Cell
+from brushloop.collect.rig.paper import Patch
 
 LIMITS = QualityConfig()
 PX = 8.0
-CELL = Cell(0, 20.0, 15.0, 40.0, 24.0)
+CELL = Patch(0, 20.0, 15.0, 40.0, 24.0)
 Gray = NDArray[np.uint8]
 
 
@@ -101,10 +101,10 @@ def test_bare_paper_between_wide_marks_is_not_glare(width_mm: float) -> None:
 def test_a_sound_mark_passes_and_its_place_is_measured() -> None:
     anchor = CELL.anchor_mm
     image = stroke(paper(), anchor[0] + 0.7, anchor[1])
-    verdict = check_capture(image, plane(), CELL, height_mm=14.0, limits=LIMITS, previous=paper(seed=1))
+    verdict = check_capture(image, plane(), CELL, depth_mm=14.0, limits=LIMITS, previous=paper(seed=1))
     assert verdict.passed, verdict.reason
     moved = stroke(paper(), anchor[0] + 0.7, anchor[1] + 3.0)
-    verdict = check_capture(moved, plane(), CELL, height_mm=14.0, limits=LIMITS, previous=paper(seed=1))
+    verdict = check_capture(moved, plane(), CELL, depth_mm=14.0, limits=LIMITS, previous=paper(seed=1))
     assert verdict.cause is not None
     assert verdict.cause.name is Failure.MISPLACED
     assert verdict.cause.score == pytest.approx(3.0, abs=0.2)
@@ -113,25 +113,25 @@ def test_a_sound_mark_passes_and_its_place_is_measured() -> None:
 def test_a_brush_that_lies_down_the_other_way_is_sound_too() -> None:
     anchor = CELL.anchor_mm
     image = stroke(paper(), anchor[0] - 0.7 + 9.0, anchor[1], length_mm=9.0)
-    assert check_capture(image, plane(), CELL, height_mm=11.0, limits=LIMITS).passed
+    assert check_capture(image, plane(), CELL, depth_mm=11.0, limits=LIMITS).passed
 
 
 def test_a_press_in_another_cell_is_misplaced_and_not_blank_where_the_still_before_is_known() -> None:
     before = stroke(paper(seed=1), 50.0, 8.0)
     image = stroke(stroke(paper(), 50.0, 8.0), 50.0, 48.0)
-    verdict = check_capture(image, plane(), CELL, height_mm=14.0, limits=LIMITS, previous=before, sheet_mm=(80.0, 60.0))
+    verdict = check_capture(image, plane(), CELL, depth_mm=14.0, limits=LIMITS, previous=before, sheet_mm=(80.0, 60.0))
     assert verdict.cause is not None
     assert verdict.cause.name is Failure.MISPLACED
     assert verdict.cause.score == pytest.approx(18.0, abs=1.0)
-    alone = check_capture(image, plane(), CELL, height_mm=14.0, limits=LIMITS, sheet_mm=(80.0, 60.0))
+    alone = check_capture(image, plane(), CELL, depth_mm=14.0, limits=LIMITS, sheet_mm=(80.0, 60.0))
     assert alone.cause is not None
     assert alone.cause.name is Failure.BLANK
 
 
 def test_a_mark_at_the_edge_of_the_frame_is_cut_and_nothing_else_is_said_of_it() -> None:
-    cell = Cell(3, -22.0, 15.0, 40.0, 24.0)
-    image = stroke(paper(), cell.anchor_mm[0] + 0.7, cell.anchor_mm[1])
-    verdict = check_capture(image, plane(), cell, height_mm=14.0, limits=LIMITS)
+    patch = Patch(3, -22.0, 15.0, 40.0, 24.0)
+    image = stroke(paper(), patch.anchor_mm[0] + 0.7, patch.anchor_mm[1])
+    verdict = check_capture(image, plane(), patch, depth_mm=14.0, limits=LIMITS)
     assert verdict.cause is not None
     assert verdict.cause.name is Failure.CUT
     assert {check.name.family for check in verdict.checks} == {Family.PICTURE}
@@ -140,14 +140,14 @@ def test_a_mark_at_the_edge_of_the_frame_is_cut_and_nothing_else_is_said_of_it()
 def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_none() -> None:
     before = stroke(paper(seed=1), 50.0, 27.0)
     drawn = stroke(stroke(paper(), 50.0, 27.0), 52.0, 22.0)
-    judge = partial(check_drawing, plane=plane(), cell=CELL, height_mm=5.0, limits=LIMITS)
+    judge = partial(check_drawing, plane=plane(), patch=CELL, depth_mm=5.0, limits=LIMITS)
     assert judge(drawn, previous=before).passed
     late = judge(stroke(paper(), 50.0, 27.0), previous=before)
     assert late.cause is not None
     assert late.cause.name is Failure.BLANK
     assert judge(paper()).cause == judge(paper(), previous=paper(seed=1)).cause
     arm = drawn.copy()
-    cv2.circle(arm, (420, 260), 90, 60, -1)  # over the right edge of the cell
+    cv2.circle(arm, (420, 260), 90, 60, -1)  # over the right edge of the patch
     shaded = judge(arm, previous=before)
     assert shaded.cause is not None
     assert shaded.cause.name is Failure.NEIGHBOUR
@@ -157,23 +157,23 @@ def test_a_figure_is_sound_where_its_cell_has_new_ink_and_blank_where_it_has_non
 
 
 def test_a_cell_that_is_not_wholly_seen_is_not_called_blank() -> None:
-    hidden = cell_is_blank(paper(), plane(), Cell(3, -10.0, 15.0, 40.0, 24.0), limits=LIMITS)
+    hidden = patch_is_blank(paper(), plane(), Patch(3, -10.0, 15.0, 40.0, 24.0), limits=LIMITS)
     assert not hidden.passed
     assert "not completely in the picture" in hidden.reason
-    inked = cell_is_blank(stroke(paper(), 50.0, 27.0), plane(), CELL, limits=LIMITS)
+    inked = patch_is_blank(stroke(paper(), 50.0, 27.0), plane(), CELL, limits=LIMITS)
     assert not inked.passed
-    assert "Cell 0 is not blank" in inked.reason
-    assert cell_is_blank(paper(), plane(), CELL, limits=LIMITS).passed
+    assert "Patch 0 is not blank" in inked.reason
+    assert patch_is_blank(paper(), plane(), CELL, limits=LIMITS).passed
 
 
 def test_the_edge_of_a_sheet_is_no_ink_in_the_cells_along_it() -> None:
-    cell, sheet_mm = Cell(0, 20.0, 36.0, 40.0, 24.0), (80.0, 60.0)
+    patch, sheet_mm = Patch(0, 20.0, 36.0, 40.0, 24.0), (80.0, 60.0)
     seen = paper()
     seen[: round(0.8 * PX)] = 20  # the dark table, where the sheet was thought to reach
-    assert not cell_is_blank(seen, plane(), cell, limits=LIMITS).passed
-    assert cell_is_blank(seen, plane(), cell, limits=LIMITS, sheet_mm=sheet_mm).passed
+    assert not patch_is_blank(seen, plane(), patch, limits=LIMITS).passed
+    assert patch_is_blank(seen, plane(), patch, limits=LIMITS, sheet_mm=sheet_mm).passed
     pressed = stroke(seen.copy(), 50.0, 48.0)
-    first = check_capture(pressed, plane(), cell, height_mm=10.0, limits=LIMITS, sheet_mm=sheet_mm)
+    first = check_capture(pressed, plane(), patch, depth_mm=10.0, limits=LIMITS, sheet_mm=sheet_mm)
     assert next(check for check in first.checks if check.name is Failure.NEIGHBOUR).passed
 
 

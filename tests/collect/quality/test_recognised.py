@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from bench.quality import Score, score
-from bench.quality_set import SPOTLESS_MM2, Bench, Patch, Sample
-from brushloop.collect.quality.checks import cell_is_blank, check_capture
+from bench.quality_set import SPOTLESS_MM2, Bench, Blank, Sample
+from brushloop.collect.quality.checks import check_capture, patch_is_blank
 from brushloop.collect.quality.verdict import Failure
 from brushloop.collect.rig.config_quality import QualityConfig
 
@@ -18,35 +18,35 @@ EACH, SOUND = 2, 10
 LIMITS = QualityConfig()
 
 
-def draw() -> Iterator[Sample | Patch]:
+def draw() -> Iterator[Sample | Blank]:
     wanted: list[Failure | None] = [*itertools.chain(*[Failure] * EACH), *[None] * SOUND]
     for sheet in itertools.count():
         bench = Bench(41, sheet)
         for index in range(bench.sheet.capacity):
-            cell = bench.sheet.cell(index)
+            patch = bench.sheet.patch(index)
             if not wanted:
                 return
-            there_mm2 = bench.ink_mm2(cell)
+            there_mm2 = bench.ink_mm2(patch)
             if there_mm2 > SPOTLESS_MM2:
                 continue
-            yield Patch(True, bench.still, bench.plane, cell)
-            sample = bench.capture(cell, wanted[0])
+            yield Blank(True, bench.still, bench.plane, patch)
+            sample = bench.capture(patch, wanted[0])
             if sample is None:
                 continue
             if sample.label is wanted[0]:
                 del wanted[0]
             yield sample
             if sample.label is None:
-                yield Patch(False, bench.still, bench.plane, cell)
+                yield Blank(False, bench.still, bench.plane, patch)
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[Sample | Patch]:
+def drawn() -> list[Sample | Blank]:
     return list(draw())
 
 
 @pytest.fixture(scope="module")
-def scores(drawn: list[Sample | Patch]) -> Score:
+def scores(drawn: list[Sample | Blank]) -> Score:
     return score(drawn, LIMITS)
 
 
@@ -63,22 +63,22 @@ def test_a_sound_stroke_is_left_alone(scores: Score) -> None:
 
 
 def test_a_cell_is_called_blank_only_where_it_is(scores: Score) -> None:
-    assert scores.patches[True, False] == 0
-    assert scores.patches[False, True] == 0
-    assert scores.patches[False, False] >= SOUND
+    assert scores.blanks_seen[True, False] == 0
+    assert scores.blanks_seen[False, True] == 0
+    assert scores.blanks_seen[False, False] >= SOUND
 
 
-def test_without_a_still_from_before_the_stroke_itself_is_judged_the_same(drawn: list[Sample | Patch]) -> None:
+def test_without_a_still_from_before_the_stroke_itself_is_judged_the_same(drawn: list[Sample | Blank]) -> None:
     bristles = {None, Failure.DRY, Failure.FAINT, Failure.SPLIT, Failure.BENT, Failure.BLANK}
     scores = score([s for s in drawn if isinstance(s, Sample) and s.label in bristles], LIMITS, with_previous=False)
     assert scores.false_alarms == 0.0
     assert sum(scores.counts[label, label] for label in bristles) >= len(scores.seconds) - 1
 
 
-def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do(drawn: list[Sample | Patch]) -> None:
+def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do(drawn: list[Sample | Blank]) -> None:
     split = next(s for s in drawn if isinstance(s, Sample) and s.label is Failure.SPLIT)
     verdict = check_capture(
-        split.image, split.plane, split.cell, height_mm=split.height_mm, limits=LIMITS, previous=split.before
+        split.image, split.plane, split.patch, depth_mm=split.depth_mm, limits=LIMITS, previous=split.before
     )
     assert verdict.cause is not None
     assert verdict.cause.score > verdict.cause.threshold == LIMITS.split_mm
@@ -89,14 +89,14 @@ def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do(drawn: list[S
     assert faint.reason == ""
 
 
-def test_limits_come_from_the_configuration(drawn: list[Sample | Patch]) -> None:
+def test_limits_come_from_the_configuration(drawn: list[Sample | Blank]) -> None:
     sound = next(s for s in drawn if isinstance(s, Sample) and s.label is None)
     strict = LIMITS.model_copy(update={"faint_tone": 0.99})
     verdict = check_capture(
-        sound.image, sound.plane, sound.cell, height_mm=sound.height_mm, limits=strict, previous=sound.before
+        sound.image, sound.plane, sound.patch, depth_mm=sound.depth_mm, limits=strict, previous=sound.before
     )
     assert verdict.cause is not None
     assert verdict.cause.name is Failure.FAINT
-    inked = next(p for p in drawn if isinstance(p, Patch) and not p.blank)
+    inked = next(p for p in drawn if isinstance(p, Blank) and not p.blank)
     lax = LIMITS.model_copy(update={"foreign_mm2": 900.0})
-    assert cell_is_blank(inked.image, inked.plane, inked.cell, limits=lax).passed
+    assert patch_is_blank(inked.image, inked.plane, inked.patch, limits=lax).passed

@@ -15,7 +15,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
-PROTOCOL = 'kind = "grid"\nheights_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'
+PROTOCOL = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\n'
 
 
 def rig_file(tmp_path: Path, old: str = "", new: str = "") -> Path:
@@ -131,15 +131,15 @@ def test_what_is_wrong_in_the_file_is_not_blamed_on_the_environment(
     [
         ("", r"kind: is missing: one of 'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'$"),
         (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'few-strokes', "),
-        (PROTOCOL.replace("heights_mm", "height_mm"), r"height_mm: unknown field; did you mean heights_mm, which is m"),
+        (PROTOCOL.replace("depths_mm", "depth_mm"), r"depth_mm: unknown field; did you mean depths_mm, which is m"),
         (PROTOCOL.replace("repeats = 2", "repeats = 0"), r"repeats: .*1"),
-        (PROTOCOL.replace("[11.0, 20.0]", "[]"), r"heights_mm: .*at least 1"),
-        (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"heights_mm has the same value twice"),
+        (PROTOCOL.replace("[11.0, 20.0]", "[]"), r"depths_mm: .*at least 1"),
+        (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"depths_mm has the same value twice"),
         (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
         (PROTOCOL + "speed = 3\n", r"speed: unknown field; did you mean seed\?$"),
         (
             PROTOCOL + "hurry = 3\n",
-            r"hurry: unknown field; known are board_every, wait_after_dip_s, kind, heights_mm, .*dwell_s$",
+            r"hurry: unknown field; known are board_every, wait_after_dip_s, kind, depths_mm, .*dwell_s$",
         ),
     ],
 )
@@ -159,7 +159,7 @@ def plan(tmp_path: Path, protocol: str = PROTOCOL, old: str = "", new: str = "")
 
 
 def test_a_press_deeper_than_the_brush_survives_is_refused_before_anything_is_connected(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"heights_mm: 23 mm is deeper than brush.max_depth_mm = 22 mm"):
+    with pytest.raises(ConfigError, match=r"depths_mm: 23 mm is deeper than brush.max_depth_mm = 22 mm"):
         plan(tmp_path, PROTOCOL.replace("20.0", "23.0"))
 
 

@@ -74,7 +74,7 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     monkeypatch.setattr(proof, "_with_lens_at", lambda _: low)
     monkeypatch.setattr(proof, "DryRunEngine" if dry else "Engine", no_engine)
     day = Day(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)  # type: ignore[arg-type]
-    protocol = 'kind = "grid"\nheights_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
+    protocol = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
     with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):
         await ProofStep()._run(day, tmp_path, protocol, dry=dry)
 

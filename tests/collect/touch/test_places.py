@@ -1,4 +1,4 @@
-"""Which cells zero touch uses up."""
+"""Which patches zero touch uses up."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import pytest
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import Sheet
-from brushloop.collect.touch.places import used_cells
+from brushloop.collect.touch.places import used_patches
 
 PAPER = PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(244.0, 172.0), touch_point_mm=(2.0, 2.0))
 SHEET = Sheet(PAPER)
 
 
 def used(**config: Any) -> set[int]:
-    return used_cells(SHEET, PAPER, TouchConfig(**config))
+    return used_patches(SHEET, PAPER, TouchConfig(**config))
 
 
 def test_the_taught_height_and_touches_in_the_margin_cost_no_cell() -> None:
@@ -26,15 +26,15 @@ def test_the_taught_height_and_touches_in_the_margin_cost_no_cell() -> None:
 
 
 def test_a_touch_in_the_middle_of_a_cell_costs_it() -> None:
-    cell = SHEET.cell(8)
-    assert used(method="jog", points_mm=[cell.anchor_mm]) == {8}
+    patch = SHEET.patch(8)
+    assert used(method="jog", points_mm=[patch.anchor_mm]) == {8}
 
 
 def test_a_patch_costs_every_cell_that_it_may_reach() -> None:
-    corner = SHEET.cell(36)
+    corner = SHEET.patch(36)
     patches = used(method="camera", points_mm=[(corner.x_mm + 4.0, corner.y_mm + 9.0), (124.0, 6.0), (6.0, 100.0)])
     assert 36 in patches
-    assert 30 in patches, "it grows into the cell above"
+    assert 30 in patches, "it grows into the patch above"
     assert len(patches) < SHEET.capacity / 3
 
 

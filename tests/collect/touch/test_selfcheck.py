@@ -174,39 +174,39 @@ async def test_an_even_triangle_is_refused_before_anything_moves(make_bench: Mak
 
 def test_triangles_lie_in_one_cell_or_over_three(make_bench: MakeBench) -> None:
     sheet = Sheet(make_bench().rig.config.paper)
-    cell = sheet.cell(0)
-    for x, y in triangle_in(cell, CONFIG):
-        assert cell.x_mm <= x <= cell.x_mm + cell.width_mm
-        assert cell.y_mm <= y <= cell.y_mm + cell.height_mm
-    corners = (sheet.cell(0), sheet.cell(sheet.columns - 1), sheet.cell(sheet.capacity - sheet.columns))
-    assert triangle_of(corners) == tuple(cell.anchor_mm for cell in corners)
+    patch = sheet.patch(0)
+    for x, y in triangle_in(patch, CONFIG):
+        assert patch.x_mm <= x <= patch.x_mm + patch.size_x_mm
+        assert patch.y_mm <= y <= patch.y_mm + patch.size_y_mm
+    corners = (sheet.patch(0), sheet.patch(sheet.columns - 1), sheet.patch(sheet.capacity - sheet.columns))
+    assert triangle_of(corners) == tuple(patch.anchor_mm for patch in corners)
 
 
-def paper(width_mm: float, height_mm: float) -> PaperConfig:
-    return PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(width_mm, height_mm))
+def paper(size_x_mm: float, size_y_mm: float) -> PaperConfig:
+    return PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(size_x_mm, size_y_mm))
 
 
 def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_cell() -> None:
     sheet = Sheet(paper(244.0, 172.0))
-    first = sheet.cell(0)
+    first = sheet.patch(0)
     wide = partners(sheet, first, {0})
-    assert [cell.index for cell in wide] == [5, 36]
+    assert [patch.index for patch in wide] == [5, 36]
     assert triangle_on((first, *wide), CONFIG) == triangle_of((first, *wide))
-    again = partners(sheet, sheet.cell(1), {0, 1, 5, 36})
-    assert [cell.index for cell in again] == [4, 37], "a second attempt finds places of its own"
+    again = partners(sheet, sheet.patch(1), {0, 1, 5, 36})
+    assert [patch.index for patch in again] == [4, 37], "a second attempt finds places of its own"
     assert partners(sheet, first, set(range(sheet.capacity)) - {1, 6}) == (), "what is left is too near"
     small = Sheet(paper(110.0, 80.0))
-    assert partners(small, small.cell(0), set()) == ()
-    assert triangle_on((small.cell(0),), CONFIG) == triangle_in(small.cell(0), CONFIG)
+    assert partners(small, small.patch(0), set()) == ()
+    assert triangle_on((small.patch(0),), CONFIG) == triangle_in(small.patch(0), CONFIG)
 
 
 @given(width=st.floats(40.0, 600.0), height=st.floats(24.0, 600.0), used=st.sets(st.integers(0, 60)))
 def test_a_wide_triangle_is_always_uneven_wide_and_on_free_cells(width: float, height: float, used: set[int]) -> None:
     sheet = Sheet(paper(width, height))
-    cell = sheet.cell(0)
-    if wide := partners(sheet, cell, used):
+    patch = sheet.patch(0)
+    if wide := partners(sheet, patch, used):
         assert not used & {one.index for one in wide}
-        places = np.array(triangle_of((cell, *wide)))
+        places = np.array(triangle_of((patch, *wide)))
         assert np.ptp(places, axis=0).min() >= 60.0
         mirrored = places * np.array([-1.0, 1.0])
         with pytest.raises(StepError, match="mirrored in x"):
@@ -216,7 +216,7 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_cells(width: float, h
 def whole_sheet(make_bench: MakeBench) -> tuple[Bench, Triangle]:
     bench = make_bench(whole=True)
     sheet = Sheet(bench.rig.config.paper)
-    return bench, triangle_of((sheet.cell(0), *partners(sheet, sheet.cell(0), set())))
+    return bench, triangle_of((sheet.patch(0), *partners(sheet, sheet.patch(0), set())))
 
 
 async def test_a_sound_camera_passes_over_three_corners(make_bench: MakeBench) -> None:
@@ -234,7 +234,7 @@ async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_n
     # The board was printed 2 % too small, or measured badly: every length by this camera is 2 % too large.
     wrong_board = board.model_copy(update={"square_mm": 1.02 * board.square_mm, "marker_mm": 1.02 * board.marker_mm})
     bench.rig = replace(bench.rig, config=bench.rig.config.model_copy(update={"board": wrong_board}))
-    near_origin = Sheet(bench.rig.config.paper).cell(36)
+    near_origin = Sheet(bench.rig.config.paper).patch(36)
     await checked(bench, triangle_in(near_origin, CONFIG))
     with pytest.raises(
         StepError, match=r"lengths are off by \+(1\.[7-9]|2\.[0-3]).* along x and \+(1\.[7-9]|2\.[0-3])"

@@ -78,9 +78,9 @@ async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBen
     config = bench.rig.config
     sent, plane = noted(bench, config), PaperPlane(120.0)
     sheet = Sheet(config.paper)
-    cells = (sheet.cell(0), *partners(sheet, sheet.cell(0), set()))
-    await self_check(bench.rig, bench.effector, triangle_on(cells, config.self_check), plane)
-    planned = moves_of(config, plane, CHECK, cells[0], cells[1:])
+    patches = (sheet.patch(0), *partners(sheet, sheet.patch(0), set()))
+    await self_check(bench.rig, bench.effector, triangle_on(patches, config.self_check), plane)
+    planned = moves_of(config, plane, CHECK, patches[0], patches[1:])
     assert not not_checked(config, sent, planned.parts)
     assert not not_sent(config, planned, sent)
     assert lowest_mm(sent) == 120.0 - config.self_check.depth_mm

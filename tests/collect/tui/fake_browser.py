@@ -98,7 +98,7 @@ class FakeReview(Review):
         binary = blot()
         return CapturePictures(np.where(binary, 40, 210).astype(np.uint8), binary, 1_795_273_966_402_000_000)
 
-    def repeatability(self, height_mm: float, tilt_deg: float) -> tuple[float, int] | None:
+    def repeatability(self, depth_mm: float, tilt_deg: float) -> tuple[float, int] | None:
         return 0.914, 9
 
 

@@ -128,7 +128,7 @@ def day(tmp_path: Path) -> Iterator[Day]:
         text = rig_toml.read_text(encoding="utf-8").replace("latency_ms = 250.0", "latency_ms = 1500.0")
         text = text.replace("stale_ms = 1000.0", "stale_ms = 2000.0\nbias_s = 0.25")
         rig_toml.write_text(text + MEASURED, encoding="utf-8")
-        grid = 'kind = "grid"\nheights_mm = [11.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 1\n'
+        grid = 'kind = "grid"\ndepths_mm = [11.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 1\n'
         (tmp_path / "protocol.toml").write_text(grid, encoding="utf-8")
         yield Day(tmp_path, rig)
 

@@ -31,9 +31,9 @@ def z_mm(cabinet: ArcsServer) -> float:
     return cabinet.cabinet.world.tool().z_mm
 
 
-async def below(cabinet: ArcsServer, height_mm: float) -> None:
+async def below(cabinet: ArcsServer, depth_mm: float) -> None:
     async with asyncio.timeout(PATIENCE_S):
-        while z_mm(cabinet) > height_mm:
+        while z_mm(cabinet) > depth_mm:
             await asyncio.sleep(0.002)
 
 

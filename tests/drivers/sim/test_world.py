@@ -19,13 +19,13 @@ TABLE = Table()
 SAFE_Z = TABLE.paper_z_mm + 40.0
 
 
-def on_paper(x_mm: float, y_mm: float, height_mm: float, *, heading_deg: float = 0.0, tilt_deg: float = 0.0) -> Pose:
+def on_paper(x_mm: float, y_mm: float, depth_mm: float, *, heading_deg: float = 0.0, tilt_deg: float = 0.0) -> Pose:
     """A pose given in the paper frame."""
     yaw = math.radians(TABLE.yaw_deg)
     dx, dy = math.cos(yaw) * x_mm - math.sin(yaw) * y_mm, math.sin(yaw) * x_mm + math.cos(yaw) * y_mm
     x0, y0 = TABLE.origin_mm
     heading = heading_deg + TABLE.yaw_deg
-    return brush_pose(x0 + dx, y0 + dy, TABLE.paper_z_mm + height_mm, heading_deg=heading, tilt_deg=tilt_deg)
+    return brush_pose(x0 + dx, y0 + dy, TABLE.paper_z_mm + depth_mm, heading_deg=heading, tilt_deg=tilt_deg)
 
 
 def dip() -> list[Pose]:

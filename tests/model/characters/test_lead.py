@@ -38,7 +38,7 @@ def test_leading_the_brush_puts_the_ink_on_the_corner() -> None:
     assert wrong(led) < 0.5 * wrong(first)
     assert led[0][:, 0].max() > HOOK[:, 0].max() + 0.5  # the tip goes on beyond the corner
     assert np.all(np.linalg.norm(np.diff(led[0][:, :3], axis=0), axis=1) >= reach.apart_mm)
-    assert led[0][:, 2].max() <= reach.height_mm[1]
+    assert led[0][:, 2].max() <= reach.depth_mm[1]
 
 
 def test_a_footprint_is_found_again_from_its_ink() -> None:

@@ -31,8 +31,8 @@ def apart(points: np.ndarray) -> np.ndarray:
 
 def assert_feasible(points: np.ndarray, reach: Reach) -> None:
     steps = apart(points)
-    assert np.all(points[:, 2] >= reach.height_mm[0] - 1e-9)
-    assert np.all(points[:, 2] <= reach.height_mm[1] + 1e-9)
+    assert np.all(points[:, 2] >= reach.depth_mm[0] - 1e-9)
+    assert np.all(points[:, 2] <= reach.depth_mm[1] + 1e-9)
     assert np.all((points[:, 3] >= reach.tilt_deg[0]) & (points[:, 3] <= reach.tilt_deg[1]))
     assert np.all(np.abs(np.diff(points[:, 2])) <= reach.plunge * steps + 1e-9)
     assert np.all(np.abs(np.diff(points[:, 4])) <= reach.turn_deg_mm * steps + 1e-6)
@@ -117,7 +117,7 @@ def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
 
 
 def test_a_shallow_brush_stays_shallow() -> None:
-    reach = Reach(height_mm=(0.5, 3.0))
+    reach = Reach(depth_mm=(0.5, 3.0))
     way = Path(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 4.0))
     first = trajectory(way, MODEL, reach, CELL, 0.0)
     better = refine(MODEL, [first], swept([way], CELL.side_mm, 64), CELL.side_mm, reach, 5)
@@ -130,7 +130,7 @@ def test_no_steps_change_nothing() -> None:
     assert np.array_equal(refine(MODEL, [first], swept([way], 60.0, 64), 60.0, REACH, 0).strokes[0], first)
 
 
-@pytest.mark.parametrize("options", [{"height_mm": (3.0, 3.0)}, {"tilt_deg": (-1.0, 5.0)}, {"plunge": 0.0}])
+@pytest.mark.parametrize("options", [{"depth_mm": (3.0, 3.0)}, {"tilt_deg": (-1.0, 5.0)}, {"plunge": 0.0}])
 def test_a_reach_that_makes_no_sense_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="expected"):
         Reach(**options)

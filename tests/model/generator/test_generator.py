@@ -69,10 +69,10 @@ def test_strokes_that_the_model_refuses_are_not_drawn() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"ranges": {"height": (1, 2)}}, "ranges.height: ccd-bsm knows height_mm"),
-        ({"ranges": {"height_mm": (20, 11)}}, "must grow within"),
+        ({"ranges": {"height": (1, 2)}}, "ranges.height: ccd-bsm knows depth_mm"),
+        ({"ranges": {"depth_mm": (20, 11)}}, "must grow within"),
         ({"ranges": {}}, "ranges is empty"),
-        ({"fixed": {"height_mm": 3}}, "fixed.height_mm: not a parameter"),
+        ({"fixed": {"depth_mm": 3}}, "fixed.depth_mm: not a parameter"),
         ({"fixed": {"lam": 30}}, "fixed.lam = 30 is outside"),
         ({"model": stroke_model("circle", Brush()), "ranges": {"radius_mm": (1, 2)}}, "circle does not have"),
     ],
@@ -123,7 +123,7 @@ def test_a_generator_is_a_stroke_model() -> None:
 
     model = generator_model(Perfect(strokes.inputs, SMALL), strokes)
     assert (model.name, model.label, model.fitted) == ("ccd-bsmg", "CCD-BSMG", False)
-    assert [spec.name for spec in model.parameters] == ["height_mm", "tilt_deg"]
+    assert [spec.name for spec in model.parameters] == ["depth_mm", "tilt_deg"]
     shape = model.profile(torch.tensor([12.0, 19.0]), 5.0)
     exact = ccdbsm(Brush(), torch.tensor([12.0, 19.0]), 5.0)
     torch.testing.assert_close(shape.area_mm2, exact.area_mm2.double(), rtol=5e-3, atol=0)
@@ -132,8 +132,8 @@ def test_a_generator_is_a_stroke_model() -> None:
     origin = centred_origin(exact)
     drawn, expected = coverage_at(shape, origin), coverage_at(exact, origin)
     assert quality([(drawn, expected)]).iou > 0.985
-    assert model.images({"height_mm": 15.0, "tilt_deg": 3.0}).shape == (1, 128, 128)
-    with pytest.raises(DomainError, match=r"height_mm = 25 is outside \[11, 20\] mm"):
+    assert model.images({"depth_mm": 15.0, "tilt_deg": 3.0}).shape == (1, 128, 128)
+    with pytest.raises(DomainError, match=r"depth_mm = 25 is outside \[11, 20\] mm"):
         model.profile(25.0, 5.0)
     with pytest.raises(ValueError, match="no parameter 'speed'"):
         model.shape({"speed": 1.0})

@@ -34,7 +34,7 @@ def test_the_documented_command_trains_it_and_images_it_has_not_seen_score_as_it
 def test_it_predicts_every_press_of_the_paper_and_calls_itself_what_it_is() -> None:
     model = load_generator(SHIPPED_GENERATOR)
     assert (model.name, model.label, model.fitted) == ("ccd-bsmg", "CCD-BSMG", False)
-    for height_mm in (11.0, 20.0):
+    for depth_mm in (11.0, 20.0):
         for tilt_deg in (0.0, 10.0):
-            model.profile(height_mm, tilt_deg)
+            model.profile(depth_mm, tilt_deg)
     assert "trained on exact images of CCD-BSM" in model.definition

@@ -30,9 +30,9 @@ ANCHOR = (0.8 * SIDE, 0.5 * SIDE)
 BASIS = Basis(Brush())
 
 
-def drawn(height_mm: np.ndarray, tilt_deg: np.ndarray, place_mm: np.ndarray, heading_deg: np.ndarray, anchored: bool):
-    mark = ccdbsm(Brush(), torch.from_numpy(height_mm), torch.from_numpy(tilt_deg))
-    ahead = height_mm * np.tan(np.radians(tilt_deg)) if anchored else np.zeros(len(height_mm))
+def drawn(depth_mm: np.ndarray, tilt_deg: np.ndarray, place_mm: np.ndarray, heading_deg: np.ndarray, anchored: bool):
+    mark = ccdbsm(Brush(), torch.from_numpy(depth_mm), torch.from_numpy(tilt_deg))
+    ahead = depth_mm * np.tan(np.radians(tilt_deg)) if anchored else np.zeros(len(depth_mm))
     turn = np.radians(heading_deg)
     origin = place_mm + ahead[:, None] * np.column_stack((np.cos(turn), -np.sin(turn)))
     return coverage_numpy(mark, torch.from_numpy(origin), torch.from_numpy(heading_deg), px_mm=PX, threads=1)
@@ -48,7 +48,7 @@ def anchored(count: int, seed: int, tilts: tuple[float, float] = (0.0, 10.0)):
 def test_clean_images_give_the_press_exactly() -> None:
     height, tilt, place, images = anchored(60, 1)
     found = Inverter.of_brush(BASIS, px_mm=PX)(images, place)
-    assert np.abs(found.height_mm - height).max() < 1e-3
+    assert np.abs(found.depth_mm - height).max() < 1e-3
     assert np.abs(found.tilt_deg - tilt).max() < 0.05
     assert not any(flags & {Flag.ALPHA_UNKNOWN, Flag.DID_NOT_CONVERGE} for flags in found.flags)
 
@@ -68,7 +68,7 @@ def test_place_and_heading_come_back_too(height: float, tilt: float, heading: fl
     place = np.array([[0.5 * SIDE + x + middle * math.cos(turn), 0.5 * SIDE + y - middle * math.sin(turn)]])
     images = drawn(np.array([height]), np.array([tilt]), place, np.array([heading]), anchored=False)
     found = Inverter.of_brush(BASIS, known=Known.NOTHING, px_mm=PX)(images)
-    assert found.height_mm[0] == pytest.approx(height, abs=1e-3)
+    assert found.depth_mm[0] == pytest.approx(height, abs=1e-3)
     assert found.tilt_deg[0] == pytest.approx(tilt, abs=0.05)
     assert found.values[0, 2:4] == pytest.approx(place[0], abs=1e-3)
     assert math.cos(math.radians(found.values[0, 4] - heading)) > 1 - 1e-6
@@ -78,8 +78,8 @@ def test_place_and_heading_come_back_too(height: float, tilt: float, heading: fl
 def test_binary_images_give_the_depth_to_a_fiftieth_of_a_millimetre() -> None:
     height, tilt, place, images = anchored(100, 2)
     found = Inverter.of_brush(BASIS, noise=Noise.QUANTISED, px_mm=PX)((images > 0.5).astype(np.float32), place)
-    assert np.abs(found.height_mm - height).mean() < 0.02
-    for name, true in (("height_mm", height), ("tilt_deg", tilt)):
+    assert np.abs(found.depth_mm - height).mean() < 0.02
+    for name, true in (("depth_mm", height), ("tilt_deg", tilt)):
         low, high = found.interval(name)
         assert 0.9 <= ((low <= true) & (true <= high)).mean() <= 1.0
 
@@ -88,7 +88,7 @@ def test_intervals_under_sensor_noise_keep_their_word() -> None:
     height, tilt, place, images = anchored(300, 3, (1.0, 10.0))
     noisy = images + np.random.default_rng(4).normal(0, 0.05, images.shape)
     found = Inverter.of_brush(BASIS, px_mm=PX)(noisy, place)
-    for name, true in (("height_mm", height), ("tilt_deg", tilt)):
+    for name, true in (("depth_mm", height), ("tilt_deg", tilt)):
         low, high = found.interval(name)
         assert 0.915 <= ((low <= true) & (true <= high)).mean() <= 0.98  # 95 % and three deviations of 300 draws
 
@@ -115,7 +115,7 @@ def test_any_model_inverts_its_own_marks(model: str) -> None:
     origin = torch.tensor(ANCHOR).double() + torch.stack((height * torch.tan(torch.deg2rad(tilt)), 0 * height), -1)
     images = coverage_numpy(of.profile(height, tilt), origin, px_mm=PX)
     found = Inverter.of_model(of, px_mm=PX)(images, ANCHOR)
-    assert np.abs(found.height_mm - height.numpy()).max() < 1e-3
+    assert np.abs(found.depth_mm - height.numpy()).max() < 1e-3
     assert np.abs(found.tilt_deg - tilt.numpy()).max() < 0.05
 
 
@@ -171,13 +171,13 @@ def test_flags_say_what_is_wrong() -> None:
     invert = Inverter.of_brush(BASIS, px_mm=PX)
     blank = invert(np.zeros_like(images), place)
     assert Flag.BLANK in blank.flags[0]
-    assert np.isnan(blank.height_mm[0])
+    assert np.isnan(blank.depth_mm[0])
     shifted = np.array([[5.0, 0.5 * SIDE]])
     cut = invert(drawn(height, tilt, shifted, np.zeros(1), anchored=True), shifted)
     assert Flag.CUT in cut.flags[0]
     low = Inverter.of_brush(BASIS, px_mm=PX, within=Range((2.0, 10.0), (0.0, 10.0)))(images, place)
     assert Flag.AT_BOUND in low.flags[0]
-    assert low.height_mm[0] == 10.0
+    assert low.depth_mm[0] == 10.0
 
 
 def test_an_upright_press_at_the_end_of_alphas_range_does_not_speak_against_the_model() -> None:
@@ -197,7 +197,7 @@ def test_without_an_anchor_alpha_can_be_held() -> None:
     found = Inverter.of_brush(BASIS, known=Known.NOTHING, px_mm=PX, tilt_deg=0.0).assuming(5.0)(images)
     assert found.tilt_deg[0] == 5.0
     assert found.sigma[0, 1] == 0.0
-    assert found.height_mm[0] == pytest.approx(height[0], abs=1e-3)
+    assert found.depth_mm[0] == pytest.approx(height[0], abs=1e-3)
     assert Flag.ALPHA_UNKNOWN in found.flags[0]
 
 

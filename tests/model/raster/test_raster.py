@@ -111,11 +111,9 @@ def test_both_exact_paths_agree_wherever_a_mark_lies(
 def test_marks_on_pixel_edges_come_out_right() -> None:
     # Whole numbers of pixels and eighths of a turn put ends, turns and 45 degree points onto edges and corners.
     rng = np.random.default_rng(0)
-    height_mm, tilt_deg = (
-        torch.from_numpy(rng.choice(of, 100)) for of in ((2.0, 8.0, 10.3125, 16.0), (0.0, 5.0, 20.0))
-    )
+    depth_mm, tilt_deg = (torch.from_numpy(rng.choice(of, 100)) for of in ((2.0, 8.0, 10.3125, 16.0), (0.0, 5.0, 20.0)))
     heading_deg = torch.from_numpy(45.0 * rng.integers(-4, 5, 100))
-    mark = ccdbsm(Brush(), height_mm, tilt_deg)
+    mark = ccdbsm(Brush(), depth_mm, tilt_deg)
     origin = torch.from_numpy(0.25 * rng.integers(24, 104, (100, 2)))
     image = coverage_numpy(mark, origin, heading_deg, px_mm=0.25, out=np.empty((100, 128, 128)))
     assert abs(image - coverage_at(mark, origin, heading_deg, px_mm=0.25).numpy()).max() < 1e-6
@@ -140,8 +138,8 @@ def test_images_straight_from_presses_match_the_closed_form(size_px: int, px_mm:
     # Marks that end on pixel edges, lie on row edges and in the middle of rows, and reach beyond the image or miss it.
     rng = np.random.default_rng(size_px)
     tilt_deg = rng.uniform(0, 60, 150)
-    height_mm = np.minimum(rng.uniform(0.01, 40, 150), 47 * np.cos(np.radians(tilt_deg)))
-    mark = ccdbsm(Brush(), torch.from_numpy(height_mm), torch.from_numpy(tilt_deg))
+    depth_mm = np.minimum(rng.uniform(0.01, 40, 150), 47 * np.cos(np.radians(tilt_deg)))
+    mark = ccdbsm(Brush(), torch.from_numpy(depth_mm), torch.from_numpy(tilt_deg))
     side_mm = size_px * px_mm
     origin = rng.uniform(-0.6 * side_mm - 10, 1.6 * side_mm + 10, (150, 2))
     if grid != "nowhere":
@@ -151,7 +149,7 @@ def test_images_straight_from_presses_match_the_closed_form(size_px: int, px_mm:
         origin += rng.choice([1e-6, -1e-7, 1e-12], (150, 2))
     level = coverage_at(mark, torch.from_numpy(origin), size_px=size_px, px_mm=px_mm).numpy()
     dirty = np.full(level.shape, 7, np.float32)
-    images = press_images(Brush(), height_mm, tilt_deg, origin_mm=origin, size_px=size_px, px_mm=px_mm, out=dirty)
+    images = press_images(Brush(), depth_mm, tilt_deg, origin_mm=origin, size_px=size_px, px_mm=px_mm, out=dirty)
     assert abs(images - level).max() < 1e-6
     assert images.min() >= 0
     assert images.max() <= 1
@@ -165,7 +163,7 @@ def test_presses_of_many_brushes_are_centred_and_checked() -> None:
     np.testing.assert_array_equal(*(press_images(Brush(), np.full(130, 15.0), 7.0, threads=n) for n in (1, 2)))
     with pytest.raises(DomainError, match=r"tilt_deg = -1 is outside \[0, 82.875\) deg"):
         press_images(Brush(), np.array([15.0, 15.0]), np.array([7.0, -1.0]))
-    with pytest.raises(DomainError, match=r"height_mm = nan is outside \(0, 47.6"):
+    with pytest.raises(DomainError, match=r"depth_mm = nan is outside \(0, 47.6"):
         press_images(Brush(), math.nan, 7.0)
     with pytest.raises(ValueError, match="a shape is not finite"):
         press_images(Brush(), np.full(2, 15.0), 7.0, origin_mm=np.array([[1.0, 1.0], [math.nan, 1.0]]))
@@ -252,13 +250,13 @@ def test_every_model_has_exact_gradients_in_its_own_parameters(name: str) -> Non
 
 
 def test_large_batches_run_on_threads_and_come_out_the_same() -> None:
-    heights_mm = torch.linspace(11, 20, 150, **DOUBLE)
-    mark = ccdbsm(Brush(), heights_mm, 5.0)
-    one, two = (coverage_numpy(mark, centred_origin(mark), heights_mm, threads=n) for n in (1, 2))
+    depths_mm = torch.linspace(11, 20, 150, **DOUBLE)
+    mark = ccdbsm(Brush(), depths_mm, 5.0)
+    one, two = (coverage_numpy(mark, centred_origin(mark), depths_mm, threads=n) for n in (1, 2))
     assert one.dtype == np.float32
     np.testing.assert_array_equal(one, two)
-    assert coverage_numpy(ccdbsm(Brush(), heights_mm[:0], 5.0), (1.0, 1.0)).shape == (0, 128, 128)
-    assert coverage_at(ccdbsm(Brush(), heights_mm[:0], 5.0), (1.0, 1.0)).shape == (0, 128, 128)
+    assert coverage_numpy(ccdbsm(Brush(), depths_mm[:0], 5.0), (1.0, 1.0)).shape == (0, 128, 128)
+    assert coverage_at(ccdbsm(Brush(), depths_mm[:0], 5.0), (1.0, 1.0)).shape == (0, 128, 128)
 
 
 def test_what_makes_no_image_is_refused() -> None:

@@ -106,7 +106,7 @@ def test_values_outside_a_range_are_refused_by_name(name: str) -> None:
         model.shape({"colour": 1.0})
     with pytest.raises(DomainError, match="heading"):
         model.profile(15.0, -1.0)
-    with pytest.raises(DomainError, match="height_mm"):
+    with pytest.raises(DomainError, match="depth_mm"):
         model.profile(49.0, 0.0)
 
 

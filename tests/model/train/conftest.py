@@ -15,7 +15,7 @@ from brushloop.model.train.config import TrainConfig, checked
 from brushloop.model.train.loop import Validation
 
 TINY: dict[str, Any] = {
-    "target": {"ranges": {"height_mm": [11, 20], "tilt_deg": [0, 10]}, "px_mm": 0.8, "size_px": 32},
+    "target": {"ranges": {"depth_mm": [11, 20], "tilt_deg": [0, 10]}, "px_mm": 0.8, "size_px": 32},
     "layers": {"width": 16, "channels": 4, "side": 8},
     "training_images": 96,
     "validation_images": 16,
@@ -80,7 +80,7 @@ def write_tiny() -> Callable[[Path], Path]:
 
 
 def write_toml(folder: Path) -> Path:
-    target = "ranges = {height_mm = [11, 20], tilt_deg = [0, 10]}\npx_mm = 0.8\nsize_px = 32\n"
+    target = "ranges = {depth_mm = [11, 20], tilt_deg = [0, 10]}\npx_mm = 0.8\nsize_px = 32\n"
     layers = "width = 16\nchannels = 4\nside = 8\n"
     numbers = "".join(f"{name} = {value}\n" for name, value in TINY.items() if isinstance(value, int))
     path = folder / "train.toml"

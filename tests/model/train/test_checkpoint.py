@@ -126,7 +126,7 @@ def test_a_generator_s_report_must_be_a_table(tmp_path: Path, tiny: TrainConfig)
 
 def test_captures_must_fit_the_generator(tmp_path: Path, tiny: TrainConfig) -> None:
     path = tmp_path / "captures.safetensors"
-    inputs = {"height_mm": torch.tensor([11.0, 15, 20]), "tilt_deg": torch.tensor([0.0, 5, 10])}
+    inputs = {"depth_mm": torch.tensor([11.0, 15, 20]), "tilt_deg": torch.tensor([0.0, 5, 10])}
     images = torch.rand(3, 32, 32)
     save_captures(path, inputs, images, 0.8, "centred", "loopback rig")
     captures, source = load_captures(path, tiny)
@@ -137,9 +137,9 @@ def test_captures_must_fit_the_generator(tmp_path: Path, tiny: TrainConfig) -> N
         ({"px_mm": 0.2}, "px_mm is 0.2"),
         ({"placement": "zero-touch"}, "placement is 'zero-touch'"),
         ({"images": torch.rand(3, 16, 16)}, "images must be"),
-        ({"inputs": inputs | {"height_mm": torch.tensor([11.0, 15, 21])}}, "height_mm = 21 is outside"),
+        ({"inputs": inputs | {"depth_mm": torch.tensor([11.0, 15, 21])}}, "depth_mm = 21 is outside"),
         ({"inputs": inputs | {"speed": torch.zeros(3)}}, "'speed' is not an input"),
-        ({"inputs": {"height_mm": inputs["height_mm"]}}, "tilt_deg must be 3"),
+        ({"inputs": {"depth_mm": inputs["depth_mm"]}}, "tilt_deg must be 3"),
     ):
         fields = {"inputs": inputs, "images": images, "px_mm": 0.8, "placement": "centred", "source": "x"} | change
         save_captures(path, **fields)
@@ -149,7 +149,7 @@ def test_captures_must_fit_the_generator(tmp_path: Path, tiny: TrainConfig) -> N
 
 def test_repeats_of_a_condition_are_held_out_together(tmp_path: Path, tiny: TrainConfig) -> None:
     depths = torch.arange(11.0, 17.0).repeat_interleave(4)
-    inputs = {"height_mm": depths, "tilt_deg": torch.zeros(24)}
+    inputs = {"depth_mm": depths, "tilt_deg": torch.zeros(24)}
     path = tmp_path / "captures.safetensors"
     save_captures(path, inputs, torch.rand(24, 32, 32), 0.8, "centred", "loopback rig")
     captures, _ = load_captures(path, tiny)
@@ -161,7 +161,7 @@ def test_repeats_of_a_condition_are_held_out_together(tmp_path: Path, tiny: Trai
 
 
 def test_captures_of_one_condition_are_refused(tmp_path: Path, tiny: TrainConfig) -> None:
-    inputs = {"height_mm": torch.full((4,), 13.0), "tilt_deg": torch.zeros(4)}
+    inputs = {"depth_mm": torch.full((4,), 13.0), "tilt_deg": torch.zeros(4)}
     path = tmp_path / "captures.safetensors"
     save_captures(path, inputs, torch.rand(4, 32, 32), 0.8, "centred", "loopback rig")
     with pytest.raises(TrainError, match="at least two conditions"):

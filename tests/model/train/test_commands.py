@@ -36,7 +36,7 @@ def test_fine_tuning_on_captures_is_marked_as_such(once: Path, tmp_path: Path) -
     inputs = torch.stack((torch.linspace(11, 20, 20), torch.linspace(0, 10, 20)), dim=-1)
     images = before.target.images(inputs).roll(2, dims=1)  # a brush that marks the paper two pixels lower
     captures = tmp_path / "captures.safetensors"
-    named = {"height_mm": inputs[:, 0], "tilt_deg": inputs[:, 1]}
+    named = {"depth_mm": inputs[:, 0], "tilt_deg": inputs[:, 1]}
     save_captures(captures, named, images, 0.8, "centred", "loopback rig")
     command = ["tune", str(once), str(captures), "--out", str(tmp_path / "t"), "--steps", "60"]
     ran = CliRunner().invoke(app, [*command, "--learning-rate", "0.01"])
@@ -60,7 +60,7 @@ def test_the_page_draws_held_out_strokes_and_says_that_there_is_no_ink(once: Pat
     path = once.with_name("training.html")
     assert ran.output.splitlines()[-1] == f"Page: {path}"
     page = path.read_text(encoding="utf-8")
-    assert page.count('alt="network: height_mm ') == 12
+    assert page.count('alt="network: depth_mm ') == 12
     assert '<span class="source">exact images of a stroke model</span>' in page
     assert "was trained for 30 steps: all steps done" in page
     assert re.findall(r"(?:src|href)=\"(?!data:|#)", page) == []

@@ -95,7 +95,7 @@ def test_the_folder_holds_all_that_the_algorithm_puts_out(finished: Path) -> Non
     assert left == files | pictures
     assert len((finished / "loss.csv").read_text().splitlines()) == 31
     card = (finished / "generator.md").read_text()
-    assert "| `height_mm` | mm | 11 | 20 |" in card
+    assert "| `depth_mm` | mm | 11 | 20 |" in card
     assert "It has seen no real ink" in card
     assert "30 steps of 16, seed 0, all steps done" in card
 

@@ -43,14 +43,14 @@ def test_an_image_has_the_size_of_the_view(image: np.ndarray):
 
 
 def test_the_sheet_is_bright_in_all_its_corners(image: np.ndarray):
-    width_mm, height_mm = CONFIG.table.sheet_mm
-    for corner in itertools.product((3.0, width_mm - 3.0), (3.0, height_mm - 3.0)):
+    size_x_mm, size_y_mm = CONFIG.table.sheet_mm
+    for corner in itertools.product((3.0, size_x_mm - 3.0), (3.0, size_y_mm - 3.0)):
         assert gray_at(image, *corner) > 0.7 * PAPER_GRAY
 
 
 def beside_the_sheet(x_mm: float, y_mm: float, by_mm: float) -> bool:
-    width_mm, height_mm = CONFIG.table.sheet_mm
-    return not (-by_mm < x_mm < width_mm + by_mm and -by_mm < y_mm < height_mm + by_mm)
+    size_x_mm, size_y_mm = CONFIG.table.sheet_mm
+    return not (-by_mm < x_mm < size_x_mm + by_mm and -by_mm < y_mm < size_y_mm + by_mm)
 
 
 def test_every_corner_of_the_board_that_the_sheet_leaves_bare_is_found_where_it_lies(image: np.ndarray):
