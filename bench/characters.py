@@ -37,7 +37,7 @@ from brushloop.model.characters.brush import Reach
 from brushloop.model.characters.plan import grid, without_tilt
 from brushloop.model.footprint import Footprint, fit_footprint
 from brushloop.model.strokes import stroke_model
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 
 Floats = NDArray[np.float64]
 CHARACTERS, ROUNDS, WRITINGS, IN_A_ROUND = "字子永", 3, 10, 2

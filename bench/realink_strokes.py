@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bench.harness import BenchError
 from brushloop.calibrate.drags.captures import Drawn, commanded_path
 from brushloop.calibrate.drags.measure import defects
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 BIG, SMALL_A, SMALL_B = "frida_bigbrush_tilt_16x20", "frida_smallbrush_16x20_a", "frida_smallbrush_16x20_b"

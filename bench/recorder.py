@@ -20,9 +20,9 @@ import numpy as np
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from bench.harness import BenchError, Result
-from brushloop.sessions.recording.messages import encode_png, image_message, pose_message
-from brushloop.sessions.recording.schemas import Event, Header, Source, Topic, Wrench
-from brushloop.sessions.recording.writer import Outgoing, SegmentWriter, encoded
+from brushloop.sessions.messages import encode_png, image_message, pose_message
+from brushloop.sessions.records import Event, Header, Source, Topic, Wrench
+from brushloop.sessions.step_file import Outgoing, SegmentWriter, encoded
 
 POSE_HZ, FORCE_HZ, STILL_HZ = 100, 1000, 0.5
 LOAD_S = 10.0

@@ -35,7 +35,7 @@ from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prep
 from brushloop.calibrate.validate.pool import Dask, Threads
 from brushloop.model.brush import Brush as Bundle
 from brushloop.model.strokes import stroke_models
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 STROKES = 60
 FEW = 4

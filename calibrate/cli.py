@@ -12,7 +12,7 @@ from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
     from brushloop.sessions.export.rows import Cropper
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
 LEFT_OUT = 3
 """Exit code of an export that left strokes out."""
@@ -31,7 +31,7 @@ def calibrate(
     from brushloop.calibrate.pages.calibration import write_calibration_page
     from brushloop.calibrate.session import calibrate_session
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     with shown() as progress:
         path = calibrate_session(session, lens, progress)

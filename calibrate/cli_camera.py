@@ -155,7 +155,7 @@ def drift(
     from brushloop.calibrate.board.drift import board_over_session
     from brushloop.calibrate.board.session import board_of, known_lens
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     recording = Recording(session)
     known = known_lens(recording, lens)

@@ -17,7 +17,7 @@ from brushloop.calibrate.stroke.preprocess import preprocess
 from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.export.rows import Crop, Cropper
-from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording import Capture, Recording
 
 
 def cropper_of(recording: Recording, calibration_path: Path | None = None) -> Cropper:

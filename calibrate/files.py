@@ -82,7 +82,7 @@ def read_bounded(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
 def read_gray(path: Path) -> NDArray[np.uint8]:
     """Read a PNG or JPEG photograph as (h, w) gray. Raises `CalibrationError` for other files and larger ones."""
     from brushloop.sessions.errors import SessionDamaged
-    from brushloop.sessions.recording.messages import decode_gray
+    from brushloop.sessions.messages import decode_gray
 
     try:
         return decode_gray(read_bounded(path, MAX_PHOTOGRAPH_BYTES), str(path))

@@ -21,7 +21,7 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
 from brushloop.sessions.cells import CsvWriter
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"

@@ -14,10 +14,10 @@ from brushloop.calibrate.board.view import calibration_plane, paper_mm
 from brushloop.calibrate.calibration import Calibration, Foreign
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.params import Params
+from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.progress import Progress, unseen
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.messages import decode_gray
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Stroke
 
 FITTED = "k1 fitted on the board"
 STEPS = "steps done: read the session, fit the plane, check the file"

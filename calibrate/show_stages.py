@@ -21,10 +21,10 @@ from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stages import Trace, contact_sheet, trace_scaled, trace_seen
 from brushloop.calibrate.stroke.difference import new_stroke
 from brushloop.calibrate.stroke.params import Params
+from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.messages import decode_gray
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Stroke
 
 PAPER = 255
 PARAMS = Params()

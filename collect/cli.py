@@ -215,7 +215,7 @@ def loop(
     """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
     from brushloop.collect.chains.commands import CommandFailed
     from brushloop.collect.chains.loop import LoopRequest, run_loop
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     options = _collect_options(arm=arm, tui=tui)
     folder = out if out is not None else Recording(session).path.parent / "loop"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
 import shutil
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from brushloop.sessions.errors import DiskFull, InputError, SessionError, disk_error, in_one_line
+from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, disk_error, in_one_line
 
 SPARE_BYTES = 16 * 1024 * 1024
 """Space that is always kept free, so that the journal's last lines fit."""
@@ -159,3 +160,21 @@ def unwritable(folder: Path) -> tuple[Path, str] | None:
     if not os.access(there, os.W_OK | os.X_OK):
         return there, "may not be written: it is read-only, or another user's"
     return None
+
+
+def file_sha256(path: Path) -> str:
+    """Hex digest of a file, read in pieces."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def check_digest(path: Path, sha256: str) -> None:
+    """Raise `SessionDamaged` unless the file is byte for byte what was recorded."""
+    if not path.is_file():
+        raise SessionDamaged(path, "is missing, though the journal says it was finished")
+    try:
+        digest = file_sha256(path)
+    except OSError as error:
+        raise SessionDamaged(path, f"cannot read: {in_one_line(error)}") from None
+    if digest != sha256:
+        raise SessionDamaged(path, "has changed since it was recorded (sha256 differs from the journal)")

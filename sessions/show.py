@@ -20,9 +20,8 @@ from brushloop.sessions.journal.codec import Line
 from brushloop.sessions.journal.events import NONSENSE
 from brushloop.sessions.journal.journal import JOURNAL_NAME, Replay, is_open, read_header, replay, replay_lines
 from brushloop.sessions.names import check_folder
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording import container
-from brushloop.sessions.recording.schemas import Header, Stroke, Topic
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Header, Stroke, Topic
 from brushloop.sessions.remarks import remarks_of
 
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
@@ -98,7 +97,7 @@ def details(path: Path) -> Details:
     found = _of_header(recording.header, "recording")
     strokes = list(recording.stroke_records())
     found.strokes, found.grid = len(strokes), _grid(strokes, recording.header)
-    found.messages = container.indexed_counts(recording.path)
+    found.messages = recording.counts
     found.file, found.size_bytes = recording.path.name, recording.path.stat().st_size
     return found
 

@@ -9,15 +9,14 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from brushloop.sessions.disk import check_room, free_bytes, fsync_folder, write_durably
+from brushloop.sessions.disk import check_digest, check_room, file_sha256, free_bytes, fsync_folder, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
 from brushloop.sessions.journal.codec import Line
 from brushloop.sessions.journal.journal import JOURNAL_NAME, Journal, Replay, read_header, replay
-from brushloop.sessions.merge import merge_session
 from brushloop.sessions.names import SEGMENT_NAME, check_folder
-from brushloop.sessions.recording.mcap_file import check_digest, file_sha256
-from brushloop.sessions.recording.schemas import Header, Recorded
-from brushloop.sessions.recording.writer import QUEUE_LIMIT, SegmentWriter
+from brushloop.sessions.recording import merge_session
+from brushloop.sessions.records import Header, Recorded
+from brushloop.sessions.step_file import QUEUE_LIMIT, SegmentWriter
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""

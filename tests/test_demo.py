@@ -21,7 +21,7 @@ from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.report.tables import table_1
 from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from tests.waiting import wait_until
 
 SMALL = """

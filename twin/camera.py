@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 STILLS = 8
 """Stills that are compared, each with the next one."""

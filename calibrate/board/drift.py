@@ -15,7 +15,7 @@ from brushloop.calibrate.board.view import see_board_and_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.line import Line, fit_line
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 MOVED_PX = 1.0
 """Movement of the board's middle between two views above which the camera or the board must have been touched."""

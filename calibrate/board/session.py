@@ -14,10 +14,9 @@ from brushloop.calibrate.board.lens import Gray, LensUsed
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording import container
-from brushloop.sessions.recording.messages import decode_gray, decode_still
-from brushloop.sessions.recording.schemas import StepEvent, Topic
+from brushloop.sessions.messages import decode_gray, decode_still
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import StepEvent, Topic
 
 EFFECTIVE = "rig.effective.json"
 """The configuration in effect: rig.toml, with the changes that the environment made."""
@@ -66,7 +65,7 @@ def known_lens(recording: Recording, given: Path | None) -> LensUsed | None:
 def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
     """(t_ns, gray photograph) of every `board` step in order. Raises `SessionDamaged` for one that cannot be read."""
     kind = ""
-    for _schema, channel, message in container.messages(recording.path, [str(Topic.STEP), str(Topic.STILL)]):
+    for _schema, channel, message in recording.messages(Topic.STEP, Topic.STILL):
         if channel.topic == Topic.STEP:
             event = StepEvent.model_validate_json(message.data)
             kind = event.kind if event.phase == "begin" else ""

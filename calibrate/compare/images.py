@@ -33,8 +33,8 @@ from brushloop.calibrate.stroke.preprocess import Prepared, prepare
 from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from brushloop.model.brush import Brush
 from brushloop.model.loops import Loop
-from brushloop.sessions.reader import Capture
-from brushloop.sessions.recording.schemas import Header, Stroke
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Header, Stroke
 
 if TYPE_CHECKING:
     from brushloop.model.outline import Shape

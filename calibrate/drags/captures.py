@@ -27,8 +27,8 @@ from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import on_raster, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Capture, Recording
-from brushloop.sessions.recording.schemas import Header, Stroke
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Header, Stroke
 
 Floats = NDArray[np.float64]
 MARGIN_MM = 16.0

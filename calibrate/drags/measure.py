@@ -24,8 +24,8 @@ from brushloop.calibrate.stroke.params import Gray, Mask, Params
 from brushloop.calibrate.stroke.preprocess import Prepared, preprocess, touches_edge
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.reader import Capture
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Stroke
 
 THUMB_PX = 160
 DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal")

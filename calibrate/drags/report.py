@@ -27,7 +27,7 @@ from brushloop.calibrate.report import (
     source_note,
     write_files,
 )
-from brushloop.sessions.recording.schemas import Header
+from brushloop.sessions.records import Header
 
 MAX_THUMBNAILS = 60
 MAX_WORST = 12

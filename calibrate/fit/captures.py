@@ -16,8 +16,8 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import calibration_of
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import Header
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Header
 
 Floats = NDArray[np.float64]
 Cell = tuple[float, float]

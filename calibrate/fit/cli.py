@@ -60,7 +60,7 @@ def fit(
     from brushloop.calibrate.fit.run import correction as corrected
     from brushloop.calibrate.fit.run import fit_session
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     before = load_artefact(reference, BrushFit) if reference is not None else None
     view = Field(mm_per_px=mm_per_px or MM_PER_PX)
@@ -82,7 +82,7 @@ def _fit_drags(
     from brushloop.calibrate.drags.captures import read_drags
     from brushloop.calibrate.drags.run import FOLDER, fit_drawn, refit_drawn
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     before = load_artefact(prior, DragArtefact) if prior is not None else None
     scale = mm_per_px or (before.mm_per_px if before is not None else DRAG_MM_PER_PX)

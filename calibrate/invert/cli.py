@@ -34,7 +34,7 @@ def invert(
 
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     check_target(out, ".csv")
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds

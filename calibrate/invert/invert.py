@@ -28,8 +28,8 @@ from brushloop.model.protocol import Basis, StrokeModel
 from brushloop.model.strokes import UnknownModelError, stroke_model
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Capture, Recording
-from brushloop.sessions.recording.schemas import Header, Stroke
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Header, Stroke
 
 _T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"

@@ -29,8 +29,8 @@ from brushloop.calibrate.stroke.measure import measure
 from brushloop.model.brush import DomainError
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Capture, Recording
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Header, Source
 
 if TYPE_CHECKING:
     from brushloop.model.protocol import StrokeModel

@@ -17,7 +17,7 @@ from brushloop.calibrate.compare.similarity import similarity
 from brushloop.calibrate.compare.stats import Summary, interval_over_groups, summarise
 from brushloop.calibrate.report import Sealed, load_sealed
 from brushloop.calibrate.stroke.measure import Measured
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 FILE = "loop.json"
 FORMAT = "brushloop-loop-1"

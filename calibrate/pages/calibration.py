@@ -34,8 +34,8 @@ from brushloop.calibrate.report import (
     source_point,
 )
 from brushloop.calibrate.session import FITTED
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.messages import decode_gray
+from brushloop.sessions.recording import Recording
 
 ARROW_SHARE = 0.4
 """Length of a typical arrow, as a share of the distance between corners."""

@@ -20,7 +20,7 @@ from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.measure import Measured, measure
 from brushloop.calibrate.validate.store import VERSION, Store
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.reader import Capture, Place, capture_at
+from brushloop.sessions.recording import Capture
 
 if TYPE_CHECKING:
     from brushloop.calibrate.validate.pool import Scheduler
@@ -48,7 +48,10 @@ class ReadJob:
     session: str
     """Path or URL of the recording."""
     sha256: str
-    place: Place
+    number: int
+    """Of the stroke, in order of capture."""
+    bad: dict[int, str]
+    """See `Recording.marked_bad`: remarks lie beside a recording, not in it."""
     calibration: Calibration | None
     view: Field
 
@@ -102,11 +105,11 @@ def prepare_job(job: PrepareJob) -> Press:
 
 
 def read_job(job: ReadJob) -> Press | None:
-    """Read a capture and prepare it; None if it does not directly follow its stroke, as in a recording of ours."""
+    """Read a capture and prepare it; None if it cannot be read alone, as in a recording of ours."""
     from brushloop.calibrate.validate.sources import opened  # not needed by jobs that get their photograph
 
     try:
-        capture = capture_at(opened(job.session, job.sha256), job.place)
+        capture = opened(job.session, job.sha256).capture(job.number, job.bad)
     except SessionDamaged:
         return None
     return prepare_job(PrepareJob(capture, job.calibration, job.view))
@@ -137,13 +140,9 @@ def prepared(
         progress(what, done, session.count)
 
     if waiting.any() and scheduler.opens(session.place, session.sha256):
-
-        def reading() -> Iterator[tuple[str, ReadJob]]:
-            for k, place in zip(every, session.recording.places(), strict=True):
-                if waiting[k]:
-                    yield str(k), ReadJob(session.place, session.sha256, place, session.calibration, view)
-
-        for number, read in scheduler.run(read_job, reading()):
+        bad, at = session.recording.marked_bad(), (session.place, session.sha256)
+        reading = ((str(k), ReadJob(*at, k, bad, session.calibration, view)) for k in every if waiting[k])
+        for number, read in scheduler.run(read_job, reading):
             if read is not None:
                 put(number, read)
     if waiting.any():

@@ -25,11 +25,11 @@ from brushloop.calibrate.files import replacing
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.session import calibration_of
+from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.mcap_file import file_sha256
-from brushloop.sessions.recording.schemas import Header, Source, Stroke
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Header, Source, Stroke
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3
@@ -164,15 +164,15 @@ def _limits(scheme: str) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=8)
-def opened(session: str, sha256: str) -> Path:
+def opened(session: str, sha256: str) -> Recording:
     """The recording as a file of this machine, checked once; a URL is copied. Raises what reading it raises."""
     if URL.match(session):
         address = session.partition("#")[0]
-        return fetched(f"{address}#sha256={sha256}", Path(tempfile.gettempdir()) / "brushloop-recordings")
+        return Recording(fetched(f"{address}#sha256={sha256}", Path(tempfile.gettempdir()) / "brushloop-recordings"))
     recording = Recording(Path(session))
     if recording.sha256 != sha256:
         raise SessionDamaged(recording.path, "is another recording there: its SHA-256 differs")
-    return recording.path
+    return recording
 
 
 def _backend_errors() -> tuple[type[Exception], ...]:

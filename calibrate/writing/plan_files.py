@@ -16,7 +16,7 @@ from brushloop.calibrate.report import write_files
 from brushloop.calibrate.writing.picture import draw
 from brushloop.calibrate.writing.plan_record import FILE, PROTOCOL, FigureRecord, Floats, PlannedBy, PlanRecord, Points
 from brushloop.model.characters.plan import Path as Way
-from brushloop.sessions.recording.messages import encode_png
+from brushloop.sessions.messages import encode_png
 
 if TYPE_CHECKING:
     from brushloop.calibrate.writing.plan import PlannedFigure, Settings

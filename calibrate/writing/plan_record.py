@@ -21,7 +21,7 @@ from brushloop.calibrate.compare.field import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.messages import decode_gray
 
 FILE, PROTOCOL = "plan.json", "protocol-write.toml"
 """Names of the files of a plan; the protocol is written last."""

@@ -18,7 +18,7 @@ from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
 from brushloop.calibrate.compare.similarity import Polarity, similarity
 from brushloop.calibrate.compare.stats import Summary, summarise
 from brushloop.calibrate.report import Sealed, load_sealed
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 FILE, PICTURE = "written.json", "figure-13.png"
 FORMAT = "brushloop-written-1"

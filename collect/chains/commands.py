@@ -14,7 +14,7 @@ from brushloop.collect.headless import stop_signals
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 Say = Callable[[str], None]
 GIVEN_UP = 3

@@ -20,8 +20,8 @@ from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.config_file import read_text
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import BareName, Header
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import BareName, Header
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"

@@ -18,15 +18,17 @@ from brushloop.collect.errors import ConfigError
 from brushloop.drivers.protocols import Camera
 from brushloop.drivers.samples import Frame
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording.messages import decode_gray, image_message
-from brushloop.sessions.recording.schemas import Topic
-from brushloop.sessions.recording.writer import ChannelTable, Outgoing
+from brushloop.sessions.messages import decode_gray, image_message
+from brushloop.sessions.records import Topic
+from brushloop.sessions.step_file import ChannelTable, Outgoing
 
 if TYPE_CHECKING:
     from foxglove import Channel
+    from mcap.records import Channel as Record
+    from mcap.records import Schema
 
-    from brushloop.sessions.recording.mcap_writer import McapWriter
-    from brushloop.sessions.recording.messages import CompressedImage
+    from brushloop.sessions.mcap_writer import McapWriter
+    from brushloop.sessions.messages import CompressedImage
 
 HOST = "127.0.0.1"
 """Loopback only, and not configurable, because a viewer needs no password."""
@@ -148,25 +150,17 @@ class _Channels:
 
     def __init__(self, context: Any) -> None:
         self._context = context
-        self._schemas: list[Any] = []
-        self._channels: list[Channel] = []
+        self._channels: dict[int, Channel] = {}
         self._topics: dict[str, int] = {}
 
-    def register_schema(self, *, name: str, encoding: str, data: bytes) -> int:
-        from foxglove import Schema
+    def add_channel(self, schema: Schema, channel: Record) -> None:
+        import foxglove
 
-        self._schemas.append(Schema(name=name, encoding=encoding, data=data))
-        return len(self._schemas) - 1
-
-    def register_channel(self, *, topic: str, message_encoding: str, schema_id: int) -> int:
-        from foxglove import Channel
-
-        schema = self._schemas[schema_id]
-        self._channels.append(
-            Channel(str(topic), schema=schema, message_encoding=message_encoding, context=self._context)
+        described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+        self._channels[channel.id] = foxglove.Channel(
+            channel.topic, schema=described, message_encoding=channel.message_encoding, context=self._context
         )
-        self._topics[topic] = len(self._channels) - 1
-        return self._topics[topic]
+        self._topics[channel.topic] = channel.id
 
     def add_message(self, *, channel_id: int, log_time: int, data: bytes, **_: int) -> None:
         channel = self._channels[channel_id]

@@ -27,7 +27,7 @@ from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unw
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.folders import next_session_id, open_sessions
 from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore, Snapshots
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"

@@ -17,7 +17,7 @@ from brushloop.collect.operator import OperatorRequest
 from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.errors import ArmMoved
-from brushloop.sessions.recording.schemas import StepEvent
+from brushloop.sessions.records import StepEvent
 
 HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
 """Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.samples import ForceSample, Frame, PoseSample, Stamp
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.recording.messages import (
+from brushloop.sessions.messages import (
     Transform,
     calibration_message,
     encode_png,
@@ -21,7 +21,7 @@ from brushloop.sessions.recording.messages import (
     pose_message,
     transforms_message,
 )
-from brushloop.sessions.recording.schemas import (
+from brushloop.sessions.records import (
     Cadence,
     Event,
     InkState,
@@ -32,7 +32,7 @@ from brushloop.sessions.recording.schemas import (
     Topic,
     Wrench,
 )
-from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.step_file import Outgoing, SegmentWriter
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message

@@ -25,10 +25,10 @@ from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.history import unlike, waits_of
 from brushloop.sessions.journal.codec import Line
 from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.names import check_folder
-from brushloop.sessions.recording import container
-from brushloop.sessions.recording.messages import decode_gray, decode_still
-from brushloop.sessions.recording.schemas import Check, Quality, Stroke, Topic
+from brushloop.sessions.records import Check, Quality, Stroke, Topic
 from brushloop.sessions.remarks import Remark, remarks_of
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ class Review:
         path = path if path.is_file() else self.folder / f"{self.folder.name}.mcap"
         image, log_ns, stroke = None, 0, None
         checks: tuple[Check, ...] = ()
-        for _schema, channel, message in container.messages(path, [Topic.STILL, Topic.STROKE, Topic.QUALITY]):
+        for _schema, channel, message in McapFile(path).messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
             if message.sequence != capture.still:
                 continue
             if channel.topic == Topic.STILL:

@@ -17,7 +17,7 @@ from brushloop.sessions.export.npz import SAMPLE_COLUMNS, write_npz
 from brushloop.sessions.export.parquet import write_parquet
 from brushloop.sessions.export.rows import Cropper, Export, ForceRow, PoseRow, Row
 from brushloop.sessions.progress import Progress, unseen
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.spool import Spool
 
 POSE_COLUMNS = (*SAMPLE_COLUMNS, "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Literal
 from brushloop.sessions.disk import sync, write_durably
 from brushloop.sessions.export.npz_file import NpzFile, Packed, npy_header, packed_image
 from brushloop.sessions.export.rows import Export, ForceRow, PoseRow, Row
-from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.spool import Spool
 
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")

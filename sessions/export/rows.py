@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -14,11 +13,10 @@ from pydantic import ValidationError
 
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.history import WAIT, unlike
+from brushloop.sessions.messages import PNG_START
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Capture, Recording
-from brushloop.sessions.recording import container
-from brushloop.sessions.recording.messages import PNG_START
-from brushloop.sessions.recording.schemas import Quality, StepEvent, Stroke, Topic, Wrench
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Quality, StepEvent, Stroke, Topic, Wrench
 
 TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
 CROP_TEXT_COLUMNS = ("mask_file", "flags")
@@ -109,7 +107,7 @@ class Export:
             if stroke.dip_to_touch_s is not None:
                 waits[stroke.stroke_id] = stroke.dip_to_touch_s
         odd = frozenset(unlike(waits))
-        return cls(recording, numbers, odd, _qualities(recording.path), progress, cropper, frames)
+        return cls(recording, numbers, odd, _qualities(recording), progress, cropper, frames)
 
     @property
     def pictures(self) -> tuple[str, ...]:
@@ -170,12 +168,12 @@ class Export:
     @property
     def has_force(self) -> bool:
         """Whether the rig had a force sensor."""
-        return container.indexed_counts(self.recording.path).get(Topic.WRENCH, 0) > 0
+        return self.recording.counts.get(Topic.WRENCH, 0) > 0
 
     def _samples(self, topic: Topic) -> Iterator[tuple[int, int, int, int, int, bytes]]:
         """(episode, frame, t_ns, log_ns, sequence, data) of a topic's messages during presses."""
         current, frame = -1, 0
-        for _schema, channel, message in container.messages(self.recording.path, [Topic.STEP, topic]):
+        for _schema, channel, message in self.recording.messages(Topic.STEP, topic):
             if channel.topic == Topic.STEP:
                 try:
                     event = StepEvent.model_validate_json(message.data)
@@ -236,14 +234,14 @@ def _suffix(still: bytes) -> str:
     return "png" if still.startswith(PNG_START) else "jpg"
 
 
-def _qualities(path: Path) -> dict[str, str]:
+def _qualities(recording: Recording) -> dict[str, str]:
     """Result of each stroke's quality checks; the last one counts."""
     found: dict[str, str] = {}
-    for _schema, _channel, message in container.messages(path, [Topic.QUALITY]):
+    for _schema, _channel, message in recording.messages(Topic.QUALITY):
         try:
             judged = Quality.model_validate_json(message.data)
         except ValidationError:
-            raise SessionDamaged(path, f"a message on {Topic.QUALITY} does not fit its schema") from None
+            raise SessionDamaged(recording.path, f"a message on {Topic.QUALITY} does not fit its schema") from None
         failed = ", ".join(check.name for check in judged.checks if not check.passed)
         found[judged.stroke_id] = f"failed: {failed}" if failed else "passed"
     return found

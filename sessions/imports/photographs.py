@@ -13,12 +13,12 @@ from pathlib import Path
 from brushloop.sessions.disk import read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.imports.table import Row, parse_table, read_text
+from brushloop.sessions.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message, upright
 from brushloop.sessions.names import SESSION_ID
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.recording.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message, upright
-from brushloop.sessions.recording.schemas import Header, Source, Topic
-from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.records import Header, Source, Topic
 from brushloop.sessions.spool import Spool
+from brushloop.sessions.step_file import Outgoing, SegmentWriter
 
 QUEUE_LIMIT = 16
 """Most photographs queued for writing; an import waits when the queue is full, and memory stays bounded."""

@@ -14,7 +14,7 @@ from typing import Literal
 from brushloop.sessions.cells import as_text, number
 from brushloop.sessions.disk import read_bounded
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.recording.schemas import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
+from brushloop.sessions.records import MAX_PX_PER_MM, MIN_PX_PER_MM, Stroke
 from brushloop.sessions.spool import Spool
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024

@@ -21,7 +21,7 @@ from brushloop.sessions.journal.codec import Chain, Line, digest, encode_line
 from brushloop.sessions.journal.events import NONSENSE, check_event, serial_of
 from brushloop.sessions.journal.lines import Fault, Reading, read, read_journal
 from brushloop.sessions.names import check_file
-from brushloop.sessions.recording.schemas import Header, Topic, TornTail
+from brushloop.sessions.records import Header, Topic, TornTail
 
 JOURNAL_NAME = "journal.jsonl"
 

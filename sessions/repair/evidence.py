@@ -14,17 +14,16 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, read_bounded
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, read_bounded
 from brushloop.sessions.errors import SessionDamaged, SessionError
 from brushloop.sessions.journal.codec import Line, encode_line, without_time
 from brushloop.sessions.journal.events import NONSENSE, serial_of
 from brushloop.sessions.journal.journal import JOURNAL_NAME, Account, DoneTwice, Replay, account, fold
 from brushloop.sessions.journal.lines import Fault, accounts_for, read_journal
+from brushloop.sessions.mcap_file import Scan, scan
 from brushloop.sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
-from brushloop.sessions.reader import parse_header
-from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, count_messages, file_sha256
-from brushloop.sessions.recording.salvage import Scan, recorded_in, scan, session_of
-from brushloop.sessions.recording.schemas import Header, Recorded, Topic
+from brushloop.sessions.recording import count_messages, parse_header
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Recorded, Topic
 from brushloop.sessions.store import closed_line, done_line, open_line
 
 
@@ -112,7 +111,7 @@ def _session(folder: Path, state: Replay) -> str:
         return named
     finals = {f"{folder.name}.mcap", f"{folder.resolve().name}.mcap"}
     paths = [path for path in folder.glob("*.mcap*") if SEGMENT_NAME.fullmatch(path.name) or path.name in finals]
-    files = Counter(session for path in paths if (session := session_of(path)))
+    files = Counter(session for path in paths if (session := scan(path, read_chunks=False).session))
     if folder.name in files or not files:
         return folder.name if files else named
     return named if files[named] == max(files.values()) else files.most_common(1)[0][0]
@@ -177,8 +176,8 @@ def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
     header: Header | None = None
     strays: list[str] = []
     for path, name, seen in _uncovered(found.folder, begun, done):
-        if recorded_in(seen) not in ("", found.session):
-            found.foreign[path.name] = recorded_in(seen)
+        if seen.session not in ("", found.session):
+            found.foreign[path.name] = seen.session
             continue
         if path.name.removesuffix(".part") != name:
             strays.append(path.name)
@@ -305,7 +304,11 @@ def _closed(found: Evidence) -> None:
         counts = count_messages(final)
     except SessionError:
         return
-    if counts and Counter(counts) >= Counter(found.state.counts()) and session_of(final) in ("", found.session):
+    if (
+        counts
+        and Counter(counts) >= Counter(found.state.counts())
+        and scan(final, read_chunks=False).session in ("", found.session)
+    ):
         line: Line = {"t_ns": found.state.last_ns, **closed_line(final, counts)}
         found.rebuilt.append(line)
         fold(found.state, line)

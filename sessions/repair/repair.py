@@ -13,17 +13,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from brushloop.sessions.disk import fsync_folder, holds, set_aside
+from brushloop.sessions.disk import check_digest, file_sha256, fsync_folder, holds, set_aside
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal.codec import Line, without_time
 from brushloop.sessions.journal.journal import JOURNAL_NAME, Replay, fold, read_header, replay
-from brushloop.sessions.merge import REPAIRS_NOTE, merge_session
+from brushloop.sessions.mcap_file import Record, Scan, scan
 from brushloop.sessions.names import SEGMENT_NAME
-from brushloop.sessions.recording.container import Record
-from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, check_digest, count_messages, file_sha256
-from brushloop.sessions.recording.salvage import Scan, recorded_in, scan
-from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, Topic
 from brushloop.sessions.repair.evidence import gather
 from brushloop.sessions.repair.journal import Report, kept_words, repaired_journal, write_anew
 from brushloop.sessions.repair.rewrite import lost_words, repair_file, replace_damaged, with_their_stills
@@ -185,7 +183,7 @@ class FolderRepair:
 
     def _is_ours(self, found: Scan) -> bool:
         """Whether a file may be evidence. Steps of another session of the same protocol have the same keys."""
-        return recorded_in(found) in ("", self._header.session_id)
+        return found.session in ("", self._header.session_id)
 
     def _write_again(
         self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str

@@ -13,12 +13,11 @@ from mcap.records import Message
 from brushloop.sessions.disk import fsync_folder, set_aside
 from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.journal.codec import Line
-from brushloop.sessions.reader import parse_header
-from brushloop.sessions.recording.container import Record
-from brushloop.sessions.recording.mcap_file import HEADER_METADATA, count_messages, header_crc, new_mcap
-from brushloop.sessions.recording.messages import decode_still
-from brushloop.sessions.recording.salvage import Scan, glimpsed, salvaged, scan
-from brushloop.sessions.recording.schemas import Header, Stroke, Topic
+from brushloop.sessions.mcap_file import Record, Scan, scan
+from brushloop.sessions.mcap_writer import new_mcap
+from brushloop.sessions.messages import decode_still
+from brushloop.sessions.recording import count_messages, parse_header
+from brushloop.sessions.records import HEADER_METADATA, Header, Stroke, Topic, header_crc
 from brushloop.sessions.repair.journal import Report, kept_words
 from brushloop.sessions.repair.union import parsed
 from brushloop.sessions.repair.verify import verify_session
@@ -57,15 +56,13 @@ class Strokes:
     """Strokes whose still cannot be read."""
     numbers_lost: tuple[int, ...]
     """Numbers, from 1, of the strokes that cannot be read themselves."""
-    names_lost: tuple[str, ...]
-    """Names of strokes still visible in damaged chunks."""
     total: int
     """Strokes that the recording held, as far as known."""
 
     def messages(self) -> Iterator[Record]:
         """Everything readable, except strokes without a photograph and strokes that were read before."""
         gone, seen = set(self.photograph_lost), set[str]()
-        for schema, channel, message in salvaged(self.found):
+        for schema, channel, message in self.found.messages():
             stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
             if stroke is not None:
                 if stroke.stroke_id in gone | seen:
@@ -76,9 +73,9 @@ class Strokes:
 
 def with_their_stills(found: Scan) -> Strokes:
     """Sort the strokes of a damaged file into those with their stills and those that are lost."""
-    there = {m.sequence for _, channel, m in salvaged(found) if channel.topic == Topic.STILL and _shows(m)}
+    there = {m.sequence for _, channel, m in found.messages() if channel.topic == Topic.STILL and _shows(m)}
     names: dict[str, bool] = {}
-    for _schema, channel, message in salvaged(found):
+    for _schema, channel, message in found.messages():
         stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
         if stroke is not None:
             names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
@@ -90,16 +87,14 @@ def with_their_stills(found: Scan) -> Strokes:
         number += count
     kept = tuple(name for name, whole in names.items() if whole)
     lost = tuple(name for name, whole in names.items() if not whole)
-    return Strokes(found, kept, lost, tuple(missing), tuple(glimpsed(found)) if missing else (), number)
+    return Strokes(found, kept, lost, tuple(missing), number)
 
 
 def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
     """Describe what was lost: each stroke by its name, or by its number if the name is lost, then other messages."""
     lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
-    named = len(strokes.names_lost) == len(strokes.numbers_lost)
-    for at, number in enumerate(strokes.numbers_lost):
-        name = f"{strokes.names_lost[at]}, " if named else ""
-        lost.append(f"stroke {name}number {number} of {strokes.total} in the recording: it cannot be read")
+    for number in strokes.numbers_lost:
+        lost.append(f"stroke number {number} of {strokes.total} in the recording: it cannot be read")
     named_count = len(strokes.numbers_lost) + len(strokes.photograph_lost)
     unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - named_count
     if unknown > 0:
@@ -132,9 +127,10 @@ def repair_file(path: Path) -> Report:
     report.lost += lost_words(strokes, Counter(found.stated or {}), counts)
     if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
         report.lost.append("anything else behind the damage: without its index its amount is unknown")
-    if found.stated is None:
+    if found.index is None:
         return report
-    if len(files) < found.stated_attachments or len(found.notes) < len(found.stated_notes - {HEADER_METADATA}):
+    noted = {one.name for one in found.index.metadata_indexes} - {HEADER_METADATA}
+    if len(files) < len(found.index.attachment_indexes) or len(found.notes) < len(noted):
         report.lost.append("an attached file, or a note of what was done to the recording")
     return report
 

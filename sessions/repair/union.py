@@ -16,11 +16,8 @@ from mcap.records import Message
 from pydantic import ValidationError
 
 from brushloop.sessions.journal.codec import Line
-from brushloop.sessions.recording.container import Record
-from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE
-from brushloop.sessions.recording.parts import Part
-from brushloop.sessions.recording.salvage import Scan, read_part, salvaged
-from brushloop.sessions.recording.schemas import StepEvent, Stroke, Topic
+from brushloop.sessions.mcap_file import Part, Record, Scan
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, StepEvent, Stroke, Topic
 
 Place = tuple[str, int]
 """Topic, and number within the step."""
@@ -45,7 +42,7 @@ def identity_of(found: Scan) -> tuple[str, int] | None:
                 return key, attempt
             case _:
                 pass
-    for _schema, channel, message in salvaged(found):
+    for _schema, channel, message in found.messages():
         if channel.topic == Topic.STEP:
             event = parsed(StepEvent, message)
             return None if event is None else (event.key, event.attempt)
@@ -98,7 +95,7 @@ def _of_step(source: Source, counts: Counter[str]) -> Iterator[tuple[Place, Reco
         inside = part.counts or Counter[str]()
         if not any(r.start < first[t] + inside[t] and first[t] < r.stop for t, r in wanted.items() if inside[t]):
             continue
-        for record in read_part(source.found, part):
+        for record in source.found.messages([part]):
             topic = record[1].topic
             if numbers[topic] in wanted.get(topic, ()):
                 yield (topic, numbers[topic] - source.before[topic]), record

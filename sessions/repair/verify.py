@@ -9,18 +9,17 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import holds
+from brushloop.sessions.disk import check_digest, holds
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal.codec import Line
 from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.mcap_file import Scan, scan
+from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.names import SEGMENT_NAME
 from brushloop.sessions.progress import Progress, counted, unseen
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.mcap_file import HEADER_METADATA, check_digest
-from brushloop.sessions.recording.messages import decode_gray, decode_still
-from brushloop.sessions.recording.salvage import Scan, recorded_in, salvaged, scan
-from brushloop.sessions.recording.schemas import Stroke, Topic
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
 from brushloop.sessions.repair.evidence import Evidence, gather
 from brushloop.sessions.show import details, step_words
 
@@ -79,7 +78,7 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
 def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
     verdict = Verdict(name, "recording", files=1)
     found, problems = file_problems(path, progress)
-    if found.stated is not None and HEADER_METADATA not in found.stated_notes:
+    if found.index is not None and HEADER_METADATA not in (one.name for one in found.index.metadata_indexes):
         raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_METADATA}")
     verdict.findings += [Finding(path.name, problem) for problem in problems]
     if not problems:
@@ -204,7 +203,7 @@ def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:
 
 def _foreign(found: Scan, evidence: Evidence) -> list[str]:
     """What is wrong with a file of another session: nothing in it is evidence."""
-    session = recorded_in(found)
+    session = found.session
     return [] if session in ("", evidence.session) else [f"is of another session, {session[:100]!r}"]
 
 
@@ -234,14 +233,12 @@ def file_problems(path: Path, progress: Progress = unseen) -> tuple[Scan, list[s
     """Read a file in full and list what is wrong with its chunks, index, images, and the stills of its strokes."""
     found = scan(path)
     problems = list(found.damage)
-    if found.stated is not None and not problems and found.stated != dict(found.counts):
-        problems.append(f"holds {dict(found.counts)}, but its index says {found.stated}")
     stills: set[int] = set()
     strokes: set[int] = set()
     """Hashes of their names, which take less memory."""
     images = 0
     try:
-        for _schema, channel, message in salvaged(found):
+        for _schema, channel, message in found.messages(topics=(*IMAGES, Topic.STROKE)):
             if channel.topic in IMAGES:
                 progress(f"{path.name}: images decoded", images, sum(found.counts[topic] for topic in IMAGES))
                 images += 1

@@ -9,7 +9,7 @@ from brushloop.calibrate.compare.field import KEYS
 from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
 from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 

@@ -22,8 +22,8 @@ from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.world import World
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

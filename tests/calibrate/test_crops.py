@@ -18,7 +18,7 @@ from bench.preprocess_rigs import Shot, sheet, true_mask
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.session import calibrate_session
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.records import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -31,7 +31,7 @@ from brushloop.calibrate.writing.plan_record import PlanRecord
 from brushloop.calibrate.writing.report import write_written
 from brushloop.calibrate.writing.scores import Character, score_character, table_3
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import BY, CALIBRATION
 from tests.photographed import imported, photograph

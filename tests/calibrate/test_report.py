@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from brushloop.calibrate.report import printable, source_label, source_note
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2: no evidence for the model)"
 

@@ -17,7 +17,7 @@ from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stages import trace_scaled
 from brushloop.calibrate.stroke.params import Params
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:

@@ -13,7 +13,7 @@ from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.headless import eta_text
 from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.collect.protocols.config import load_protocol
+from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.mcap_file import file_sha256
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Stroke
 from brushloop.sessions.repair.verify import verify_session
 
 if TYPE_CHECKING:

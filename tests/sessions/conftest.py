@@ -21,9 +21,9 @@ from brushloop.sessions.errors import InputError
 from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
 from brushloop.sessions.journal.journal import JOURNAL_NAME
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.recording.messages import encode_png, image_message, pose_message
-from brushloop.sessions.recording.schemas import Header, Source, StepEvent, Stroke, Topic
-from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.messages import encode_png, image_message, pose_message
+from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
+from brushloop.sessions.step_file import Outgoing, SegmentWriter
 from brushloop.sessions.store import SessionStore
 
 

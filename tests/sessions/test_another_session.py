@@ -6,7 +6,7 @@ import pytest
 
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.repair import repair_session
 from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.store import SessionStore

@@ -10,8 +10,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 
 from brushloop.sessions.errors import InputError, SessionDamaged
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording import index as index_file
+from brushloop.sessions.recording import Recording
 
 CUTS = 120
 FLIPS = 400
@@ -121,6 +120,6 @@ def test_a_file_that_may_not_be_read_is_refused(whole, path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(index_file.io, "FileIO", refuse)
+    monkeypatch.setattr("pathlib.Path.open", refuse)
     with pytest.raises(InputError, match="cannot open: Permission denied"):
         Recording(path)

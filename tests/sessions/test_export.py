@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.export.export import export
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.messages import decode_gray
-from brushloop.sessions.recording.schemas import Check, Quality, Topic, Wrench
-from brushloop.sessions.recording.writer import Outgoing
+from brushloop.sessions.messages import decode_gray
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Check, Quality, Topic, Wrench
+from brushloop.sessions.step_file import Outgoing
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from brushloop.sessions import messages
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.imports import photographs as importer
 from brushloop.sessions.imports import table
 from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording import messages
+from brushloop.sessions.recording import Recording
 
 START = {"start_x_px": "1", "start_y_px": "1"}
 ROWS = [

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from brushloop.sessions.cli import app
 from brushloop.sessions.export.export import export
 from brushloop.sessions.imports.photographs import ImportOptions
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Source
 from tests.command import brushloop
 
 START = {"start_x_px": "1", "start_y_px": "1"}

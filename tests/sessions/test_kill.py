@@ -7,7 +7,7 @@ import time
 from collections import Counter
 
 from brushloop.sessions.folders import open_sessions
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 KEYS = [f"step-{number:02d}" for number in range(12)]
 KILLS = 10
@@ -15,10 +15,10 @@ KILLS = 10
 COLLECT = """
 import random, sys, time
 from pathlib import Path
-from brushloop.sessions.recording.messages import image_message
-from brushloop.sessions.recording.schemas import Header, Stroke, Topic
+from brushloop.sessions.messages import image_message
+from brushloop.sessions.records import Header, Stroke, Topic
 from brushloop.sessions.store import SessionStore
-from brushloop.sessions.recording.writer import Outgoing
+from brushloop.sessions.step_file import Outgoing
 
 folder, keys = Path(sys.argv[1]), sys.argv[2:]
 header = Header(session_id=folder.name, source="loopback rig", software="test")

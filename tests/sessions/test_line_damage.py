@@ -21,7 +21,7 @@ from mcap.stream_reader import breakup_chunk
 
 from brushloop.sessions.journal.codec import with_crc
 from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.records import Topic
 from brushloop.sessions.repair.repair import repair_session
 from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.store import SessionStore

@@ -10,9 +10,9 @@ import pytest
 from mcap.writer import Writer
 
 from brushloop.sessions.errors import InputError, SessionDamaged
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.mcap_file import HEADER_METADATA, header_metadata
-from brushloop.sessions.recording.messages import decode_gray
+from brushloop.sessions.messages import decode_gray
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import HEADER_METADATA, header_metadata
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def test_an_image_bomb_is_refused_before_it_is_decoded(make, path, bomb, monkeyp
 
 
 def test_too_many_bytes_are_refused(make, monkeypatch):
-    monkeypatch.setattr("brushloop.sessions.recording.messages.MAX_IMAGE_BYTES", 10)
+    monkeypatch.setattr("brushloop.sessions.messages.MAX_IMAGE_BYTES", 10)
     with pytest.raises(SessionDamaged, match="exceeds 10"):
         decode_gray(make.png(), "a still")
 

@@ -11,7 +11,7 @@ from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.export.export import export
 from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.repair import repair_session
 from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.show import Summary, details, summaries

@@ -7,13 +7,14 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from brushloop.sessions import mcap_writer
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
 from brushloop.sessions.journal.codec import encode_line
 from brushloop.sessions.journal.journal import JOURNAL_NAME
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording import mcap_writer
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Topic
 from brushloop.sessions.repair import rewrite
 from brushloop.sessions.repair.repair import repair_session
 from brushloop.sessions.repair.verify import verify_session
@@ -368,7 +369,9 @@ def test_one_flipped_byte_of_a_lone_recording_costs_one_stroke_and_names_it(make
     shutil.copy(store.close(), path)
     store.release()
     with path.open("rb") as file:
-        chunk = make_reader(file).get_summary().chunk_indexes[2]
+        summary = make_reader(file).get_summary()
+    [stroke] = [number for number, channel in summary.channels.items() if channel.topic == Topic.STROKE]
+    chunk = [chunk for chunk in summary.chunk_indexes if stroke in chunk.message_index_offsets][2]
     data = bytearray(path.read_bytes())
     data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     path.write_bytes(data)

@@ -16,7 +16,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.records import Topic
 from brushloop.sessions.repair.repair import repair_session
 from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.store import SessionStore

@@ -14,9 +14,8 @@ from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, 
 from brushloop.sessions.folders import next_session_id, open_sessions
 from brushloop.sessions.journal.codec import with_crc
 from brushloop.sessions.journal.journal import JOURNAL_NAME, Journal
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.container import attachments
-from brushloop.sessions.recording.mcap_file import count_messages
+from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.recording import Recording, count_messages
 from brushloop.sessions.store import SessionStore
 
 CRC = re.compile(rb',"crc":"[0-9a-f]{8}"\}$')
@@ -157,7 +156,7 @@ def test_each_attached_file_says_what_it_is(make, tmp_path):
     final = store.close()
     store.release()
     expected = dict.fromkeys(make.snapshots, "application/toml") | {"rig.effective.json": "application/json"}
-    assert {a.name: a.media_type for a in attachments(final)} == expected
+    assert {a.name: a.media_type for a in McapFile(final).attachments()} == expected
 
 
 def test_a_closed_session_is_not_opened_for_writing_again(make, store, resume):

@@ -12,7 +12,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.decoder import DecoderFactory
 from pydantic import ValidationError
 
-from brushloop.sessions.recording.messages import (
+from brushloop.sessions.messages import (
     Transform,
     calibration_message,
     image_message,
@@ -20,8 +20,8 @@ from brushloop.sessions.recording.messages import (
     log_message,
     transforms_message,
 )
-from brushloop.sessions.recording.schemas import Cadence, Check, InkState, Quality, SlowSection, Topic, Wrench
-from brushloop.sessions.recording.writer import Outgoing
+from brushloop.sessions.records import Cadence, Check, InkState, Quality, SlowSection, Topic, Wrench
+from brushloop.sessions.step_file import Outgoing
 
 JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
 K = [[1500.0, 0.0, 1024.0], [0.0, 1500.0, 768.0], [0.0, 0.0, 1.0]]

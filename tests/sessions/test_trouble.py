@@ -17,7 +17,7 @@ from brushloop.sessions import disk
 from brushloop.sessions.errors import DiskFull, SessionError
 from brushloop.sessions.journal.journal import JOURNAL_NAME
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.store import STEP_BYTES, SessionStore
 from tests.waiting import PATIENCE_S

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.recording.mcap_file import HEADER_METADATA as HEADER
+from brushloop.sessions.records import HEADER_METADATA as HEADER
 from brushloop.sessions.repair.verify import verify_session
 from tests.command import brushloop
 
@@ -47,7 +47,7 @@ def test_a_flipped_bit_of_a_photograph_is_named_with_its_step(folder):
         chunks = make_reader(file).get_summary().chunk_indexes
     flip(path, chunks[1].chunk_start_offset + chunks[1].chunk_length // 2)
     [finding] = words(folder)
-    assert finding.startswith(f"{path.name}: (capture H13-a05-r00) a chunk at byte")
+    assert finding.startswith(f"{path.name}: (capture H13-a05-r00) the chunk at byte")
     assert finding.endswith("messages lost: 1 of /camera/still")
 
 

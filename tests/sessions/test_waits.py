@@ -8,7 +8,7 @@ import pytest
 
 from brushloop.sessions.export.export import export
 from brushloop.sessions.history import unlike, waits_of
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.records import Stroke
 
 
 def step(kind: str, stroke_id: str, **result: object) -> dict[str, object]:

@@ -21,10 +21,10 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.messages import decode_gray, log_message
-from brushloop.sessions.recording.schemas import Topic
-from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.messages import decode_gray, log_message
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Topic
+from brushloop.sessions.step_file import Outgoing, SegmentWriter
 
 
 class FullDisk(io.FileIO):
@@ -185,9 +185,9 @@ def test_a_writer_that_may_wait_loses_nothing_in_a_short_queue(make, path):
 KILLED = """
 import itertools, sys, time
 from pathlib import Path
-from brushloop.sessions.recording.messages import pose_message
-from brushloop.sessions.recording.schemas import Header, Topic
-from brushloop.sessions.recording.writer import Outgoing, SegmentWriter
+from brushloop.sessions.messages import pose_message
+from brushloop.sessions.records import Header, Topic
+from brushloop.sessions.step_file import Outgoing, SegmentWriter
 writer = SegmentWriter(Path(sys.argv[1]), Header(session_id="s", source="loopback rig", software="t"))
 for n in itertools.count():
     t_ns = time.time_ns()

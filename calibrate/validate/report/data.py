@@ -12,7 +12,7 @@ from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.loop.scores import LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.writing.scores import WrittenRecord
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 FORMAT = "brushloop-validation-1"
 MAX_BYTES = 256 * 1024 * 1024

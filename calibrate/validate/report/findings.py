@@ -15,7 +15,7 @@ from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.report.data import Report, Session, Stat
 from brushloop.calibrate.validate.run import ANOTHER as ANOTHER_PRESS
 from brushloop.calibrate.writing.scores import REFERENCE
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 CLOSE = 0.5
 """Points below which two models count as equal."""

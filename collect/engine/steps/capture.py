@@ -21,8 +21,8 @@ from brushloop.collect.quality.verdict import Check, Family, Verdict
 from brushloop.collect.rig.optics import undistorted
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.samples import Frame
+from brushloop.sessions import records
 from brushloop.sessions.history import limit_s, unlike, waits_of
-from brushloop.sessions.recording import schemas
 
 MOVED_MM = 1.0
 """Distance by which the sheet may seem to have moved in the picture since the first mark of the session."""
@@ -194,7 +194,7 @@ async def capture(context: StepContext) -> Result:
 
 
 async def _looked_at(
-    context: StepContext, frame: Frame, patch: Patch, waited: schemas.Check | None
+    context: StepContext, frame: Frame, patch: Patch, waited: records.Check | None
 ) -> tuple[Gray, Verdict | None]:
     """Record the frame, judge the stroke in it, and show both; nothing moves here."""
     image = await _recorded(context, frame)
@@ -205,7 +205,7 @@ async def _looked_at(
     return image, verdict
 
 
-def _wait_check(context: StepContext) -> schemas.Check | None:
+def _wait_check(context: StepContext) -> records.Check | None:
     """Compare this stroke's time from dip to touch with those of earlier strokes; None if it was not recorded.
 
     The check is recorded as a remark and decides nothing: the ink is judged from the photograph.
@@ -217,10 +217,10 @@ def _wait_check(context: StepContext) -> schemas.Check | None:
         return None
     reason, found = unlike(waits).get(still, ""), limit_s(waits.values())
     threshold = None if found is None else sum(found)
-    return schemas.Check(name="dip_to_touch", score=waits[still], threshold=threshold, passed=not reason, reason=reason)
+    return records.Check(name="dip_to_touch", score=waits[still], threshold=threshold, passed=not reason, reason=reason)
 
 
-async def _judged(context: StepContext, image: Gray, patch: Patch, waited: schemas.Check | None) -> Verdict | None:
+async def _judged(context: StepContext, image: Gray, patch: Patch, waited: records.Check | None) -> Verdict | None:
     """Judge the capture and record the checks; None where captures are not judged."""
     run, stroke_id = context.run, str(context.step.params["stroke_id"])
     if waited is not None and not waited.passed:
@@ -230,11 +230,11 @@ async def _judged(context: StepContext, image: Gray, patch: Patch, waited: schem
     with context.recorder.sections.timed("judge the capture"):
         verdict = await uninterrupted(_judge, context, image, patch)
     checks = tuple(
-        schemas.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
+        records.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
         for c in verdict.checks
     )
     remarks = () if waited is None else (waited,)
-    context.recorder.quality(schemas.Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
+    context.recorder.quality(records.Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
     if verdict.cause is not None:
         run.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
         if verdict.cause.name.family is Family.PICTURE:
@@ -274,9 +274,9 @@ def _show(context: StepContext, verdict: Verdict | None, image: Gray, patch: Pat
     context.run.progress.show(LastCapture(stroke_id, depth_mm, tilt_deg, still, True, verdict, photo, binary, model))
 
 
-def _stroke(context: StepContext, patch: Patch, dip_to_touch_s: float | None) -> schemas.Stroke:
+def _stroke(context: StepContext, patch: Patch, dip_to_touch_s: float | None) -> records.Stroke:
     again_of = context.step.params.get("again_of")
-    return schemas.Stroke(
+    return records.Stroke(
         stroke_id=str(context.step.params["stroke_id"]),
         kind="drag" if _drawn(context) else "press",
         still=context.attempt.serial,

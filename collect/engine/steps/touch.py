@@ -21,7 +21,7 @@ from brushloop.collect.touch.heights import PlaneResult, kept
 from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.drivers.samples import Frame
-from brushloop.sessions.recording.messages import Transform
+from brushloop.sessions.messages import Transform
 
 
 async def zero_touch(context: StepContext) -> Result:

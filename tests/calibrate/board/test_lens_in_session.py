@@ -28,8 +28,8 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import FITTED, calibrate_session
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.collect.tui.captures import Review
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -25,8 +25,8 @@ from brushloop.calibrate.stroke.params import Params
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.model.drag import DragModel, distances, trails
 from brushloop.model.drag import ink as chance
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Header, Source
 from tests.photographed import imported, photograph
 
 STROKES = [

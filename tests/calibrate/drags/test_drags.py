@@ -13,7 +13,7 @@ from brushloop.calibrate.drags.residual import Residual, threshold
 from brushloop.calibrate.drags.run import different
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.model.drag import DragModel, distances, ink, trails
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(-18.0, 18.0, 1.0)
 TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)

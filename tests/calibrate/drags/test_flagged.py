@@ -14,7 +14,7 @@ from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, validate_drags
 from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
 from brushloop.calibrate.stroke.params import Params
 from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 PX = 10
 LEFT, TOP = 200, 250

@@ -21,9 +21,9 @@ from brushloop.model.ccdbsm import ccdbsm
 from brushloop.model.inversion.press import Range
 from brushloop.model.raster.exact import coverage_at
 from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
-from brushloop.sessions.reader import Capture
-from brushloop.sessions.recording.messages import encode_png
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.messages import encode_png
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Stroke
 from tests.command import brushloop
 
 PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]

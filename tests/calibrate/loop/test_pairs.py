@@ -15,9 +15,9 @@ from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore
 from brushloop.model.brush import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
-from brushloop.sessions.reader import Capture
-from brushloop.sessions.recording.messages import encode_png
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.messages import encode_png
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Stroke
 from tests.calibrate.given import CALIBRATION
 
 MODEL = stroke_model("ccd-bsm", Brush())

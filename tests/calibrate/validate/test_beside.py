@@ -24,8 +24,8 @@ from brushloop.calibrate.validate.report import tables
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.run import REPEATED
 from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Source
 from tests.calibrate.records import loop_record, table_of, written_record
 
 FAST = ("--model", "line", "--no-held-out", "--no-parquet")

@@ -196,7 +196,7 @@ from pathlib import Path
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.validate.jobs import PrepareJob, prepare_job
 from brushloop.calibrate.validate.pool import Dask, Threads
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
 jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
 there = {{}}

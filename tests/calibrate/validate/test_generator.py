@@ -21,7 +21,7 @@ from brushloop.model.train import SHIPPED_GENERATOR
 from brushloop.model.train.checkpoint import load_generator, load_weights
 from brushloop.model.train.data import load_captures
 from brushloop.model.train.errors import TrainError
-from brushloop.sessions.recording.schemas import Source
+from brushloop.sessions.records import Source
 
 # One word a line, as the file's owner would write it.
 TRAINING = """

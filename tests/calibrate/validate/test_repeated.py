@@ -14,7 +14,7 @@ from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
 from brushloop.calibrate.validate.pool import Threads
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Options, validate_presses
 from brushloop.calibrate.validate.sources import open_session
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 
 def test_the_repetition_is_scored_against_its_original_only(

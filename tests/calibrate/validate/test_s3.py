@@ -18,7 +18,7 @@ from brushloop.__main__ import app, main
 from brushloop.calibrate.session import calibrate_session
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.sources import open_session
-from brushloop.sessions.recording.schemas import Stroke
+from brushloop.sessions.records import Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -30,9 +30,9 @@ from brushloop.calibrate.writing.scores import (
     score_character,
     table_3,
 )
-from brushloop.sessions.reader import Capture
-from brushloop.sessions.recording.messages import encode_png
-from brushloop.sessions.recording.schemas import Source, Stroke
+from brushloop.sessions.messages import encode_png
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Source, Stroke
 from tests.calibrate.given import BY, CALIBRATION
 from tests.calibrate.records import written_record
 

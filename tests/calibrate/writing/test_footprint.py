@@ -17,7 +17,7 @@ from brushloop.collect.protocols.write import WriteConfig
 from brushloop.model.characters.brush import Reach
 from brushloop.model.characters.plan import without_tilt
 from brushloop.model.footprint import NAMES, Footprint
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import BY, CALIBRATION
 from tests.command import brushloop
 

@@ -21,7 +21,7 @@ from brushloop.model.characters.ink import swept
 from brushloop.model.characters.lead import covered, drawn, first_lead, lead
 from brushloop.model.characters.plan import Path as Way
 from brushloop.model.footprint import NAMES, START, Footprint
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import BY, CALIBRATION
 
 SIDE_MM = 48.0

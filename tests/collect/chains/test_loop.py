@@ -15,7 +15,7 @@ import pytest
 
 from brushloop.calibrate.loop.scores import read_loop
 from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from tests.waiting import wait_until
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import pytest
 from brushloop.collect.errors import CollectAborted
 from brushloop.sessions.journal.journal import JOURNAL_NAME
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording import container
+from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import the_session
 from tests.collect.until import until, wait_for_end
@@ -59,7 +59,7 @@ def test_a_clock_that_is_set_within_a_step_and_between_two_moves_no_stamp(
     times_ns = [line["t_ns"] for line in lines]
     assert times_ns == sorted(times_ns)
     assert "clock" not in [line["event"] for line in lines]
-    stamps_ns = [message.log_time for _, _, message in container.messages(folder / f"{folder.name}.mcap")]
+    stamps_ns = [message.log_time for _, _, message in McapFile(folder / f"{folder.name}.mcap").messages()]
     assert max(stamps_ns) - min(stamps_ns) < 60e9
     assert engine.snapshot().elapsed_s < 60.0
     assert verify_session(folder).sound

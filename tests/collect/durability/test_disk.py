@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import Disk, parked, the_session
 from tests.command import brushloop

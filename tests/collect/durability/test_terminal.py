@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.verify import verify_session
 from tests.collect.durability.conftest import parked, the_session
 from tests.waiting import PATIENCE_S, wait_until

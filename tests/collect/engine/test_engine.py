@@ -17,7 +17,7 @@ from brushloop.drivers.errors import RobotNotSafe
 from brushloop.drivers.samples import Identity
 from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:

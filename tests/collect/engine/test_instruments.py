@@ -15,7 +15,7 @@ from brushloop.drivers.errors import ConnectionLost, Stuck
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.sim.faults.kinds import Device, Fault
 from brushloop.sessions.journal.journal import replay
-from brushloop.sessions.recording.schemas import Topic
+from brushloop.sessions.records import Topic
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:

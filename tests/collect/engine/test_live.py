@@ -29,11 +29,11 @@ from brushloop.collect.engine.telemetry import FRAME_PERIOD_S
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import start
 from brushloop.drivers.samples import Frame, Stamp
-from brushloop.sessions.recording import container
-from brushloop.sessions.recording.messages import encode_png, image_message, pose_message
-from brushloop.sessions.recording.schemas import Topic, Wrench
-from brushloop.sessions.recording.writer import Outgoing
+from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.messages import encode_png, image_message, pose_message
+from brushloop.sessions.records import Topic, Wrench
 from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.step_file import Outgoing
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S
 
@@ -295,7 +295,7 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
     thread.join(timeout=PATIENCE_S)
     [folder] = lab.sessions.iterdir()
     assert verify_session(folder).sound
-    recorded = set(container.indexed_counts(folder / f"{folder.name}.mcap"))
+    recorded = set(McapFile(folder / f"{folder.name}.mcap").counts)
     assert Topic.PREVIEW not in recorded
     assert {Topic.PREVIEW, Topic.TCP, Topic.WRENCH, Topic.STEP, Topic.STROKE} <= seen
     assert seen <= {*recorded, Topic.PREVIEW} - {Topic.STILL}

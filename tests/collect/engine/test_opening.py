@@ -20,7 +20,7 @@ from brushloop.drivers.clock import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from brushloop.sessions.difference import Difference
-from brushloop.sessions.recording.schemas import Header, Source
+from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
 

@@ -16,7 +16,7 @@ from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorR
 from brushloop.collect.protocols.steps import Result, Step, StepKind
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
 from tests.collect.until import until, wait_for_end

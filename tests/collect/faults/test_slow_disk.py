@@ -19,8 +19,8 @@ from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.journal.lines import read_lines
-from brushloop.sessions.reader import Recording
-from brushloop.sessions.recording.writer import ChannelTable
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.step_file import ChannelTable
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.start_screen import StartScreen
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.remarks import remarks_of
 from brushloop.sessions.repair.verify import verify_session
 from tests.collect.tui.screen_text import has_picture, shown

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brushloop.sessions.disk import fsync_folder, sync
+from mcap.records import Channel, Schema
+
+from brushloop.sessions.disk import file_sha256, fsync_folder, sync
 from brushloop.sessions.errors import SessionError, disk_error
-from brushloop.sessions.recording.mcap_file import BEGIN_NOTE, DONE_NOTE, file_sha256, note, start_mcap
-from brushloop.sessions.recording.mcap_writer import McapWriter
-from brushloop.sessions.recording.schemas import Event, Header, Recorded, Topic
+from brushloop.sessions.mcap_writer import McapWriter, start_mcap
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, Event, Header, Recorded, Topic, note
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -158,18 +159,22 @@ def encoded(message: Event | Message) -> bytes:
 
 
 class ChannelTable:
-    """Registers a channel at the first message on a topic, and flushes so that its schema is on disk."""
+    """Adds a channel at the first message on a topic, and flushes so that its schema is on disk.
+
+    A topic has the same number in every file, so that a merge can copy chunks as they are.
+    """
 
     def __init__(self, writer: McapWriter) -> None:
         self._writer = writer
-        self._channels: dict[str, int] = {}
+        self._numbers: dict[str, int] = {}
 
     def add(self, outgoing: Outgoing) -> None:
         """Encode and write one message."""
-        number = self._channels.get(outgoing.topic)
+        number = self._numbers.get(outgoing.topic)
         new = number is None
         if number is None:
-            number = self._channels[outgoing.topic] = self._register(outgoing)
+            number = self._numbers[outgoing.topic] = list(Topic).index(outgoing.topic) + 1
+            self._writer.add_channel(*_channel(number, outgoing))
         self._writer.add_message(
             channel_id=number,
             log_time=outgoing.log_ns,
@@ -180,16 +185,17 @@ class ChannelTable:
         if new or outgoing.topic == Topic.STROKE:  # ends the chunk, so that a damaged chunk costs one stroke
             self._writer.flush()
 
-    def _register(self, outgoing: Outgoing) -> int:
-        message = outgoing.message
-        if isinstance(message, Event):
-            name, encoding = f"brushloop.{type(message).__name__}", "json"
-            schema = json.dumps(type(message).model_json_schema(), sort_keys=True).encode()
-            schema_encoding = "jsonschema"
-        else:
-            from mcap_protobuf.schema import build_file_descriptor_set
 
-            name, encoding, schema_encoding = message.DESCRIPTOR.full_name, "protobuf", "protobuf"
-            schema = build_file_descriptor_set(type(message)).SerializeToString()
-        schema_id = self._writer.register_schema(name=name, encoding=schema_encoding, data=schema)
-        return self._writer.register_channel(topic=outgoing.topic, message_encoding=encoding, schema_id=schema_id)
+def _channel(number: int, outgoing: Outgoing) -> tuple[Schema, Channel]:
+    """The channel of a topic and its schema, both under this number."""
+    message = outgoing.message
+    if isinstance(message, Event):
+        data = json.dumps(type(message).model_json_schema(), sort_keys=True).encode()
+        schema = Schema(id=number, name=f"brushloop.{type(message).__name__}", encoding="jsonschema", data=data)
+    else:
+        from mcap_protobuf.schema import build_file_descriptor_set
+
+        data = build_file_descriptor_set(type(message)).SerializeToString()
+        schema = Schema(id=number, name=message.DESCRIPTOR.full_name, encoding="protobuf", data=data)
+    encoding = "json" if isinstance(message, Event) else "protobuf"
+    return schema, Channel(number, str(outgoing.topic), encoding, {}, number)

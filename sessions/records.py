@@ -5,15 +5,21 @@ Foxglove's types are protobuf, which any viewer shows; our events are JSON, whic
 
 from __future__ import annotations
 
+import json
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from brushloop.sessions.names import bare_name
 
 SCHEMA_VERSION = 1
+HEADER_METADATA = "brushloop.header"
+BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"
+"""Notes of a step's file: the journal's lines about it, so that a lost journal can be rebuilt."""
 
 
 def _bare_or_empty(value: str) -> str:
@@ -88,6 +94,8 @@ class Stroke(Event):
     """`sequence` of the message on /camera/still that shows this stroke."""
     depth_mm: float | None = None
     """Commanded press depth H; None where the source has none."""
+    reached_mm: float | None = None
+    """Depth that the arm reached, measured along the paper's normal; None where it was not measured."""
     tilt_deg: float | None = None
     heading_deg: float = 0.0
     cell_mm: tuple[float, float, float, float] | None = None
@@ -214,3 +222,41 @@ class Recorded:
     counts: dict[str, int]
     sha256: str
     size_bytes: int
+
+
+def header_metadata(header: Header) -> dict[str, str]:
+    """Header as MCAP metadata: every value as JSON, so that it reads back unchanged, and a CRC, which MCAP lacks."""
+    values = {name: json.dumps(value) for name, value in header.model_dump(mode="json").items()}
+    return {**values, "crc": header_crc(values)}
+
+
+def header_crc(values: dict[str, str]) -> str:
+    """CRC-32 of a header's metadata, without `crc` itself."""
+    texts = {name: text for name, text in values.items() if name != "crc"}
+    return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"
+
+
+def session_in(metadata: dict[str, str]) -> str:
+    """Id of the session in a header's metadata; empty where it does not match its CRC."""
+    try:
+        session = json.loads(metadata.get("session_id", '""'))
+    except (ValueError, RecursionError):
+        return ""
+    return session if isinstance(session, str) and metadata.get("crc") == header_crc(metadata) else ""
+
+
+def note(values: Mapping[str, Any]) -> dict[str, str]:
+    """Values as MCAP metadata with a CRC."""
+    text = json.dumps(values, separators=(",", ":"), allow_nan=False)
+    return {"json": text, "crc": f"{zlib.crc32(text.encode()):08x}"}
+
+
+def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
+    """Values of a note; None where it does not match its CRC. Raises `ValueError` where it is not a note."""
+    text = metadata.get("json", "")
+    if metadata.get("crc") != f"{zlib.crc32(text.encode()):08x}":
+        return None
+    values = json.loads(text)
+    if not isinstance(values, dict):
+        raise ValueError("holds no values")
+    return cast("dict[str, Any]", values)
