@@ -54,10 +54,6 @@ class Strokes:
     kept: tuple[str, ...]
     photograph_lost: tuple[str, ...]
     """Strokes whose still cannot be read."""
-    numbers_lost: tuple[int, ...]
-    """Numbers, from 1, of the strokes that cannot be read themselves."""
-    total: int
-    """Strokes that the recording held, as far as known."""
 
     def messages(self) -> Iterator[Record]:
         """Everything readable, except strokes without a photograph and strokes that were read before."""
@@ -79,26 +75,17 @@ def with_their_stills(found: Scan) -> Strokes:
         stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
         if stroke is not None:
             names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
-    missing: list[int] = []
-    number = 0
-    for part in found.parts:
-        count = (part.counts or Counter[str]())[Topic.STROKE]
-        missing += [] if part.sound else range(number + 1, number + count + 1)
-        number += count
     kept = tuple(name for name, whole in names.items() if whole)
     lost = tuple(name for name, whole in names.items() if not whole)
-    return Strokes(found, kept, lost, tuple(missing), number)
+    return Strokes(found, kept, lost)
 
 
 def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
-    """Describe what was lost: each stroke by its name, or by its number if the name is lost, then other messages."""
+    """Describe what was lost: each stroke by its name, as far as that can be read, then other messages."""
     lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
-    for number in strokes.numbers_lost:
-        lost.append(f"stroke number {number} of {strokes.total} in the recording: it cannot be read")
-    named_count = len(strokes.numbers_lost) + len(strokes.photograph_lost)
-    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - named_count
+    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - len(lost)
     if unknown > 0:
-        lost.append(f"{unknown} strokes whose names are lost too")
+        lost.append(f"strokes that cannot be read: {unknown}")
     gone = {topic: count - now.get(topic, 0) for topic, count in before.items() if topic != Topic.STROKE}
     return lost + [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
 
