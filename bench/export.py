@@ -1,4 +1,4 @@
-"""How long the export of many strokes takes in each format, and whether that of arrays needs more memory for more."""
+"""How long the export of many strokes takes in each format."""
 
 from __future__ import annotations
 
@@ -13,26 +13,21 @@ from bench.peak import Used, measure
 from bench.press_sessions import CLOSE, Presses, session
 
 STROKES = 2000
-FEW = 10
-"""The other session of the comparison of memory has this many times fewer strokes."""
 GOAL_S = 5.0
-MOST_GROWTH = 1.05
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Seconds to export `n` strokes (2,000) in each format, and the peak memory of `npz` beside a tenth of them.
+    """Seconds to export `n` strokes (2,000) in each format.
 
-    ratio = for `npz` the goal over ours, for the others npz over ours; for memory 1.05 times the peak at a tenth over
-    ours. Raises BenchError where a command fails, ValueError for fewer than ten strokes.
+    ratio = for `npz` the goal over ours, for the others npz over ours. Raises BenchError where a command fails,
+    ValueError for n < 1.
     """
     strokes = STROKES if n is None else n
-    if strokes < FEW:
-        raise ValueError(f"n = {n}: at least {FEW} strokes are needed")
+    if strokes < 1:
+        raise ValueError(f"n = {n}: at least one stroke is needed")
     with tempfile.TemporaryDirectory() as folder:
         under = Path(folder)
         many = session(under, "many", Presses(strokes, seed))
-        few = session(under, "few", Presses(strokes // FEW, seed))
-        level = _exported(few, under / "out", "npz")
         used = {kind: _exported(many, under / "out", kind) for kind in ("npz", "png", "parquet")}
     npz = used["npz"]
     cpu = ", ".join(f"{kind} {one.cpu_s:.1f}" for kind, one in used.items())
@@ -40,8 +35,6 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     where = f"loopback rig, {strokes} strokes, photographs of {size} without noise; CPU-s: {cpu}; {machine()}"
     rows = [("npz", npz.wall_s, "s", f"goal {GOAL_S:g} s at most for 2,000 strokes", GOAL_S / npz.wall_s)]
     rows += [(kind, one.wall_s, "s", "npz", npz.wall_s / one.wall_s) for kind, one in used.items() if kind != "npz"]
-    limit = f"{MOST_GROWTH:g} times the peak at {strokes // FEW}"
-    rows += [("npz-memory", npz.peak_mb, "MB", limit, MOST_GROWTH * level.peak_mb / npz.peak_mb)]
     return [
         Result(f"export.{name}", value, unit, peer, ratio, 1, seed, where) for name, value, unit, peer, ratio in rows
     ]

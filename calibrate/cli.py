@@ -11,7 +11,7 @@ from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from brushloop.sessions.export.rows import Cropper
+    from brushloop.sessions.export_rows import Cropper
     from brushloop.sessions.recording import Recording
 
 LEFT_OUT = 3
@@ -148,7 +148,7 @@ def export(
     Ends with exit code 3 if strokes could not be cropped; they are named.
     """
     from brushloop.calibrate.errors import CalibrationError
-    from brushloop.sessions.export.export import export as write
+    from brushloop.sessions.export import export as write
     from brushloop.sessions.progress import shown
 
     if not crops and (frames or calibration is not None):

@@ -6,7 +6,7 @@ import io
 import pytest
 
 from brushloop.sessions.cells import CsvWriter, as_cell, as_text, number
-from brushloop.sessions.export.export import export
+from brushloop.sessions.export import export
 from brushloop.sessions.imports.photographs import ImportOptions
 from brushloop.sessions.recording import Recording
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.sessions.errors import InputError, SessionError
-from brushloop.sessions.export.export import export
+from brushloop.sessions.export import export
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
@@ -132,6 +132,17 @@ def test_npz_loads_without_pickle(make, session, to):
         assert arrays["pose_position_mm"].shape == (10, 3)
         assert arrays["pose_t_ns"].dtype == np.int64
         assert arrays["pose_episode_index"].tolist() == [0] * 5 + [1] * 5
+
+
+def test_equal_recordings_make_equal_arrays_and_a_value_that_only_a_later_stroke_has_is_nan_before(make, tmp_path):
+    later = make.stroke(1, reached_mm=12.9, commanded={"length_mm": 30.0})
+    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0), make.still(1), later)
+    export(path, tmp_path / "out", "npz")
+    export(path, tmp_path / "again", "npz")
+    assert (tmp_path / "out" / "strokes.npz").read_bytes() == (tmp_path / "again" / "strokes.npz").read_bytes()
+    with np.load(tmp_path / "out" / "strokes.npz", allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(arrays["commanded_length_mm"], [np.nan, 30.0])
+        np.testing.assert_array_equal(arrays["reached_mm"], [np.nan, 12.9])
 
 
 def test_parquet_is_what_datasets_reads(make, session, to):

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
-from brushloop.sessions.export.export import export
+from brushloop.sessions.export import export
 from brushloop.sessions.imports.photographs import ImportOptions
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source

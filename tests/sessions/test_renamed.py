@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.export.export import export
+from brushloop.sessions.export import export
 from brushloop.sessions.journal.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair.repair import repair_session

@@ -6,7 +6,7 @@ import csv
 
 import pytest
 
-from brushloop.sessions.export.export import export
+from brushloop.sessions.export import export
 from brushloop.sessions.history import unlike, waits_of
 from brushloop.sessions.records import Stroke
 

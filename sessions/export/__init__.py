@@ -1,1 +1,0 @@
-"""Exports of recordings for other tools: images with tables, NumPy, Parquet."""
