@@ -23,7 +23,7 @@ from brushloop.calibrate.compare.similarity import binary_scores
 from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.paper import Footprint
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 
 PX_MM, SIZE_PX = 0.3, 128
 LEFT_MM, TOP_MM = 29.1, 19.2

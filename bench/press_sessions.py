@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.recording import Recording
 
 CELLS = tuple((height, tilt) for height in (11.0, 13.0, 15.0, 17.0, 20.0) for tilt in (0.0, 5.0, 10.0))

@@ -16,7 +16,7 @@ import typer
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from brushloop.sessions.imports.photographs import ImportOptions
+    from brushloop.sessions.imports import ImportOptions
 
 LOSSY, DAMAGED = 3, 6
 Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap file.")]
@@ -161,7 +161,7 @@ def import_(
     simulated: Simulated = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
-    from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+    from brushloop.sessions.imports import ImportOptions, import_photographs
 
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     _import(import_photographs, folder, csv, out, options)

@@ -11,7 +11,7 @@ import numpy as np
 
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.paper import Footprint
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 
 PAPER_GRAY, INK_GRAY = 235, 200
 """Gray of the paper, and how much of it full ink takes away."""

@@ -18,7 +18,7 @@ import pytest
 from mcap.reader import make_reader
 
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.journal.journal import JOURNAL_NAME
 from brushloop.sessions.journal.lines import read_lines
 from brushloop.sessions.messages import encode_png, image_message, pose_message

@@ -7,7 +7,7 @@ import pytest
 
 from brushloop.sessions.cells import CsvWriter, as_cell, as_text, number
 from brushloop.sessions.export import export
-from brushloop.sessions.imports.photographs import ImportOptions
+from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.recording import Recording
 
 FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1", "''=1", "＝1"]

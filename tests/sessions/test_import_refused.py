@@ -9,11 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.sessions import messages
+from brushloop.sessions import imports, messages
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.imports import photographs as importer
-from brushloop.sessions.imports import table
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.recording import Recording
 
 START = {"start_x_px": "1", "start_y_px": "1"}
@@ -165,9 +163,9 @@ def test_a_table_that_is_not_utf8_is_refused(make, photos, refusal):
 
 def test_a_huge_table_is_refused(make, photos, refusal, monkeypatch):
     make.photographs(photos, *ROWS)
-    monkeypatch.setattr(table, "MAX_ROWS", 1)
+    monkeypatch.setattr(imports, "MAX_ROWS", 1)
     assert refusal() == "photos/table.csv: has more than 1 rows"
-    monkeypatch.setattr(table, "MAX_TABLE_BYTES", 10)
+    monkeypatch.setattr(imports, "MAX_TABLE_BYTES", 10)
     assert "larger than 10 bytes" in refusal()
 
 
@@ -175,7 +173,7 @@ def test_a_huge_photograph_is_refused(make, photos, refusal, monkeypatch):
     make.photographs(photos, *ROWS)
     monkeypatch.setattr(messages, "MAX_IMAGE_PIXELS", 100)
     assert refusal() == "photos/a.png: image of 24 x 24 pixels exceeds 100"
-    monkeypatch.setattr(importer, "MAX_IMAGE_BYTES", 10)
+    monkeypatch.setattr(imports, "MAX_IMAGE_BYTES", 10)
     assert "photos/a.png: is larger than 10 bytes" in refusal()
 
 
@@ -188,14 +186,14 @@ def test_a_name_that_is_no_session_id_is_refused(make, tmp_path, photos):
 def test_a_photograph_that_changes_under_the_import_is_refused(make, photos, refusal, monkeypatch):
     make.photographs(photos, *ROWS)
     (photos.parent / "sessions").mkdir()
-    read = importer.read_bounded
+    read = imports.read_bounded
     seen = []
 
     def change(path, max_bytes):
         seen.append(path)
-        return read(path, max_bytes) + b"x" * (len(seen) > 2)
+        return read(path, max_bytes) + b"x" * (len(seen) > 3)
 
-    monkeypatch.setattr(importer, "read_bounded", change)
+    monkeypatch.setattr(imports, "read_bounded", change)
     assert refusal() == "photos/a.png: changed while it was imported"
 
 

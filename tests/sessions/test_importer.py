@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.export import export
-from brushloop.sessions.imports.photographs import ImportOptions
+from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.command import brushloop

@@ -13,7 +13,7 @@ from brushloop.calibrate.drags.captures import read_drags
 from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, validate_drags
 from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
 from brushloop.calibrate.stroke.params import Params
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.recording import Recording
 
 PX = 10

@@ -20,7 +20,7 @@ from brushloop.model.brush import Brush
 from brushloop.model.ccdbsm import ccdbsm
 from brushloop.model.inversion.press import Range
 from brushloop.model.raster.exact import coverage_at
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Stroke

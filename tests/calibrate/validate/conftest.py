@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
 PX_MM = 10.0

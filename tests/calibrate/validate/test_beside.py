@@ -23,7 +23,7 @@ from brushloop.calibrate.loop.scores import LoopRecord
 from brushloop.calibrate.validate.report import tables
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.run import REPEATED
-from brushloop.sessions.imports.photographs import ImportOptions, import_photographs
+from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.calibrate.records import loop_record, table_of, written_record

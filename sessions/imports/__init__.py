@@ -1,1 +1,0 @@
-"""Imports: photographs from elsewhere become sessions."""
