@@ -76,7 +76,7 @@ def verify(session: Session) -> None:
     Exit code 0: everything is intact. 6: something is damaged, and is named.
     """
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.repair.verify import verify_session
+    from brushloop.sessions.verify import verify_session
 
     with shown() as progress:
         verdict = verify_session(session, progress)
@@ -101,7 +101,7 @@ def repair(session: Session) -> None:
     """
     import time
 
-    from brushloop.sessions.repair.repair import repair_session
+    from brushloop.sessions.repair import repair_session
 
     report = repair_session(session, time.time_ns)
     for line in report.did:

@@ -6,7 +6,8 @@ import datetime as dt
 from pathlib import Path
 
 from brushloop.sessions.errors import InputError, SessionError
-from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal.journal import is_open, replay
 from brushloop.sessions.names import SEGMENT_NAME, check_folder
 
 

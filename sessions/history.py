@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from brushloop.sessions.errors import SessionDamaged, in_one_line
-from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal import JOURNAL_NAME, Line
 from brushloop.sessions.journal.events import NONSENSE
-from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal.journal import replay
 
 CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
 LEAST_S = 2.0

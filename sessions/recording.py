@@ -19,7 +19,8 @@ from pydantic import ValidationError
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, fsync_folder, read_bounded, set_aside
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error, in_one_line
 from brushloop.sessions.folders import check_name, not_a_session
-from brushloop.sessions.journal.journal import JOURNAL_NAME, Replay, is_open, replay
+from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal.journal import Replay, is_open, replay
 from brushloop.sessions.mcap_file import McapFile, Record, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_gray, decode_still

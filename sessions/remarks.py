@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.journal.journal import Journal
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import Journal, read_lines
 
 REMARKS_NAME = "remarks.jsonl"
 

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
 from brushloop.sessions.folders import check_name, recording_of_renamed
-from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal import JOURNAL_NAME, Line
 from brushloop.sessions.journal.events import NONSENSE
-from brushloop.sessions.journal.journal import JOURNAL_NAME, Replay, is_open, read_header, replay, replay_lines
+from brushloop.sessions.journal.journal import Replay, is_open, read_header, replay, replay_lines
 from brushloop.sessions.names import check_folder
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Stroke, Topic

@@ -11,8 +11,8 @@ from filelock import FileLock, Timeout
 
 from brushloop.sessions.disk import check_digest, check_room, file_sha256, free_bytes, fsync_folder, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
-from brushloop.sessions.journal.codec import Line
-from brushloop.sessions.journal.journal import JOURNAL_NAME, Journal, Replay, read_header, replay
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line
+from brushloop.sessions.journal.journal import Replay, read_header, replay
 from brushloop.sessions.names import SEGMENT_NAME, check_folder
 from brushloop.sessions.recording import merge_session
 from brushloop.sessions.records import Header, Recorded

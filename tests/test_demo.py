@@ -19,8 +19,8 @@ from mcap.reader import make_reader
 from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.report.tables import table_1
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.journal.journal import replay
-from brushloop.sessions.journal.lines import read_lines
 from brushloop.sessions.recording import Recording
 from tests.waiting import wait_until
 

@@ -27,7 +27,8 @@ from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.session import calibration_of
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Source, Stroke
 

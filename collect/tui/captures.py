@@ -23,8 +23,8 @@ from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.history import unlike, waits_of
-from brushloop.sessions.journal.codec import Line
-from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
+from brushloop.sessions.journal import JOURNAL_NAME, Line
+from brushloop.sessions.journal.journal import is_open, replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.names import check_folder

@@ -23,7 +23,7 @@ from brushloop.collect.tui.widgets import Line
 from brushloop.sessions.errors import SessionError
 
 if TYPE_CHECKING:
-    from brushloop.sessions.repair.verify import Verdict
+    from brushloop.sessions.verify import Verdict
 
 MOST_LINES = 400
 """Number of lines shown of a command's output: the last ones."""
@@ -125,7 +125,7 @@ class FinishScreen(ModalScreen[None]):
 
 def verify(folder: Path) -> Verdict:
     """Read every file of a session again. Raises `InputError`."""
-    from brushloop.sessions.repair.verify import verify_session
+    from brushloop.sessions.verify import verify_session
 
     return verify_session(folder)
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from typing import Any, cast
 
-from brushloop.sessions.journal.codec import Line
+from brushloop.sessions.journal import Line
 from brushloop.sessions.names import bare_name
 
 NONSENSE = (KeyError, TypeError, ValueError, OverflowError, AttributeError)

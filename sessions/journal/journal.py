@@ -8,95 +8,16 @@ clock was set back), `ended` (how a run ended before its time), `closed`. A repa
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import fsync_folder
-from brushloop.sessions.errors import SessionDamaged, disk_error, in_one_line
-from brushloop.sessions.journal.codec import Chain, Line, digest, encode_line
+from brushloop.sessions.errors import SessionDamaged, in_one_line
+from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, Reading, read, read_journal
 from brushloop.sessions.journal.events import NONSENSE, check_event, serial_of
-from brushloop.sessions.journal.lines import Fault, Reading, read, read_journal
-from brushloop.sessions.names import check_file
-from brushloop.sessions.records import Header, Topic, TornTail
-
-JOURNAL_NAME = "journal.jsonl"
-
-
-class Journal:
-    """Writer that appends to one journal file. The caller holds the session's lock, so only one process writes.
-
-    `t_ns`, the time of opening, dates the note about a torn tail. With a `session` id, new lines are chained, even
-    after unchained lines. Raises `SessionError` where the disk fails, and `InputError` where the file is a link.
-    """
-
-    def __init__(self, path: Path, t_ns: int, session: str = "") -> None:
-        self.path = path
-        try:
-            created = not check_file(path)
-            self._next = None if created else _whole_lines(path, t_ns, session)
-            if created:
-                self._next = next_chain(b"", session)
-            self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-            self._size = os.fstat(self._fd).st_size
-            if created:
-                fsync_folder(path.parent)
-        except OSError as error:
-            raise disk_error(path, "cannot open", error) from error
-
-    def append(self, t_ns: int, line: Line) -> None:
-        """Write one event and wait until it is on disk. Raises `SessionError` where that fails."""
-        data = encode_line(t_ns, line, self._next)
-        try:
-            if os.fstat(self._fd).st_size != self._size:
-                os.ftruncate(self._fd, self._size)  # part of a line that did not fit on the disk
-            view = memoryview(data)
-            while view:
-                view = view[os.write(self._fd, view) :]
-            os.fsync(self._fd)
-        except OSError as error:
-            raise disk_error(self.path, "cannot write", error) from error
-        self._size += len(data)
-        self._next = _after(self._next, data)
-
-    def close(self) -> None:
-        """Close the file; the session stays open until there is a `closed` event."""
-        os.close(self._fd)
-
-
-def next_chain(data: bytes, session: str) -> Chain | None:
-    """Chain of the line that follows `data`, which must consist of whole lines; None without a session."""
-    if not session:
-        return None
-    *lines, _end = data.split(b"\n")
-    chained = bool(lines) and not read(lines[-1] + b"\n").unchained
-    return Chain(len(lines) + 1, session, digest(lines[-1] if chained else data))
-
-
-def _after(chain: Chain | None, data: bytes) -> Chain | None:
-    return None if chain is None else Chain(chain.seq + 1, chain.session, digest(data.rstrip(b"\n")))
-
-
-def _whole_lines(path: Path, t_ns: int, session: str) -> Chain | None:
-    """Make the journal end with a whole line, and return the chain of the next one."""
-    data = read_journal(path)
-    keep = data.rfind(b"\n") + 1
-    if keep == len(data):
-        return next_chain(data, session)
-    chain = next_chain(data[:keep], session)
-    if read(data).torn:
-        # Longer than the tail that it overwrites, and written in one call: a crash leaves the tail or the note.
-        note, at = encode_line(t_ns, TornTail(hex=data[keep:].hex()).model_dump(), chain), keep
-    else:
-        note, at = b"\n", len(data)  # only the newline was cut off
-    with path.open("r+b", buffering=0) as file:
-        file.seek(at)
-        file.write(note)
-        os.fsync(file.fileno())
-    return next_chain(data[:at] + note, session)
+from brushloop.sessions.records import Header, Topic
 
 
 @dataclass(slots=True)
@@ -142,8 +63,6 @@ class Account:
     state: Replay = field(default_factory=Replay)
     faults: list[Fault] = field(default_factory=list[Fault])
     """All problems, in the order of the file; every command uses this list."""
-    damaged: list[bytes] = field(default_factory=list[bytes])
-    """Lines that cannot be used."""
     twice: list[Line] = field(default_factory=list[Line])
     """`done` lines of steps that were done already."""
 
@@ -152,7 +71,6 @@ def account(data: bytes, session: str = "") -> Account:
     """Read the bytes of a journal and apply its events, those of `session` if it is given, to a new state."""
     found = Account(read(data, session))
     found.faults += found.reading.faults
-    found.damaged += [span for _, span in found.reading.damaged]
     for entry in found.reading.entries:
         try:
             fold(found.state, entry.line)
@@ -161,7 +79,6 @@ def account(data: bytes, session: str = "") -> Account:
             found.twice.append(entry.line)
         except NONSENSE as error:
             found.faults.append(Fault(entry.number, f"makes no sense: {error}"))
-            found.damaged.append(entry.raw)
         else:
             found.lines.append(entry.line)
     found.faults.sort(key=lambda fault: fault.number)

@@ -22,11 +22,11 @@ import pytest
 
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.sessions.disk import file_sha256
-from brushloop.sessions.journal.journal import JOURNAL_NAME, is_open, replay
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal.journal import is_open, replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 
 if TYPE_CHECKING:
     from conftest import Lab

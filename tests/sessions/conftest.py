@@ -19,8 +19,7 @@ from mcap.reader import make_reader
 
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.imports import ImportOptions, import_photographs
-from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, encode_line, read_lines
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
 from brushloop.sessions.step_file import Outgoing, SegmentWriter
@@ -127,6 +126,12 @@ class Make:
 
     def events(self, folder: Path, kind: str) -> list[dict[str, Any]]:
         return [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == kind]
+
+    def rewrite_journal(self, folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+        """Change what lines say, as a program would that knows the format."""
+        lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
+        data = [encode_line(line.pop("t_ns"), line, n, self.header.session_id) for n, line in enumerate(lines, 1)]
+        (folder / JOURNAL_NAME).write_bytes(b"".join(data))
 
     def stroke_names(self, path: Path) -> list[str]:
         """As any MCAP reader finds them, CRCs checked."""

@@ -5,11 +5,11 @@ import shutil
 import pytest
 
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.repair import repair_session
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.repair import repair_session
 from brushloop.sessions.store import SessionStore
+from brushloop.sessions.verify import verify_session
 
 OTHER = "2026-01-03-grid-01"
 

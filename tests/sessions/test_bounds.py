@@ -6,9 +6,9 @@ import pytest
 import zstandard
 
 from brushloop.sessions.folders import open_sessions
-from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.repair.repair import repair_session
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.repair import repair_session
+from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 
 HUGE = 40 * 2**30

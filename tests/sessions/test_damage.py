@@ -12,7 +12,7 @@ from mcap.records import Chunk
 
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 
 CUTS = 120
 FLIPS = 400

@@ -14,8 +14,7 @@ from typer.main import get_command
 from brushloop.__main__ import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.folders import open_sessions
-from brushloop.sessions.journal.codec import encode_line
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.names import bare_name
 from brushloop.sessions.store import SessionStore
 
@@ -87,18 +86,9 @@ def place(make, tmp_path):
     return tmp_path
 
 
-def rewritten(folder, change):
-    """The journal again, unchained as a stranger may write it, with `change` made to each of its lines."""
-    from brushloop.sessions.journal.lines import read_lines
-
-    lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
-    data = b"".join(encode_line(line.pop("t_ns"), line) for line in lines)
-    (folder / JOURNAL_NAME).write_bytes(data)
-
-
 def named(name, event="done"):
     """Every line of this event names the file `name`."""
-    return lambda folder, _: rewritten(
+    return lambda make, folder, _: make.rewrite_journal(
         folder,
         lambda line: (
             {**line, "file": name.format(out=folder.parents[1] / "outside")} if line["event"] == event else line
@@ -107,9 +97,9 @@ def named(name, event="done"):
 
 
 def snapshot(name):
-    def damage(folder, outside):
+    def damage(make, folder, outside):
         snapshots = {name.format(out=outside): "written by a stranger"}
-        rewritten(folder, lambda line: {**line, "snapshots": snapshots} if line["event"] == "open" else line)
+        make.rewrite_journal(folder, lambda line: {**line, "snapshots": snapshots} if line["event"] == "open" else line)
 
     return damage
 
@@ -117,7 +107,7 @@ def snapshot(name):
 def linked(pattern, to):
     """A file or folder of the session is a link."""
 
-    def damage(folder, outside):
+    def damage(make, folder, outside):
         path = next(iter(sorted(folder.glob(pattern))), folder / pattern)
         if path.is_dir():
             shutil.rmtree(path)
@@ -127,10 +117,10 @@ def linked(pattern, to):
     return damage
 
 
-def session_id(folder, _):
+def session_id(make, folder, _):
     """The header names a folder elsewhere."""
     session_id = "../../outside/calibration"
-    rewritten(
+    make.rewrite_journal(
         folder,
         lambda line: (
             {**line, "header": {**line["header"], "session_id": session_id}} if line["event"] == "open" else line
@@ -166,7 +156,7 @@ WAYS = {
 def test_nothing_outside_the_folder_is_touched(make, place, opened_outside, way, monkeypatch):
     outside, folder = place / "outside", place / "root" / make.header.session_id
     before = make.tree(outside)
-    WAYS[way](folder, outside)
+    WAYS[way](make, folder, outside)
     monkeypatch.chdir(place)
     watch, seen = opened_outside
     places = {"root": folder.parent, "session": folder, "out": place / "out", "file": folder / f"{folder.name}.mcap"}

@@ -7,8 +7,8 @@ import os
 import pytest
 
 from brushloop.sessions.errors import SessionDamaged, SessionError
-from brushloop.sessions.journal.journal import Journal, replay
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import Journal, encode_line, read, read_lines
+from brushloop.sessions.journal.journal import replay
 
 BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "patch": 4, "file": "0000-k1.mcap"}
 DONE = {
@@ -24,7 +24,7 @@ DONE = {
 
 
 def written(path, *lines, t_ns=1):
-    journal = Journal(path, t_ns)
+    journal = Journal(path, t_ns, "s")
     for line in lines:
         journal.append(t_ns, line)
     journal.close()
@@ -80,24 +80,63 @@ def test_a_journal_that_is_only_a_torn_line_is_set_aside_too(path):
     assert bytes.fromhex(torn["hex"]) == b'{"t_ns":1,"ev'
 
 
+def test_each_line_says_its_number_and_its_session(path):
+    lines = written(path, BEGIN, DONE).read_bytes().splitlines()
+    assert [json.loads(line)["seq"] for line in lines] == [1, 2]
+    assert {json.loads(line)["session"] for line in lines} == {"s"}
+
+
+LINES = [encode_line(1, {"event": "sheet", "sheet": n}, n, "s") for n in range(1, 13)]
+FOREIGN = encode_line(1, {"event": "sheet", "sheet": 7}, 7, "other")
+WRONG = "line 5 does not match its CRC"
+
+
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("change", "expected"),
     [
-        (b"{oops", "line 2 is not JSON"),
-        (b"\xff\xfe", "line 2 is not JSON"),
-        (b"", "line 2 is not JSON"),
-        (b"[" * 100_000, "line 2 is not JSON"),
-        (b"[1]", "line 2 has no event"),
-        (b'{"t_ns":1}', "line 2 has no event"),
+        (lambda a: [*a[:4], *a[5:]], ["line 5 comes after a line that is missing"]),
+        (lambda a: [*a[:4], *a[7:]], ["line 5 comes after 3 lines that are missing"]),
+        (lambda a: a[1:], ["line 1 comes after a line that is missing"]),
+        (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 stands twice: it is line 5"]),
+        (lambda a: [*a[:4], a[5], a[4], *a[6:]], ["line 6 is out of place: it was written as line 5"]),
+        (
+            lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
+            [
+                "line 4 is out of place: it was written as line 10",
+                "line 10 is out of place: it was written as line 4",
+            ],
+        ),
+        (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'"]),
+        (lambda a: [*a[:4], b"{oops\n", *a[5:]], [WRONG]),
+        (lambda a: [*a[:4], b"\xff\xfe\n", *a[5:]], [WRONG]),
+        (lambda a: [*a[:4], b"[" * 100_000 + b"\n", *a[5:]], [WRONG]),
+        (lambda a: [*a[:4], a[4].replace(b"sheet", b"sheer"), *a[5:]], [WRONG]),
+        (lambda a: [*a[:4], a[4][:-1] + b"\x0b", *a[5:]], ["line 5 has a damaged end"]),
+        (lambda a: [*a[:-1], a[-1][:-9]], []),
     ],
-    ids=["half", "binary", "empty", "deep", "list", "no event"],
+    ids=[
+        "deleted",
+        "three",
+        "first",
+        "doubled",
+        "neighbours",
+        "exchanged",
+        "foreign",
+        "half",
+        "binary",
+        "deep",
+        "bit",
+        "end",
+        "torn",
+    ],
 )
-def test_damage_in_the_middle_names_the_line(path, line, message):
-    whole = written(path, BEGIN).read_bytes()
-    path.write_bytes(whole + line + b"\n" + whole)
-    with pytest.raises(SessionDamaged, match=message) as caught:
-        list(read_lines(path))
-    assert caught.value.path == path
+def test_what_happened_to_lines_is_named(path, change, expected):
+    path.write_bytes(b"".join(change(LINES)))
+    assert [str(fault) for fault in read(path.read_bytes()).faults] == expected
+    if expected:
+        with pytest.raises(SessionDamaged, match=expected[0]) as caught:
+            replay(path)
+        assert caught.value.path == path
 
 
 @pytest.mark.parametrize(
@@ -106,7 +145,6 @@ def test_damage_in_the_middle_names_the_line(path, line, message):
         {"event": "begin"},
         {**BEGIN, "attempt": "many"},
         {**BEGIN, "patch": [1]},
-        {**BEGIN, "patch": float("inf")},
         {"event": "done"},
         {**DONE, "counts": 3},
         {**DONE, "counts": {"/step": "2"}},
@@ -115,12 +153,17 @@ def test_damage_in_the_middle_names_the_line(path, line, message):
     ],
 )
 def test_an_event_without_a_field_is_damage_in_one_line(path, event):
-    path.write_text(json.dumps({"t_ns": 1, **event}) + "\n")
+    written(path, event)
     with pytest.raises(
         SessionDamaged, match=f"line 1 makes no sense: '[a-z0-9]+' of event '{event['event']}' "
     ) as caught:
         replay(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_step_that_is_done_twice_is_damage(path):
+    with pytest.raises(SessionDamaged, match="its step was done already"):
+        replay(written(path, BEGIN, DONE, DONE))
 
 
 def test_replay_folds_begin_done_void_and_sheet(path):

@@ -10,12 +10,12 @@ from typer.testing import CliRunner
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.export import export
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.repair import repair_session
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.repair import repair_session
 from brushloop.sessions.show import Summary, details, summaries
 from brushloop.sessions.store import SessionStore
+from brushloop.sessions.verify import verify_session
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.remarks import mark_bad_or_good
-from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.show import GridCell, Sheet, details
 from brushloop.sessions.show_text import ranges
 from brushloop.sessions.store import SessionStore
+from brushloop.sessions.verify import verify_session
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
 

@@ -5,7 +5,7 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.show import Summary, summaries
 
 

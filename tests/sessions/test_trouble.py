@@ -15,11 +15,10 @@ import pytest
 
 from brushloop.sessions import disk
 from brushloop.sessions.errors import DiskFull, SessionError
-from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, read_lines
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.store import STEP_BYTES, SessionStore
+from brushloop.sessions.verify import verify_session
 from tests.waiting import PATIENCE_S
 
 Usage = namedtuple("Usage", "total used free")
@@ -163,7 +162,7 @@ store.release()
 TOUCH = """
 import sys, time
 from pathlib import Path
-from brushloop.sessions.repair.repair import repair_session
+from brushloop.sessions.repair import repair_session
 from brushloop.sessions.store import SessionStore
 folder = Path(sys.argv[1])
 for take in (lambda: SessionStore(folder, None, time.time_ns), lambda: repair_session(folder, time.time_ns)):

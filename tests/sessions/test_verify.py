@@ -7,9 +7,9 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.records import HEADER_METADATA as HEADER
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 
 
@@ -63,7 +63,7 @@ def test_what_is_missing_is_named(folder):
 def test_a_damaged_journal_line_is_reported_and_whether_the_files_make_up_for_it(folder):
     journal = folder / JOURNAL_NAME
     flip(journal, journal.read_bytes().index(b'"depth_mm"'))
-    assert words(folder) == ["journal.jsonl: line 8 is not JSON"]
+    assert words(folder) == ["journal.jsonl: line 8 does not match its CRC"]
     assert "journal.jsonl: all of it can be rebuilt from the files" in verify_session(folder).notes
 
 

@@ -22,7 +22,8 @@ from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.rig_text import rig_of, rig_text
 from brushloop.collect.teach.store import Notebook, StepName
 from brushloop.drivers.cancellation import finished
-from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
+from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal.journal import replay
 
 ABOVE_MM = 30.0
 SLOW_MM_S = 45.0

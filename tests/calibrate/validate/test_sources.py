@@ -208,11 +208,11 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
     folder.mkdir()
     (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
     lines = [{"t_ns": 1, "event": "open", "header": {}}, {"t_ns": 2, "event": "closed", "sha256": "0" * 64}]
-    from brushloop.sessions.journal.codec import encode_line
+    from brushloop.sessions.journal import encode_line
 
     with (folder / "journal.jsonl").open("wb") as file:
-        for line in lines:
-            file.write(encode_line(line.pop("t_ns"), line))
+        for number, line in enumerate(lines, start=1):
+            file.write(encode_line(line.pop("t_ns"), line, number, "presses"))
     assert json.loads((folder / "journal.jsonl").read_bytes().splitlines()[0])["event"] == "open"
     with pytest.raises(SessionDamaged, match="SHA-256 differs"):
         open_session(str(folder), tmp_path / "work", None, None)

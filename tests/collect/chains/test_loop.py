@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from brushloop.calibrate.loop.scores import read_loop
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from tests.waiting import wait_until
 

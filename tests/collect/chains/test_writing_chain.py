@@ -11,7 +11,7 @@ from brushloop.calibrate.writing.plan_record import PROTOCOL, FigureRecord, Plan
 from brushloop.collect.chains import writing
 from brushloop.collect.chains.writing import FOOTPRINT, Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from tests.calibrate.given import BY
 
 CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.drivers.sim.faults.phases import Phase
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.sessions.journal.journal import JOURNAL_NAME
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, read_lines
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import the_session
 from tests.collect.until import until, wait_for_end
 

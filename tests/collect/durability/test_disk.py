@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from brushloop.sessions.journal.journal import JOURNAL_NAME, replay
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import Disk, parked, the_session
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until

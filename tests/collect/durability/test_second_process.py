@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.durability.conftest import the_session
 from tests.command import brushloop

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import parked, the_session
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -17,7 +17,7 @@ from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.drivers.samples import Pose
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic

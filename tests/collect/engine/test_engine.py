@@ -15,8 +15,8 @@ from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.drivers.arcs.codes import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
 from brushloop.drivers.samples import Identity
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.journal.journal import replay
-from brushloop.sessions.journal.lines import read_lines
 from brushloop.sessions.recording import Recording
 from tests.collect.until import until, wait_for_end
 

@@ -16,8 +16,8 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.journal.journal import replay
-from brushloop.sessions.journal.lines import read_lines
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic

@@ -32,8 +32,8 @@ from brushloop.drivers.samples import Frame, Stamp
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Topic, Wrench
-from brushloop.sessions.repair.verify import verify_session
 from brushloop.sessions.step_file import Outgoing
+from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S
 

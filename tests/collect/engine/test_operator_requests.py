@@ -15,7 +15,7 @@ from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from brushloop.collect.protocols.steps import Result, Step, StepKind
 from brushloop.drivers.errors import DeviceTimeout
-from brushloop.sessions.journal.lines import read_lines
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab

@@ -13,7 +13,7 @@ from brushloop.collect.engine.engine import Engine
 from brushloop.collect.errors import CollectAborted, NeedsOperator, Parked
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.sim.config import View
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.store import SessionStore
 from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.until import until, wait_for_end

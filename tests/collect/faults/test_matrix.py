@@ -31,8 +31,8 @@ from brushloop.drivers.geometry import distance
 from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.faults.kinds import ALWAYS, Fault
 from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.journal.journal import replay
-from brushloop.sessions.journal.lines import read_lines
 from brushloop.sessions.store import SessionStore
 from tests.collect.faults.conftest import CAMERA_TIMEOUT_S
 from tests.collect.until import wait_for_end

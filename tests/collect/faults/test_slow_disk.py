@@ -17,8 +17,8 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.journal import read_lines
 from brushloop.sessions.journal.journal import replay
-from brushloop.sessions.journal.lines import read_lines
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.step_file import ChannelTable
 from tests.collect.until import wait_for_end

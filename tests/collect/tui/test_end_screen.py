@@ -11,7 +11,7 @@ import pytest
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.end_screen import EndScreen, alike_text, contact_sheet
 from brushloop.collect.tui.finish_screen import FinishScreen
-from brushloop.sessions.repair.verify import Verdict
+from brushloop.sessions.verify import Verdict
 from tests.collect.tui.fake import DONE, FakeEngine, marked_grid, picture
 from tests.collect.tui.fake_browser import FakeReview
 from tests.collect.tui.screen_text import has_picture, look

@@ -13,7 +13,7 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.finish_screen import FinishScreen
 from brushloop.collect.tui.themes import LIGHT, SAFE
-from brushloop.sessions.repair.verify import Verdict
+from brushloop.sessions.verify import Verdict
 from tests.collect.tui.fake import (
     DONE,
     FAILED,

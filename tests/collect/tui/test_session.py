@@ -26,7 +26,7 @@ from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.remarks import remarks_of
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.verify import verify_session
 from tests.collect.tui.screen_text import has_picture, shown
 from tests.collect.until import wait_for_end
 from tests.waiting import PATIENCE_S

@@ -26,7 +26,7 @@ from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.sessions.remarks import remarks_of
-from brushloop.sessions.repair.verify import Finding, Verdict
+from brushloop.sessions.verify import Finding, Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.screen_text import has_picture, look, shown

@@ -16,10 +16,9 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, read_bounded
 from brushloop.sessions.errors import SessionDamaged, SessionError
-from brushloop.sessions.journal.codec import Line, encode_line, without_time
+from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, read_journal
 from brushloop.sessions.journal.events import NONSENSE, serial_of
-from brushloop.sessions.journal.journal import JOURNAL_NAME, Account, DoneTwice, Replay, account, fold
-from brushloop.sessions.journal.lines import Fault, accounts_for, read_journal
+from brushloop.sessions.journal.journal import Account, DoneTwice, Replay, account, fold
 from brushloop.sessions.mcap_file import Scan, scan
 from brushloop.sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
 from brushloop.sessions.recording import count_messages, parse_header
@@ -39,8 +38,6 @@ class Evidence:
     faults: list[Fault]
     """Problems of the journal, line by line; every command uses this list."""
     torn: bytes
-    unchained: int
-    """Number of lines written before lines were chained."""
     rebuilt: list[Line] = field(default_factory=list[Line])
     """Lines missing from the journal and found in the files."""
     lost: int = 0
@@ -82,9 +79,7 @@ def gather(folder: Path) -> Evidence:
     session = _session(folder, journal.state)
     if session and session != _named_in(journal.state):
         journal = account(data or b"", session)
-    found = Evidence(
-        folder, data, journal.lines, too_large + journal.faults, journal.reading.torn, journal.reading.unchained
-    )
+    found = Evidence(folder, data, journal.lines, too_large + journal.faults, journal.reading.torn)
     found.session = session
     _lost_between(found, journal.twice)
     header = _from_files(found, journal.state.done)
@@ -95,7 +90,7 @@ def gather(folder: Path) -> Evidence:
         found.rebuilt.insert(0, {"t_ns": 0, **open_line(header, _snapshots(folder))})
     _fold(found)
     _closed(found)
-    found.lost = _lost(journal, found.rebuilt)
+    found.lost = _lost(journal, found.all_lines)
     return found
 
 
@@ -137,16 +132,18 @@ def _lost_between(found: Evidence, twice: list[Line]) -> None:
             found.rebuilt += [{**lost, "aside": "", "why": why}, line]
 
 
-def _lost(journal: Account, rebuilt: list[Line]) -> int:
-    damaged, others = list(journal.damaged), 0
-    for line in rebuilt:
-        body = encode_line(int(line["t_ns"]), without_time(line))
-        span = next((span for span in damaged if accounts_for(span, body)), None)
-        if span is None:
-            others += 1
+def _lost(journal: Account, lines: list[Line]) -> int:
+    """Number of missing or damaged lines, less those that were rebuilt in the same place."""
+    numbers = {id(entry.line): entry.seq for entry in journal.reading.entries}
+    lost = rebuilt = last = 0
+    for line in lines:
+        seq = numbers.get(id(line))
+        if seq is None:
+            rebuilt += 1
         else:
-            damaged.remove(span)
-    return len(damaged) + max(0, journal.reading.gaps - others)
+            lost, rebuilt, last = lost + max(0, seq - last - 1 - rebuilt), 0, seq
+    end = max((entry.number for entry in journal.reading.entries), default=0)
+    return lost + max(0, sum(number > end for number in journal.reading.damaged) - rebuilt)
 
 
 def _place(lines: list[Line], line: Line) -> int:

@@ -15,19 +15,23 @@ from pathlib import Path
 
 import pytest
 from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 
-from brushloop.sessions.journal.codec import with_crc
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.records import Topic
-from brushloop.sessions.repair.repair import repair_session
-from brushloop.sessions.repair.verify import verify_session
+from brushloop.sessions.repair import repair_session
 from brushloop.sessions.store import SessionStore
+from brushloop.sessions.verify import verify_session
 
 STROKES = 3
-QUICK = 15
+QUICK = 34
+"""Damages of each of the three kinds of session. The soak has ten times as many."""
+HEADER_BYTES = 1500
+"""More than the header of a file with its notes."""
 
 
 @dataclass
@@ -37,8 +41,10 @@ class Whole:
     folder: Path
     foreign: list[bytes]
     """Lines of another session."""
-    closed: bool
+    lone: bool
     messages: Counter
+    starts: dict[str, list] = field(default_factory=dict)
+    """File -> (first byte, byte behind the start) of each record, then of the index."""
     chunks: dict[str, list] = field(default_factory=dict)
     """File -> (first byte, byte behind the last, messages) of each chunk."""
 
@@ -72,23 +78,41 @@ def collect(make, folder):
     return store
 
 
-@pytest.fixture(scope="module", params=["open", "closed"])
+@pytest.fixture(scope="module", params=["open", "closed", "lone"])
 def whole(request, make, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param) / "2026-01-02-grid-01"
     store = collect(make, folder)
     store.release()
     twin = tmp_path_factory.mktemp("twin") / folder.name
     shutil.copytree(folder, twin)
-    store = SessionStore(folder if request.param == "closed" else twin, None, make.clock())
+    store = SessionStore(twin if request.param == "open" else folder, None, make.clock())
     messages = make.messages(store.close())
     store.release()
     other = make.store(tmp_path_factory.mktemp("other") / "2026-01-02-other-01", session_id="2026-01-02-other-01")
     make.collect(other)
     other.release()
     foreign = (other.folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
-    made = Whole(folder, foreign, request.param == "closed", messages)
+    if request.param == "lone":
+        for path in folder.iterdir():
+            if path.name != f"{folder.name}.mcap":
+                path.unlink()
+    made = Whole(folder, foreign, request.param == "lone", messages)
+    made.starts = {path.name: starts_of(path) for path in folder.glob("*.mcap")}
     made.chunks = {path.name: chunks_of(path) for path in folder.glob("*.mcap")}
     return made
+
+
+def starts_of(path):
+    """Opcode and length of every record up to the end of the data, in one piece each; the rest is the index."""
+    data, at, starts = path.read_bytes(), 8, []
+    while not starts or data[starts[-1][0]] != Opcode.DATA_END:
+        starts.append((at, at + 9))
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    return [*starts, (at, len(data))]
+
+
+def hits(ranges, start, end):
+    return any(start < b and a < end for a, b in ranges)
 
 
 def chunks_of(path):
@@ -114,20 +138,28 @@ def chunks_of(path):
 
 
 def intact_strokes(whole, damage):
-    """Strokes of which both the record and its photograph are outside of what was hit, in one file or in two."""
-    there = set()
+    """Strokes of which one file holds both the record and its photograph outside of what was hit."""
+    names = set()
     for name, chunks in whole.chunks.items():
+        there = set()
         for start, end, messages in chunks:
-            if not any(start < b and a < end for a, b in damage.hit[name]):
+            if not hits(damage.hit[name], start, end) and findable(whole, name, start, damage.hit[name]):
                 there |= messages
-    stills = {number for topic, number, _ in there if topic == Topic.STILL}
-    return {name for topic, number, name in there if topic == Topic.STROKE and number in stills}
+        stills = {number for topic, number, _ in there if topic == Topic.STILL}
+        names |= {stroke for topic, number, stroke in there if topic == Topic.STROKE and number in stills}
+    return names
+
+
+def findable(whole, name, at, ranges):
+    """Whether the index, or an unbroken row of records, leads to this place."""
+    *starts, index = whole.starts[name]
+    return not hits(ranges, *index) or not any(hits(ranges, *start) for start in starts if start[0] < at)
 
 
 def bytes_of(whole, folder, chosen, damage):
     """One bit, or everything behind a place, of a file."""
     paths = [path for path in sorted(folder.iterdir()) if path.stat().st_size and path.name in whole.chunks]
-    path = chosen.choice([*paths, folder / JOURNAL_NAME])
+    path = chosen.choice(paths if whole.lone else [*paths, folder / JOURNAL_NAME])
     data = bytearray(path.read_bytes())
     at = chosen.randrange(len(data))
     if chosen.random() < 0.3:
@@ -156,10 +188,10 @@ def exchanged(whole, folder, chosen, damage):
 
 
 def lines_of(whole, folder, chosen, damage):
-    """Whole lines taken out, doubled, exchanged, put in from another session, or edited by a program."""
+    """Whole lines taken out, doubled, exchanged, put in from another session, or edited."""
     path = folder / JOURNAL_NAME
     lines = path.read_bytes().splitlines(keepends=True)
-    kind = chosen.choice(["delete", "double", "exchange", "foreign", "edit", "edit badly"])
+    kind = chosen.choice(["delete", "double", "exchange", "foreign", "edit"])
     at = chosen.randrange(len(lines))
     if kind == "delete":
         del lines[at : at + chosen.choice([1, 1, 1, 2, 5])]
@@ -172,24 +204,25 @@ def lines_of(whole, folder, chosen, damage):
         lines.insert(at, chosen.choice(whole.foreign))
     else:
         at = chosen.randrange(len(lines) - 1)
-        lines[at] = edited(lines[at], chosen, well=kind == "edit")
+        lines[at] = edited(lines[at], chosen)
     damage.words.append(f"line {at + 1}: {kind}")
     path.write_bytes(b"".join(lines))
 
 
-def edited(line, chosen, *, well):
-    """Another digit somewhere in what the line says; with the CRC made right, or as it was."""
-    body, crc = line.rstrip(b"\n").rsplit(b',"crc":', 1)
-    digits = [at for at, byte in enumerate(body) if chr(byte).isdigit()]
-    at = chosen.choice(digits)
-    body = body[:at] + str((body[at] - 48 + chosen.randrange(1, 10)) % 10).encode() + body[at + 1 :]
-    return with_crc(body + b"}") + b"\n" if well else body + b',"crc":' + crc + b"\n"
+def edited(line, chosen):
+    """Another digit somewhere in what the line says, its CRC as it was."""
+    end = line.rindex(b',"crc":')
+    at = chosen.choice([at for at, byte in enumerate(line[:end]) if chr(byte).isdigit()])
+    digit = str((line[at] - 48 + chosen.randrange(1, 10)) % 10).encode()
+    return line[:at] + digit + line[at + 1 :]
 
 
 def may_be_sound(whole, folder, before, damage):
     """Where nothing is damaged: all as it was, or a journal that ends earlier, as after a kill, and files for it."""
     if {name: data for name, data in before.items() if data is not None} == contents(whole.folder):
         return True
+    if whole.lone:
+        return False
     journal = b"".join(whole.lines)
     others = {name for name, data in contents(whole.folder).items() if name != JOURNAL_NAME and before[name] != data}
     return not others and journal.startswith(before[JOURNAL_NAME])
@@ -204,8 +237,8 @@ def check(make, whole, root, chosen):
     shutil.copytree(whole.folder, folder)
     (root / "beside.txt").write_text("not the session's")
     damage = Damage()
-    ways = [lines_of] * 5 + [bytes_of] * 4 + [exchanged]
-    for way in chosen.choice([[chosen.choice(ways)]] * 3 + [[lines_of, lines_of], [bytes_of, bytes_of]]):
+    ways = [bytes_of] if whole.lone else [lines_of] * 5 + [bytes_of] * 4 + [exchanged]
+    for way in chosen.choice([[chosen.choice(ways)]] * 3 + [[ways[0], ways[0]], [bytes_of, bytes_of]]):
         way(whole, folder, chosen, damage)
     try:
         return judged(make, whole, root, folder, damage)
@@ -219,7 +252,15 @@ def judged(make, whole, root, folder, damage):
     verdict = verify_session(folder)
     assert not verdict.sound or may_be_sound(whole, folder, before, damage), "verify says sound"
     assert contents(folder) == before, "verify changed something"
-    report = repair_session(folder, make.clock())
+    try:
+        report = repair_session(folder, make.clock())
+    except SessionDamaged:
+        header = whole.starts[f"{folder.name}.mcap"][1][0]
+        assert whole.lone, "a session can be rebuilt"
+        assert hits(damage.hit[f"{folder.name}.mcap"], 0, header + HEADER_BYTES), "the header was whole"
+        assert contents(folder) == before
+        return "refused"
+    assert repair_session(folder, make.clock()).did == [], "a second repair did something"
     again = verify_session(folder)
     assert again.sound, again.findings
     kept = [path.read_bytes() for path in folder.iterdir() if path.is_file()]
@@ -238,9 +279,8 @@ def judged(make, whole, root, folder, damage):
     gone = intact_strokes(whole, damage) - set(names)
     assert not gone, f"intact strokes were given up: {gone}; {report}"
     for name in set(intact_strokes(whole, Damage())) - set(names):
-        assert any(name in line for line in report.lost), f"{name} is lost and not named: {report.lost}"
-    if report.lossless:
-        assert messages == whole.messages
+        assert whole.lone or any(name in line for line in report.lost), f"{name} is not named: {report.lost}"
+    assert messages == whole.messages or not report.lossless
     outside = sorted(str(path.relative_to(root)) for path in root.rglob("*") if folder not in path.parents)
     assert outside == ["beside.txt", "sessions", f"sessions/{folder.name}"]
     assert (root / "beside.txt").read_text() == "not the session's"
@@ -264,12 +304,12 @@ def run(make, whole, root, seed, count):
 
 def test_no_damage_gives_up_what_is_intact_or_makes_it_twice(make, whole, tmp_path):
     ends = run(make, whole, tmp_path, 3, QUICK)
-    assert ends["lossless"] > QUICK / 3
+    assert ends["lossless"] + ends["lossy"] > QUICK / 2
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(10))
 def test_a_thousand_damages(make, whole, tmp_path, seed):
-    """Five seeds of 100 each, of an open and of a closed session."""
-    assert run(make, whole, tmp_path, seed, 100).total() == 100
+    """Ten seeds of 34 each, of an open and of a closed session, and of a recording alone."""
+    assert run(make, whole, tmp_path, seed, QUICK).total() == QUICK

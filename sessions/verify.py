@@ -11,19 +11,16 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import check_digest, holds
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
+from brushloop.sessions.evidence import Evidence, gather
 from brushloop.sessions.folders import check_name, not_a_session
-from brushloop.sessions.journal.codec import Line
-from brushloop.sessions.journal.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, Line
 from brushloop.sessions.mcap_file import Scan, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.names import SEGMENT_NAME
 from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
-from brushloop.sessions.repair.evidence import Evidence, gather
 from brushloop.sessions.show import details, step_words
-
-IMAGES = (Topic.STILL, Topic.PREVIEW)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,11 +153,6 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
         verdict.findings.append(Finding(JOURNAL_NAME, "is missing, though the folder holds recordings"))
     if evidence.torn:
         verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
-    if evidence.unchained:
-        verdict.notes.append(
-            f"{JOURNAL_NAME}: {evidence.unchained} of {len(evidence.lines)} lines are unchained, as older versions "
-            "wrote them: a line removed from these or added to them would not be noticed"
-        )
     for line in evidence.rebuilt:
         match line["event"]:
             case "begin":
@@ -195,7 +187,8 @@ def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:
         words = ", ".join(f"{count} of {topic}" for topic, count in lost.items()) or "none"
         why = "; ".join(problems) or error.what
         return [Finding(path.name, f"({step}) {why}; messages lost: {words}")]
-    found, problems = file_problems(path)
+    # The merged file holds the same messages, so they are decoded only there.
+    found, problems = file_problems(path, decode=evidence.state.closed is None)
     if dict(found.counts) != line["counts"]:
         problems.append(f"holds {dict(found.counts)}, but the journal says {line['counts']}")
     return [Finding(path.name, f"({step}) {problem}") for problem in problems]
@@ -229,29 +222,28 @@ def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progres
     verdict.findings += [Finding(path.name, problem) for problem in problems]
 
 
-def file_problems(path: Path, progress: Progress = unseen) -> tuple[Scan, list[str]]:
-    """Read a file in full and list what is wrong with its chunks, index, images, and the stills of its strokes."""
+def file_problems(path: Path, progress: Progress = unseen, *, decode: bool = True) -> tuple[Scan, list[str]]:
+    """Read a file in full and list what is wrong with its chunks, its index, its photographs and its strokes.
+
+    Without `decode`, photographs and strokes are only checked by their CRC.
+    """
     found = scan(path)
     problems = list(found.damage)
     stills: set[int] = set()
-    strokes: set[int] = set()
-    """Hashes of their names, which take less memory."""
-    images = 0
+    strokes: set[str] = set()
     try:
-        for _schema, channel, message in found.messages(topics=(*IMAGES, Topic.STROKE)):
-            if channel.topic in IMAGES:
-                progress(f"{path.name}: images decoded", images, sum(found.counts[topic] for topic in IMAGES))
-                images += 1
-                decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
+        for _schema, channel, message in found.messages(topics=(Topic.STILL, Topic.STROKE) if decode else ()):
             if channel.topic == Topic.STILL:
+                progress(f"{path.name}: photographs decoded", len(stills), found.counts[Topic.STILL])
+                decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
                 stills.add(message.sequence)
-            elif channel.topic == Topic.STROKE:
-                stroke = Stroke.model_validate_json(message.data)
-                if hash(stroke.stroke_id) in strokes:
-                    problems.append(f"stroke {stroke.stroke_id} occurs twice")
-                strokes.add(hash(stroke.stroke_id))
-                if stroke.still not in stills:
-                    problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
+                continue
+            stroke = Stroke.model_validate_json(message.data)
+            if stroke.stroke_id in strokes:
+                problems.append(f"stroke {stroke.stroke_id} occurs twice")
+            strokes.add(stroke.stroke_id)
+            if stroke.still not in stills:
+                problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
     except SessionDamaged as error:
         problems.append(f"{error.path} {error.what}")
     except (DecodeError, ValidationError) as error:

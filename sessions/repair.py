@@ -1,0 +1,564 @@
+"""Repair a session: give back every stroke that one copy holds whole, mark the rest as lost, and say what was done.
+
+Order: journal, configuration, steps, merged file. The file of a step and the merged file are two copies: a damaged step
+is written again from the copy that holds most of it, and the merged file is merged again from the steps. A recording
+without its session loses only the strokes of damaged chunks.
+
+Nothing recorded is overwritten or deleted: a damaged original is kept as `<name>.damaged-1`. A repair that is
+interrupted anywhere and started again ends with the same result.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from google.protobuf.message import DecodeError
+from mcap.records import Message
+from pydantic import ValidationError
+
+from brushloop.sessions.disk import check_digest, file_sha256, fsync_folder, holds, set_aside, sync
+from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
+from brushloop.sessions.evidence import Evidence, gather
+from brushloop.sessions.folders import check_name, not_a_session
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, without_time
+from brushloop.sessions.journal.journal import Replay, fold, read_header, replay
+from brushloop.sessions.mcap_file import Part, Record, Scan, scan
+from brushloop.sessions.mcap_writer import new_mcap
+from brushloop.sessions.messages import decode_still
+from brushloop.sessions.names import SEGMENT_NAME
+from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session, parse_header
+from brushloop.sessions.records import (
+    BEGIN_NOTE,
+    DONE_NOTE,
+    HEADER_METADATA,
+    Header,
+    StepEvent,
+    Stroke,
+    Topic,
+    header_crc,
+)
+from brushloop.sessions.show import step_words
+from brushloop.sessions.store import closed_line, lock
+from brushloop.sessions.verify import file_problems, verify_session
+
+MEASURED = (str(Topic.STILL), str(Topic.STROKE))
+"""Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""
+
+
+Step = tuple[str, int]
+"""Key and attempt of a step."""
+
+
+@dataclass(slots=True)
+class Report:
+    """Result of a repair."""
+
+    session: str
+    did: list[str] = field(default_factory=list[str])
+    lost: list[str] = field(default_factory=list[str])
+    """Descriptions of what could not be recovered; empty for a repair without loss."""
+    strokes: int = 0
+    """Finished strokes in the session after the repair."""
+
+    @property
+    def lossless(self) -> bool:
+        """Whether everything recorded was recovered."""
+        return not self.lost
+
+
+def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
+    """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` if nothing can be rebuilt.
+
+    `InputError` for anything that is not a session, and for a renamed folder, which needs no repair.
+    `SessionLocked` while another process has the session open, `DiskFull` and `SessionError` if the disk fails.
+    """
+    target = path.resolve()
+    if not target.exists():
+        raise not_a_session(path)
+    try:
+        check_name(path)
+        if target.is_file():
+            return _repair_file(target)
+        files = [file.name for file in target.glob("*.mcap*")]
+        if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
+            final = target / f"{target.name}.mcap"
+            if not final.is_file():
+                raise not_a_session(path)
+            return _repair_file(final)
+        held = lock(target)
+        try:
+            return FolderRepair(target, now_ns).run()
+        finally:
+            held.release()
+    except OSError as error:
+        raise disk_error(target, "cannot be repaired", error) from error
+
+
+class FolderRepair:
+    """Repair of one folder while its lock is held."""
+
+    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
+        self._folder = folder
+        self._final = folder / f"{folder.name}.mcap"
+        self._now_ns = now_ns
+        self._report = Report(folder.name)
+        self._lost_steps: list[str] = []
+        """Reported as lost unless the merged file holds them."""
+        self._scans: dict[tuple[int, int, int], tuple[Scan, Step | None]] = {}
+        """Content of each file that was read and the step it belongs to, by inode, size and time."""
+        evidence = gather(folder)
+        self._strays = dict.fromkeys(evidence.strays, "it is a copy of another step")
+        self._strays |= {name: f"it is of another session, {other!r}" for name, other in evidence.foreign.items()}
+        self._begins = [line for line in evidence.all_lines if line["event"] == "begin"]
+        self._header = read_header(folder, evidence.state)
+        self._journal = _repaired_journal(evidence, self._header.session_id, now_ns, self._report)
+        try:
+            self._state = replay(folder / JOURNAL_NAME)
+            self._final_sound = _final_is_sound(folder, self._state)
+            self._merged: tuple[dict[Step, list[Part]], dict[int, list[Part]]] | None = None
+        except BaseException:
+            self._journal.close()
+            raise
+
+    def run(self) -> Report:
+        """Repair configuration, steps and merged file."""
+        try:
+            self._snapshots()
+            for line in list(self._state.segments):
+                self._segment(line)
+            for name, why in self._strays.items():
+                kept = self._move_aside(self._folder / name)
+                self._report.did.append(f"put {name} aside: {why}{_kept_words(kept)}")
+            if self._state.closed is None:
+                self._left_by_a_close()
+            elif not self._final_sound:
+                self._merge_again()
+        finally:
+            self._journal.close()
+        self._report.lost += self._lost_steps
+        counts = (self._state.closed or {}).get("counts", self._state.counts())
+        self._report.strokes = counts.get(Topic.STROKE, 0)
+        return self._report
+
+    def _snapshots(self) -> None:
+        for name, text in (self._state.opened or {}).get("snapshots", {}).items():
+            path = self._folder / name
+            data = text.encode()
+            if not holds(path, data):
+                kept = _write_anew(path, data)
+                self._report.did.append(f"wrote {path.name} again from the journal{_kept_words(kept)}")
+
+    def _segment(self, line: Line) -> None:
+        path = self._folder / line["file"]
+        if "held" in line and self._final_sound:
+            return
+        try:
+            check_digest(path, str(line["sha256"]))
+        except SessionDamaged as error:
+            self._damaged(path, line, error.what)
+
+    def _damaged(self, path: Path, line: Line, why: str) -> None:
+        found = self._look(path)[0] if path.is_file() else Scan(path)
+        why = "; ".join(found.damage) or why
+        counts = Counter[str](line["counts"])
+        needed = _needed(counts)
+
+        def worth(records: list[Record]) -> tuple[bool, int]:
+            missing = counts - _count(records)
+            return not any(topic in missing for topic in needed), len(records)
+
+        copies = [records for records in self._copies(path, line) if _count(records) <= counts]
+        records = max(copies, key=worth, default=[])
+        missing = counts - _count(records)
+        if missing and self._final_sound:
+            kept = self._move_aside(path)
+            self._log({"event": "held", "key": line["key"], "file": path.name, "by": self._final.name, "why": why})
+            held = f"{path.name} ({step_words(line)}) {why}: the merged file holds all of it{_kept_words(kept)}"
+            self._report.did.append(held)
+        elif any(topic in missing for topic in needed):
+            self._lose(path, line, why)
+        else:
+            self._write_again(path, line, found, records, dict(missing), why)
+
+    def _copies(self, path: Path, line: Line) -> Iterator[list[Record]]:
+        """What is intact of a step in each file that names it inside, whatever its name, and in the merged file."""
+        step: Step = line["key"], line.get("attempt", 1)
+        others = (other for other in sorted(self._folder.glob("*.mcap*")) if other not in (path, self._final))
+        for file in (path, *others):
+            if file.is_file():
+                found, whose = self._look(file)
+                if whose == step:
+                    yield list(found.messages())
+        if not self._final.is_file():
+            return
+        found = self._look(self._final)[0]
+        if self._is_ours(found):
+            self._merged = self._merged or _steps_in(found)
+            by_step, by_still = self._merged
+            yield list(found.messages(by_step.get(step, [])))
+            yield list(found.messages(by_still.get(line["result"].get("still"), [])))
+
+    def _look(self, path: Path) -> tuple[Scan, Step | None]:
+        """Read the content of a file and the step it belongs to; only once, even if the file is renamed meanwhile."""
+        stat = path.stat()
+        known = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        if known not in self._scans:
+            found = scan(path)
+            whole = path == self._final or not self._is_ours(found)
+            self._scans[known] = found, None if whole else _step_of(found)
+        self._scans[known][0].path = path
+        return self._scans[known]
+
+    def _is_ours(self, found: Scan) -> bool:
+        """Whether a file may be evidence. Steps of another session of the same protocol have the same keys."""
+        return found.session in ("", self._header.session_id)
+
+    def _write_again(
+        self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str
+    ) -> None:
+        begin = {"t_ns": line["t_ns"], "header": self._header.model_dump(mode="json"), "line": self._begin_of(line)}
+        if self._look(path)[1] == (line["key"], line.get("attempt", 1)) if path.is_file() else False:
+            begin = found.notes.get(BEGIN_NOTE, begin)
+        counts = dict(_count(records))
+        done = {name: line[name] for name in ("key", "kind", "result", "t_ns")}
+        notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line.get("attempt", 1), "counts": counts}}
+        kept, counts = _replace_damaged(path, self._header, notes, {}, records)
+        event: Line = {"event": "repaired", "key": line["key"], "file": path.name, "sha256": file_sha256(path)}
+        self._log({**event, "counts": counts, "missing": missing, "aside": kept, "why": why})
+        words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
+        how = f"without {words}" if words else "whole"
+        self._report.did.append(f"wrote {path.name} ({step_words(line)}) again {how}: {why}{_kept_words(kept)}")
+        if words:
+            self._lost_steps.append(f"messages in {path.name} ({step_words(line)}): {words}")
+
+    def _begin_of(self, line: Line) -> Line:
+        """The attempt's `begin` line in the journal; without one, a line made from its `done` line."""
+        for begin in self._begins:
+            if begin["file"] == line["file"]:
+                return without_time(begin)
+        known = {"event": "begin", "key": line["key"], "kind": line["kind"], "attempt": line.get("attempt", 1)}
+        return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "patch": None, "file": line["file"]}
+
+    def _lose(self, path: Path, line: Line, why: str) -> None:
+        kept = self._move_aside(path)
+        again = "" if self._state.closed is not None else "; it is done again when the session goes on"
+        self._log({"event": "lost", "key": line["key"], "file": path.name, "aside": kept, "why": why})
+        self._report.did.append(f"marked {path.name} ({step_words(line)}) as lost: {why}{_kept_words(kept)}")
+        self._lost_steps.append(f"{step_words(line)}{again}")
+        if self._state.closed is None:
+            self._lose_its_press(line)
+
+    def _lose_its_press(self, line: Line) -> None:
+        """Mark the press as lost too if its sheet was removed: it cannot be photographed again."""
+        stroke = line["result"].get("stroke_id")
+        for other in list(self._state.segments):
+            result = other["result"]
+            if stroke is None or result.get("stroke_id") != stroke or "sheet" not in result:
+                continue
+            if result["sheet"] != self._state.sheet:
+                why = f"its photograph is lost and its sheet {int(result['sheet']) + 1} is no longer in"
+                event = {"event": "lost", "key": other["key"], "file": other["file"], "aside": "", "why": why}
+                self._log(event)
+                self._report.did.append(f"marked {other['file']} ({step_words(other)}) as lost: {why}")
+
+    def _move_aside(self, path: Path) -> str:
+        if not path.exists():
+            return ""
+        kept = set_aside(path, "damaged")
+        path.unlink()
+        fsync_folder(self._folder)
+        return kept.name
+
+    def _merge_again(self) -> None:
+        """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
+        found = self._look(self._final)[0] if self._final.is_file() else Scan(self._final)
+        if (
+            self._final.is_file()
+            and self._is_ours(found)
+            and len(_with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0)
+        ):
+            self._lost_steps = self._rewrite_final(found)
+            return
+        why = "; ".join(found.damage) or ("has changed" if self._final.is_file() else "is missing")
+        kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
+        merge_session(self._folder, self._state, self._header, "damaged")
+        self._log(closed_line(self._final, self._state.counts()))
+        self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{_kept_words(kept)}")
+
+    def _rewrite_final(self, found: Scan) -> list[str]:
+        """Rewrite the merged file, and return descriptions of what was lost."""
+        strokes = _with_their_stills(found)
+        names = (self._state.opened or {}).get("snapshots", {})
+        files = {a.name: a.data for a in found.attachments} | {name: text.encode() for name, text in names.items()}
+        notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": self._state.repairs}} if self._state.repairs else {}
+        kept, counts = _replace_damaged(self._final, self._header, notes, files, strokes.messages())
+        before = Counter[str]((self._state.closed or {}).get("counts", {}))
+        self._log(closed_line(self._final, counts))
+        why = "; ".join(found.damage) or "has changed"
+        self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{_kept_words(kept)}")
+        return _lost_words(strokes, before, counts)
+
+    def _left_by_a_close(self) -> None:
+        """Put aside a damaged merged file of an open session, which is merged again when it closes."""
+        found, problems = file_problems(self._final) if self._final.is_file() else (Scan(self._final), [])
+        if problems or not self._is_ours(found):
+            kept = self._move_aside(self._final)
+            self._report.did.append(
+                f"put {self._final.name} aside, for which the journal has no close{_kept_words(kept)}"
+            )
+
+    def _log(self, line: Line) -> None:
+        t_ns = self._now_ns()
+        self._journal.append(t_ns, line)
+        fold(self._state, {"t_ns": t_ns, **line})
+
+
+def _needed(counts: Counter[str]) -> tuple[str, ...]:
+    """Topics that a step needs; a photograph without a stroke (the board) is found by the event of its step."""
+    return MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
+
+
+def _final_is_sound(folder: Path, state: Replay) -> bool:
+    """Whether the merged file is unchanged since the close, and reads back with every CRC."""
+    final = folder / f"{folder.name}.mcap"
+    if state.closed is None or not final.is_file():
+        return False
+    try:
+        if "sha256" in state.closed and file_sha256(final) != state.closed["sha256"]:
+            return False
+        return count_messages(final) == state.closed.get("counts", state.counts()) and not file_problems(final)[1]
+    except (SessionError, OSError):
+        return False
+
+
+def _count(records: list[Record]) -> Counter[str]:
+    return Counter(channel.topic for _schema, channel, _message in records)
+
+
+def _step_of(found: Scan) -> Step | None:
+    """Key and attempt of the step recorded in a file, from its content, whatever its name."""
+    for values in (found.notes.get(BEGIN_NOTE, {}).get("line"), found.notes.get(DONE_NOTE)):
+        match values:
+            case {"key": str(key), "attempt": int(attempt)}:
+                return key, attempt
+            case _:
+                pass
+    for _schema, _channel, message in found.messages(topics=(Topic.STEP,)):
+        event = _parsed(StepEvent, message)
+        return None if event is None else (event.key, event.attempt)
+    return None
+
+
+def _steps_in(found: Scan) -> tuple[dict[Step, list[Part]], dict[int, list[Part]]]:
+    """Sound chunks of a damaged merged file by step, and those with a photograph and its stroke by the still's number.
+
+    A step lies between its begin and end events. Chunks between damage and the next event belong to the step of that
+    event if it ends there.
+    """
+    by_step: dict[Step, list[Part]] = {}
+    by_still: dict[int, list[Part]] = {}
+    run: list[Part] = []
+    for part in found.parts:
+        if not part.sound:
+            run = []
+            continue
+        run = [*run, part]
+        step: Step | None = None
+        for _schema, channel, message in found.messages([part], (Topic.STEP, Topic.STILL, Topic.STROKE)):
+            if channel.topic == Topic.STEP and (event := _parsed(StepEvent, message)) is not None:
+                step = event.key, event.attempt
+                run = [part] if event.phase == "begin" else run
+            elif channel.topic == Topic.STILL:
+                by_still.setdefault(message.sequence, []).append(part)
+            elif channel.topic == Topic.STROKE and (stroke := _parsed(Stroke, message)) is not None:
+                parts = by_still.setdefault(stroke.still, [])
+                parts += [] if part in parts else [part]
+        if step is not None:
+            known = by_step.get(step, [])
+            run = by_step[step] = [*known, *(part for part in run if part not in known)]
+    return by_step, by_still
+
+
+_E = TypeVar("_E", Stroke, StepEvent)
+
+
+def _parsed(kind: type[_E], message: Message) -> _E | None:
+    """The event in a message; None where it does not fit its schema."""
+    try:
+        return kind.model_validate_json(message.data)
+    except ValidationError:
+        return None
+
+
+def _repaired_journal(evidence: Evidence, session: str, now_ns: Callable[[], int], report: Report) -> Journal:
+    """Repair the session's journal and open it for further lines. Raises `SessionError`."""
+    if not evidence.intact:
+        _rewrite_journal(evidence, session, now_ns, report)
+    journal = Journal(evidence.folder / JOURNAL_NAME, now_ns(), session)
+    try:
+        _add_lines(journal, evidence, now_ns, report)
+    except BaseException:
+        journal.close()
+        raise
+    return journal
+
+
+def _rewrite_journal(evidence: Evidence, session: str, now_ns: Callable[[], int], report: Report) -> None:
+    path = evidence.folder / JOURNAL_NAME
+    aside = f"{path.name}.damaged" if path.exists() else ""
+    words = {"event": "journal", "aside": aside, "rebuilt": len(evidence.rebuilt), "lost": evidence.lost}
+    lines = [*evidence.all_lines, {"t_ns": now_ns(), **words}]
+    data = (encode_line(int(line.get("t_ns", 0)), without_time(line), n, session) for n, line in enumerate(lines, 1))
+    kept = _write_anew(path, b"".join(data))
+    report.did.append(
+        f"wrote {JOURNAL_NAME} again: {len(evidence.lines)} lines as they were, {len(evidence.rebuilt)} rebuilt "
+        f"from the files{_kept_words(kept)}"
+    )
+    report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.faults]
+    if evidence.lost:
+        count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
+        report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
+
+
+def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], report: Report) -> None:
+    if evidence.intact:
+        for line in evidence.rebuilt:
+            journal.append(int(line["t_ns"]), without_time(line))
+            what = step_words(line) if line["event"] != "closed" else "the session"
+            shown = str(line.get("file", "the header"))
+            report.did.append(f"journalled {line['event']!r} of {what}, which {shown} shows")
+    sheet = evidence.state.sheet
+    if evidence.doubtful and sheet not in evidence.state.doubtful_sheets:
+        for name in evidence.doubtful:
+            journal.append(now_ns(), {"event": "doubt", "file": name, "sheet": sheet})
+            report.lost.append(
+                f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
+                f"go on with a fresh one, --sheet {sheet + 2}"
+            )
+
+
+def _write_anew(path: Path, data: bytes) -> str:
+    """Replace a file; return the name under which the old one is kept, or an empty string. Raises `OSError`."""
+    kept = set_aside(path, "damaged").name if path.exists() else ""
+    fresh = path.with_name(path.name + ".repair")
+    with fresh.open("wb") as file:
+        file.write(data)
+        sync(file)
+    fresh.replace(path)
+    fsync_folder(path.parent)
+    return kept
+
+
+def _kept_words(name: str) -> str:
+    """Say where the damaged file is kept."""
+    return f"; the damaged file is kept as {name}" if name else ""
+
+
+def _replace_damaged(
+    path: Path, header: Header, notes: dict[str, Line], attachments: dict[str, bytes], messages: Iterable[Record]
+) -> tuple[str, dict[str, int]]:
+    """Write a file with these contents in place of `path`, and keep the damaged one beside it.
+
+    Returns the name of the damaged file (empty where there was none) and the messages by topic, as read back. Raises
+    `SessionError`; the damaged file then still has its own name.
+    """
+    fresh = path.with_name(path.name + ".repair")
+    try:
+        fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
+        with new_mcap(fresh, header, notes, attachments) as copy:
+            for record in messages:
+                copy.add(*record)
+        counts = count_messages(fresh)
+        kept = set_aside(path, "damaged").name if path.exists() else ""
+        fresh.replace(path)
+        fsync_folder(path.parent)
+    except OSError as error:
+        raise disk_error(path, "cannot write its repaired copy", error) from error
+    return kept, counts
+
+
+@dataclass(frozen=True, slots=True)
+class Strokes:
+    """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
+
+    found: Scan
+    kept: tuple[str, ...]
+    photograph_lost: tuple[str, ...]
+    """Strokes whose still cannot be read."""
+
+    def messages(self) -> Iterator[Record]:
+        """Everything readable, except strokes without a photograph and strokes that were read before."""
+        gone, seen = set(self.photograph_lost), set[str]()
+        for schema, channel, message in self.found.messages():
+            stroke = _parsed(Stroke, message) if channel.topic == Topic.STROKE else None
+            if stroke is not None:
+                if stroke.stroke_id in gone | seen:
+                    continue
+                seen.add(stroke.stroke_id)
+            yield schema, channel, message
+
+
+def _with_their_stills(found: Scan) -> Strokes:
+    """Sort the strokes of a damaged file into those with their stills and those that are lost."""
+    there = {m.sequence for _, channel, m in found.messages() if channel.topic == Topic.STILL and _shows(m)}
+    names: dict[str, bool] = {}
+    for _schema, channel, message in found.messages():
+        stroke = _parsed(Stroke, message) if channel.topic == Topic.STROKE else None
+        if stroke is not None:
+            names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
+    kept = tuple(name for name, whole in names.items() if whole)
+    lost = tuple(name for name, whole in names.items() if not whole)
+    return Strokes(found, kept, lost)
+
+
+def _lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
+    """Describe what was lost: each stroke by its name, as far as that can be read, then other messages."""
+    lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
+    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - len(lost)
+    if unknown > 0:
+        lost.append(f"strokes that cannot be read: {unknown}")
+    gone = {topic: count - now.get(topic, 0) for topic, count in before.items() if topic != Topic.STROKE}
+    return lost + [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
+
+
+def _repair_file(path: Path) -> Report:
+    """Repair one MCAP file: an import, or a merged file without its session. Raises `SessionDamaged`."""
+    report = Report(path.name)
+    verdict = verify_session(path)
+    report.strokes = verdict.strokes
+    if verdict.sound:
+        return report
+    found = scan(path)
+    metadata = found.metadata.get(HEADER_METADATA)
+    if metadata is None:
+        raise SessionDamaged(path, "has lost its header; it cannot be repaired")
+    header = parse_header(path, metadata)
+    if metadata.get("crc", "") not in ("", header_crc(metadata)):
+        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
+    strokes = _with_their_stills(found)
+    notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
+    files = {attachment.name: attachment.data for attachment in found.attachments}
+    kept, counts = _replace_damaged(path, header, notes, files, strokes.messages())
+    why = "; ".join(finding.what for finding in verdict.findings)
+    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{_kept_words(kept)}")
+    report.strokes = counts.get(Topic.STROKE, 0)
+    report.lost += _lost_words(strokes, Counter(found.stated or {}), counts)
+    if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
+        report.lost.append("anything else behind the damage: without its index its amount is unknown")
+    if found.index is None:
+        return report
+    noted = {one.name for one in found.index.metadata_indexes} - {HEADER_METADATA}
+    if len(files) < len(found.index.attachment_indexes) or len(found.notes) < len(noted):
+        report.lost.append("an attached file, or a note of what was done to the recording")
+    return report
+
+
+def _shows(message: Message) -> bool:
+    try:
+        return bool(decode_still(message.data))
+    except DecodeError:
+        return False

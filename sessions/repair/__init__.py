@@ -1,1 +1,0 @@
-"""Checking sessions for damage, and repairing them."""
