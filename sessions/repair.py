@@ -172,7 +172,7 @@ class FolderRepair:
             return not any(topic in missing for topic in needed), len(records)
 
         copies = [records for records in self._copies(path, line) if _count(records) <= counts]
-        records = max(copies, key=worth, default=[])
+        records = max(copies, key=worth, default=list[Record]())
         missing = counts - _count(records)
         if missing and self._final_sound:
             kept = self._move_aside(path)
