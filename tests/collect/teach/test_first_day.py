@@ -116,6 +116,8 @@ async def test_killed_again_and_again_it_asks_nothing_twice_and_a_step_taught_ag
     assert kills > 10
     assert "this moves the arm. Start the same command again with --arm." in person.trouble
     assert len(person.brought) == len(set(person.brought)), "something was brought twice"
+    kinds = [target.kind for target in person.brought]
+    assert kinds.index("clear-view") < kinds.index("park"), "the proof begins where the arm is left: within the limits"
     once = ("R:", "L:", "Squares", "Side of a square", "Address of the cabinet")
     typed = [question for question in person.asked if question.startswith(once)]
     assert len(typed) == len(set(typed)) == 6
