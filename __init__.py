@@ -1,1 +1,107 @@
-"""Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink."""
+"""Press a Chinese brush with a robot arm, record it, and measure how well a stroke model predicts the ink.
+
+The names below are what one types in a notebook; docs/python.md shows them. Each is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from brushloop.calibrate.calibrated import Calibrated
+    from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+    from brushloop.calibrate.fit.artefact import BrushFit
+    from brushloop.calibrate.fit.command import FitResult
+    from brushloop.calibrate.invert.command import Recovered
+    from brushloop.calibrate.notebook import (
+        Prediction,
+        RecordedPress,
+        Session,
+        Similarity,
+        calibrate_session,
+        compare,
+        fit,
+        models,
+        predict,
+        recover,
+        validate,
+    )
+    from brushloop.calibrate.validate.main import ValidationOutput
+    from brushloop.collect.errors import CollectAborted, ConfigError
+    from brushloop.collect.start import collect_session
+    from brushloop.drivers.loopback import LoopbackRig, simulate
+    from brushloop.model.brush import Brush, DomainError
+    from brushloop.sessions.condition import Condition
+    from brushloop.sessions.errors import SessionDamaged, SessionError
+
+_NAMES = {
+    "brushloop.calibrate.calibrated": ("Calibrated",),
+    "brushloop.calibrate.errors": ("CalibrationError", "CaptureRefused"),
+    "brushloop.calibrate.fit.artefact": ("BrushFit",),
+    "brushloop.calibrate.fit.command": ("FitResult",),
+    "brushloop.calibrate.invert.command": ("Recovered",),
+    "brushloop.calibrate.notebook": (
+        "Prediction",
+        "RecordedPress",
+        "Session",
+        "Similarity",
+        "calibrate_session",
+        "compare",
+        "fit",
+        "models",
+        "predict",
+        "recover",
+        "validate",
+    ),
+    "brushloop.calibrate.validate.main": ("ValidationOutput",),
+    "brushloop.collect.errors": ("CollectAborted", "ConfigError"),
+    "brushloop.collect.start": ("collect_session",),
+    "brushloop.drivers.loopback": ("LoopbackRig", "simulate"),
+    "brushloop.model.brush": ("Brush", "DomainError"),
+    "brushloop.sessions.condition": ("Condition",),
+    "brushloop.sessions.errors": ("SessionDamaged", "SessionError"),
+}
+
+__all__ = [
+    "Brush",
+    "BrushFit",
+    "Calibrated",
+    "CalibrationError",
+    "CaptureRefused",
+    "CollectAborted",
+    "Condition",
+    "ConfigError",
+    "DomainError",
+    "FitResult",
+    "LoopbackRig",
+    "Prediction",
+    "RecordedPress",
+    "Recovered",
+    "Session",
+    "SessionDamaged",
+    "SessionError",
+    "Similarity",
+    "ValidationOutput",
+    "calibrate_session",
+    "collect_session",
+    "compare",
+    "fit",
+    "models",
+    "predict",
+    "recover",
+    "simulate",
+    "validate",
+]
+
+
+def __getattr__(name: str) -> object:
+    for module, names in _NAMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(module), name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -26,25 +26,12 @@ def calibrate(
 ) -> None:
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
 
-    from brushloop.calibrate.artefact import load_artefact
-    from brushloop.calibrate.calibration import Calibration
-    from brushloop.calibrate.pages.calibration import write_calibration_page
-    from brushloop.calibrate.session import calibrate_session
+    from brushloop.calibrate.calibrated import calibrate_session
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.recording import Recording
 
     with shown() as progress:
-        path = calibrate_session(session, lens, progress)
-    made = load_artefact(path, Calibration)
-    for flag in made.flags:
-        say(f"warning: {flag}")
-    say(
-        f"pix2len {made.mm_per_px:.5f} mm/px (95 %: {made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f}), "
-        f"board residual {made.rms_px:.3f} px over {made.corners} corners, {made.source}",
-        f"lens: {made.lens.source if made.lens else 'none'}",
-        str(path),
-        f"Page: {write_calibration_page(Recording(session), path)}",
-    )
+        found = calibrate_session(session, lens, progress)
+    say(*found.lines())
 
 
 app = typer.Typer(

@@ -13,7 +13,7 @@ from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
-from brushloop.calibrate.stroke.preprocess import preprocess
+from brushloop.calibrate.stroke.preprocess import Steps, preprocess
 from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.export_rows import Crop, Cropper
@@ -38,11 +38,25 @@ def cropper_of(recording: Recording, calibration_path: Path | None = None) -> Cr
 
 
 def crop_capture(capture: Capture, calibration: Calibration | None) -> Crop:
-    """Crop a capture.
+    """Crop a capture, as PNG. Raises as `rectified` does."""
+    raster, steps = rectified(capture, calibration)
+    mask = ink_of(capture, steps)
+    prepared = steps.prepared
+    return Crop(
+        _png(raster), _png(255 * mask.astype(np.uint8)), PX_PER_MM, prepared.anchor_px, "; ".join(prepared.flags)
+    )
+
+
+def ink_of(capture: Capture, steps: Steps) -> NDArray[np.bool_]:
+    """(h, w) ink: of a press its largest connected ink, as everywhere; of a stroke that travels all ink in its cell."""
+    return steps.ink if capture.stroke.kind == "drag" else steps.prepared.mask
+
+
+def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Steps]:
+    """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
 
     A press is cropped to the field of `validate` around its zero-touch point, a stroke that travels to its paper cell;
-    an imported photograph is rescaled whole. The mask of a press is its largest connected ink, as everywhere; that of a
-    stroke that travels is all ink in its cell. Raises `CaptureRefused` or `SessionDamaged`.
+    an imported photograph is rescaled whole. Raises `CaptureRefused` or `SessionDamaged`.
     """
     stroke, image = capture.stroke, capture.image()
     params = Params.of(calibration)
@@ -60,9 +74,7 @@ def crop_capture(capture: Capture, calibration: Calibration | None) -> Crop:
         anchor = None if stroke.anchor_px is None else on_raster(stroke.anchor_px, stroke.px_per_mm)
     else:
         raise CaptureRefused(stroke.stroke_id, "has neither a zero-touch point on the sheet nor a scale of its own")
-    steps = preprocess(raster, anchor, capture.where, params, cell_px)
-    mask = steps.ink if stroke.kind == "drag" else steps.prepared.mask
-    return Crop(_png(raster), _png(255 * mask.astype(np.uint8)), PX_PER_MM, anchor, "; ".join(steps.prepared.flags))
+    return raster, preprocess(raster, anchor, capture.where, params, cell_px)
 
 
 def _png(image: Gray | NDArray[np.uint8]) -> bytes:

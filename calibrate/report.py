@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
+import html
 import io
 import json
 import re
@@ -54,6 +55,11 @@ def _templates() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def framed(page: Path) -> str:
+    """A written page as a notebook shows it: in a frame of its own, because it has its own styles."""
+    return f'<iframe srcdoc="{html.escape(page.read_text("utf-8"))}" width="100%" height="600"></iframe>'
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from brushloop.calibrate.drags.artefact import DragArtefact
     from brushloop.calibrate.drags.captures import Drawn
-    from brushloop.calibrate.fit.captures import Captures
-    from brushloop.calibrate.fit.run import Correction, Fitted
 
 DRAG_MM_PER_PX = 0.4
 """Scale of the images that drags are fitted to."""
@@ -52,26 +50,13 @@ def fit(
         _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
 
-    from brushloop.calibrate.artefact import load_artefact, put_to_use
-    from brushloop.calibrate.compare.field import Field
-    from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
-    from brushloop.calibrate.fit.captures import read_presses
-    from brushloop.calibrate.fit.report import write_fit_page
-    from brushloop.calibrate.fit.run import correction as corrected
-    from brushloop.calibrate.fit.run import fit_session
+    from brushloop.calibrate.fit.command import FitRequest, fit_presses
     from brushloop.sessions.progress import shown
-    from brushloop.sessions.recording import Recording
 
-    before = load_artefact(reference, BrushFit) if reference is not None else None
-    view = Field(mm_per_px=mm_per_px or MM_PER_PX)
+    request = FitRequest(session, mm_per_px or MM_PER_PX, calibration, reference)
     with shown() as progress:
-        captures = read_presses(session, view, calibration, progress)
-        fitted = fit_session(captures, view, progress)
-    path = put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)
-    say(*_tables(captures, fitted))
-    if before is not None:
-        say(*_correction(corrected(captures, before)))
-    say(f"Fit: {path}", f"Page: {write_fit_page(captures, fitted, path)}")
+        fitted = fit_presses(request, progress)
+    say(*fitted.lines())
 
 
 def _fit_drags(
@@ -134,44 +119,3 @@ def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
         yield out
     elif not artefact.prior:
         yield "Fewer than five images: too few to leave some out."
-
-
-def _tables(captures: Captures, fitted: Fitted) -> Iterator[object]:
-    from rich.table import Table
-
-    from brushloop.calibrate.fit.sizes import FEWEST_CELLS, middle
-    from brushloop.calibrate.report import source_label, source_note
-
-    yield f"{source_note(captures.header.source, captures.header.brush)}; {len(captures.strokes)} presses fitted"
-    for name, why in captures.refused:
-        yield f"left out: {name}: {why}"
-    label = source_label(captures.header.source, [captures.header.brush])
-    out = Table(
-        "size, mm",
-        "at {:g} mm, {:g}°".format(*middle(captures.strokes)),
-        "per mm of depth",
-        "per degree of tilt",
-        title=f"sizes of the marks with 95 % intervals ({label})",
-    )
-    for size in fitted.sizes:
-        out.add_row(size.name, str(size.here), str(size.by_depth), str(size.by_tilt))
-    yield (
-        out
-        if fitted.sizes
-        else f"Intervals of the sizes of the marks need {FEWEST_CELLS} combinations of depth and tilt."
-    )
-    if not fitted.held_out:
-        yield "Only one cell: nothing can be held out."
-        return
-    out = Table("model", "n", "CSIM", "SSIM", title=f"leave one cell out, mm, binary, percent ({label})")
-    for row in fitted.held_out:
-        out.add_row(row.model, str(row.n), f"{row.csim:.2f}", f"{row.ssim:.2f}")
-    yield out
-
-
-def _correction(found: Correction) -> Iterator[str]:
-    yield f"Zero touch relative to the fit of {found.reference}, with all else of the brush held:"
-    yield f"  paper.touch_z_mm: add {found.lift_mm} mm, 95 % interval in brackets"
-    yield f"  along the heading: the ink is off by {found.along_mm} mm"
-    if found.lift_mm.low <= 0.0 <= found.lift_mm.high:
-        yield "  The interval includes 0: leave rig.toml as it is."

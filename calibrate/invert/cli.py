@@ -32,72 +32,30 @@ def invert(
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
-    from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target
-    from brushloop.sessions.recording import Recording
+    from brushloop.sessions.reader import Recording
 
     check_target(out, ".csv")
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
 
-    from brushloop.calibrate.compare.field import Field
-    from brushloop.calibrate.invert.files import write_inversion
-    from brushloop.calibrate.invert.invert import (
-        NO_MODEL_ERROR,
-        NOT_INFORMATIVE,
-        Settings,
-        invert_recording,
-        off_command,
-    )
-    from brushloop.model.inversion.press import Range
+    from brushloop.calibrate.invert.command import RecoverRequest, recover
     from brushloop.sessions.progress import shown
 
-    try:
-        within = Range(depth_range, tilt_range)
-        if tilt_range[1] > 30:
-            raise ValueError(f"tilt_deg = {tilt_range}: expected 0 to 30")
-    except ValueError as error:
-        raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
-    fitted, cells = None, frozenset[tuple[float, float]]()
-    if fit is not None:
-        from brushloop.calibrate.artefact import load_artefact
-        from brushloop.calibrate.fit.artefact import BrushFit
-        from brushloop.model.fitted import NAMES
-        from brushloop.model.fitted_shape import fitted_model
-
-        artefact = load_artefact(fit, BrushFit)
-        press, cells = artefact.press(), frozenset(artefact.cells)
-        fitted = fitted_model(press)
-        model = fitted.name
-        # A fitted brush marks nothing above its zero offset.
-        least = max(within.depth_mm[0], 0.5 - float(press.values[NAMES.index("h0_mm")]))
-        if least >= within.depth_mm[1]:
-            raise CalibrationError("--depth-range", f"ends before the fitted brush marks, at {least:.2f} mm")
-        within = Range((least, within.depth_mm[1]), within.tilt_deg)
-    settings = Settings(model, fitted, cells, lam, within, anchor_sd, Field(mm_per_px=mm_per_px))
-    with shown() as progress:
-        made = invert_recording(session, settings, calibration, presses, progress)
-    protocol = write_inversion(made, out, repeats, seed)
-    say(f"{made.header.session_id}: {len(made.rows)} presses recovered by {model} ({made.header.source})")
-    for name, mean, sd, inside, n in off_command(made.rows):
-        unit = "mm" if name == "H" else "deg"
-        scatter = "" if sd is None else f", sd {sd:.3f}"
-        say(f"{name}: recovered - commanded {mean:+.3f} {unit}{scatter}; {inside:.0%} of {n} in the interval")
-    say(
-        "alpha follows from how far the mark lies from the zero-touch point, and is as accurate as the model's "
-        "prediction of that distance; the shape of the mark alone does not determine it."
+    request = RecoverRequest(
+        session=session,
+        out=out,
+        model=model,
+        fit=fit,
+        lam=lam,
+        depth_range_mm=depth_range,
+        tilt_range_deg=tilt_range,
+        anchor_sd_mm=anchor_sd,
+        mm_per_px=mm_per_px,
+        calibration=calibration,
+        presses=presses,
+        repeats=repeats,
+        seed=seed,
     )
-    bare = sum(NO_MODEL_ERROR in row.flags for row in made.rows)
-    if bare:
-        say(f"warning: {bare} without model error in their intervals: too few cells with a known command")
-    for name, flag in NOT_INFORMATIVE.items():
-        vague = sum(flag in row.flags for row in made.rows)
-        if vague:
-            say(f"warning: {vague} not informative on {name}: the interval covers most of the commanded range")
-    bound = sum("at_bound" in row.flags for row in made.rows)
-    if 2 * bound > len(made.rows):
-        say(f"warning: {bound} at a bound: the model does not fit this brush; do not press these again")
-    elif bound:
-        say(f"warning: {bound} at a bound of the range: their intervals are valid on one side at most")
-    for stroke_id, why in made.refused:
-        say(f"not used: {stroke_id}: {why}")
-    say(str(out), str(protocol))
+    with shown() as progress:
+        recovered = recover(request, progress)
+    say(*recovered.lines())

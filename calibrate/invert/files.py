@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.invert.invert import Inversion
-from brushloop.sessions.cells import CsvWriter
+from brushloop.calibrate.report import csv_text
 
 PROTOCOL = "protocol-replay.toml"
 MAX_ROWS = 10_000
@@ -33,24 +33,18 @@ def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1)
     if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
         raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(out, recovered_csv(made))
+    write_whole(out, csv_text(COLUMNS, csv_rows(made)))
     protocol = out.parent / PROTOCOL
     write_whole(protocol, replay_toml(made, out.name, repeats, seed))
     return protocol
 
 
-def recovered_csv(made: Inversion) -> str:
-    """CSV, one row per stroke; depths and tilts to three decimals, deviations to three figures."""
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    writer.writerow(COLUMNS)
+def csv_rows(made: Inversion) -> Iterator[list[str]]:
+    """One row per stroke; depths and tilts to three decimals, deviations to three figures."""
     for row in made.rows:
         asked = ["" if v is None else f"{v:g}" for v in (row.commanded_depth_mm, row.commanded_tilt_deg)]
         numbers = [f"{row.depth_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.depth_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
-        writer.writerow(
-            [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, str(made.header.source)]
-        )
-    return out.getvalue()
+        yield [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, str(made.header.source)]
 
 
 def replay_toml(made: Inversion, name: str, repeats: int = 1, seed: int = 1) -> str:

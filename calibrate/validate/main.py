@@ -16,7 +16,7 @@ from brushloop.calibrate.drags.predicted import predict_session
 from brushloop.calibrate.drags.report import DragValidation, write_drags
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
-from brushloop.calibrate.report import csv_text, write_files
+from brushloop.calibrate.report import csv_text, framed, write_files
 from brushloop.calibrate.stroke.params import Params
 from brushloop.calibrate.validate.ablation import similarity_by_strokes
 from brushloop.calibrate.validate.candidates import generator_file
@@ -30,7 +30,7 @@ from brushloop.calibrate.validate.report.page import page_of, pages_beside
 from brushloop.calibrate.validate.report.summary import report_of
 from brushloop.calibrate.validate.run import Options, Outcome, validate_presses
 from brushloop.calibrate.validate.sources import URL, LoadedSession, one_source, open_session
-from brushloop.sessions.progress import Progress, counted
+from brushloop.sessions.progress import Progress, counted, unseen
 
 FOLDER = "validation"
 WORK = "work"
@@ -70,8 +70,17 @@ class ValidationOutput:
     drags: tuple[DragValidation, ...] = ()
     notes: tuple[str, ...] = ()
 
+    @property
+    def page(self) -> Path:
+        """The report; of several sessions of drags, the first one."""
+        several = f"{self.drags[0].header.session_id}/" if len(self.drags) > 1 else ""
+        return self.folder / f"{several}report.html"
 
-def validate(request: Request, progress: Progress) -> ValidationOutput:
+    def _repr_html_(self) -> str:
+        return framed(self.page)
+
+
+def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     """Validate and write every file of the report; gates are checked by `check`.
 
     Raises `CalibrationError`, `ClusterError`, and what reading a recording raises. Finished work is kept in the

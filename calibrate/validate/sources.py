@@ -164,6 +164,11 @@ def _limits(scheme: str) -> dict[str, Any]:
     return {"client_kwargs": {"timeout": untyped.ClientTimeout(total=None, sock_connect=STALL_S, sock_read=STALL_S)}}
 
 
+def local_path(place: str) -> Path:
+    """The path, or that of a copy of the recording at a URL in this machine's temporary folder."""
+    return fetched(place, Path(tempfile.gettempdir()) / "brushloop-recordings") if URL.match(place) else Path(place)
+
+
 @lru_cache(maxsize=8)
 def opened(session: str, sha256: str) -> Recording:
     """The recording as a file of this machine, checked once; a URL is copied. Raises what reading it raises."""

@@ -1,0 +1,44 @@
+"""`brushloop calibrate SESSION` as a function: the calibration of a session and its page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.pages.calibration import write_calibration_page
+from brushloop.calibrate.report import framed
+from brushloop.calibrate.session import calibrate_session as calibrate
+from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.reader import Recording
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """The calibration that a session uses from now on."""
+
+    calibration: Calibration
+    path: Path
+    page: Path
+
+    def lines(self) -> list[str]:
+        """What the command prints."""
+        found = self.calibration
+        return [
+            *(f"warning: {flag}" for flag in found.flags),
+            f"pix2len {found.mm_per_px:.5f} mm/px (95 %: {found.mm_per_px_low:.5f} to {found.mm_per_px_high:.5f}), "
+            f"board residual {found.rms_px:.3f} px over {found.corners} corners, {found.source}",
+            f"lens: {found.lens.source if found.lens else 'none'}",
+            str(self.path),
+            f"Page: {self.page}",
+        ]
+
+    def _repr_html_(self) -> str:
+        return framed(self.page)
+
+
+def calibrate_session(session: Path, lens: Path | None = None, progress: Progress = unseen) -> Calibrated:
+    """Calibrate a session and write the page. Raises what `calibrate.session.calibrate_session` raises."""
+    path = calibrate(session, lens, progress)
+    return Calibrated(load_artefact(path, Calibration), path, write_calibration_page(Recording(session), path))

@@ -1,0 +1,306 @@
+"""What one types in a notebook: a session and its presses, predictions, and the commands as functions.
+
+`import brushloop` gives these names. Each function fills the request of the command of the same name and runs it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.calibrated import Calibrated
+from brushloop.calibrate.calibrated import calibrate_session as calibrate
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import Alignment, Field, Tone, covered
+from brushloop.calibrate.compare.images import brush_of, loop_of, prepare_press, simulated
+from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.crops import ink_of, rectified
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.artefact import FOLDER as FITS
+from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.command import FitRequest, FitResult, fit_presses
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.validate.main import Request, ValidationOutput, check
+from brushloop.calibrate.validate.main import validate as run_validation
+from brushloop.calibrate.validate.sources import local_path
+from brushloop.model.brush import Brush
+from brushloop.sessions.condition import Condition
+from brushloop.sessions.export.rows import Export
+from brushloop.sessions.reader import Capture, Recording
+from brushloop.sessions.recording.schemas import Header
+
+if TYPE_CHECKING:
+    from brushloop.calibrate.invert.command import Recovered
+    from brushloop.model.protocol import StrokeModel
+
+Gray = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+GENERATOR = "ccd-bsmg"
+"""The generator that comes with brushloop."""
+
+
+class Poses(NamedTuple):
+    """Where the brush tip was during a press, in the base frame of the arm."""
+
+    t_ns: NDArray[np.int64]
+    """(n,) when the host received each sample."""
+    position_mm: Floats
+    """(n, 3)."""
+    quaternion: Floats
+    """(n, 4): x, y, z, w."""
+
+
+class Forces(NamedTuple):
+    """What the force sensor measured during a press, in its own frame; empty if the rig had none."""
+
+    t_ns: NDArray[np.int64]
+    """(n,)."""
+    wrench: Floats
+    """(n, 6): fx, fy, fz in N, mx, my, mz in N m."""
+
+
+class RecordedPress:
+    """A press of a session; a picture is decoded when it is first asked for."""
+
+    def __init__(self, session: Session, capture: Capture) -> None:
+        self._session, self._capture = session, capture
+
+    @property
+    def name(self) -> str:
+        """Its name in the session, such as `H13-a05-r02`."""
+        return self._capture.stroke.stroke_id
+
+    @property
+    def condition(self) -> Condition:
+        """What was commanded. Raises `CalibrationError` for an import that does not say it."""
+        stroke = self._capture.stroke
+        if stroke.depth_mm is None or stroke.tilt_deg is None:
+            raise CalibrationError(self._capture.where, "has no depth or tilt")
+        return Condition(depth_mm=stroke.depth_mm, tilt_deg=stroke.tilt_deg, heading_deg=stroke.heading_deg)
+
+    @property
+    def reached_mm(self) -> float | None:
+        """Depth that the arm reached; None where the recording does not say it."""
+        return self._capture.stroke.reached_mm
+
+    @property
+    def verdict(self) -> str:
+        """`passed` or `failed: ...` by the checks of the run, `was marked bad` by a person, or empty."""
+        return self._capture.bad or self._session.quality.get(self.name, "")
+
+    @cached_property
+    def photograph(self) -> Gray:
+        """(h, w) uint8, as it was taken."""
+        return self._capture.image()
+
+    @property
+    def image(self) -> Gray:
+        """(h, w) uint8: what surrounds the press, seen from above at 20 px/mm. Raises `CaptureRefused`."""
+        return self._crop[0]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """(h, w), of the same shape: True where the ink is. Raises `CaptureRefused` where none is found."""
+        return self._crop[1]
+
+    @cached_property
+    def coverage(self) -> NDArray[np.float32]:
+        """(128, 128) share of each pixel that is ink, on the field that `predict` draws on. Raises `CaptureRefused`."""
+        return covered(prepare_press(self._capture, self._session.applied, Field()))
+
+    @property
+    def poses(self) -> Poses:
+        """Path of the brush tip; empty for an import."""
+        return self._session.samples[0].get(self.name, Poses(*_columns([], 3, 4)))
+
+    @property
+    def forces(self) -> Forces:
+        """Force during the press."""
+        return self._session.samples[1].get(self.name, Forces(*_columns([], 6)))
+
+    @cached_property
+    def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
+        raster, steps = rectified(self._capture, self._session.applied)
+        return raster, ink_of(self._capture, steps)
+
+
+class Session:
+    """A finished session: a folder, an MCAP file, or a URL with a checksum. Raises `SessionError`, `CalibrationError`."""
+
+    def __init__(self, place: str | os.PathLike[str]) -> None:
+        self.recording = Recording(local_path(str(place)))
+
+    @property
+    def header(self) -> Header:
+        """Where the strokes come from: source, devices, brush, ink, paper, protocol."""
+        return self.recording.header
+
+    @property
+    def brush(self) -> Brush:
+        """The brush by its nominal size."""
+        return brush_of(self.header)
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration in use; None if there is none, as for an import."""
+        path = current(self.recording.path.parent)
+        return None if path is None else load_artefact(path, Calibration)
+
+    @property
+    def fit(self) -> BrushFit | None:
+        """The brush fit in use."""
+        path = current(self.recording.path.parent, FITS)
+        return None if path is None else load_artefact(path, BrushFit)
+
+    @cached_property
+    def applied(self) -> Calibration | None:
+        """The calibration that crops use; None for an import. Raises `CalibrationError` where it is missing."""
+        first = next(self.recording.stroke_records())
+        return calibration_of(self.recording, first, self.recording.sha256, None)
+
+    @cached_property
+    def quality(self) -> dict[str, str]:
+        """Result of the checks of the run by name of stroke."""
+        return self._export.quality
+
+    @cached_property
+    def samples(self) -> tuple[dict[str, Poses], dict[str, Forces]]:
+        """Poses and forces by name of stroke."""
+        names = list(self._export.numbers)
+        poses: dict[str, list[tuple[Any, ...]]] = {name: [] for name in names}
+        forces: dict[str, list[tuple[Any, ...]]] = {name: [] for name in names}
+        for pose in self._export.poses():
+            poses[names[pose.episode_index]].append((pose.t_ns, pose.position_mm, pose.quaternion))
+        for force in self._export.forces() if self._export.has_force else ():
+            forces[names[force.episode_index]].append((force.t_ns, force.wrench))
+        return (
+            {name: Poses(*_columns(rows, 3, 4)) for name, rows in poses.items()},
+            {name: Forces(*_columns(rows, 6)) for name, rows in forces.items()},
+        )
+
+    def presses(self) -> Iterator[RecordedPress]:
+        """Every press in order, those that were marked bad included."""
+        return (RecordedPress(self, capture) for capture in self.recording.captures())
+
+    @cached_property
+    def _export(self) -> Export:
+        return Export.of(self.recording)
+
+
+def _columns(rows: list[tuple[Any, ...]], *widths: int) -> tuple[NDArray[Any], ...]:
+    """Times and the values beside them as arrays, (n,) and (n, width)."""
+    times = np.array([row[0] for row in rows], np.int64)
+    return times, *(
+        np.array([row[k] for row in rows], np.float64).reshape(-1, width) for k, width in enumerate(widths, 1)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """The mark that a model predicts for a press."""
+
+    model: str
+    image: NDArray[np.float32]
+    """(128, 128) share of each pixel that is ink, at .32 mm/px, with the zero-touch point at .76 of the width."""
+    outline_mm: Floats
+    """(n, 2) points along its edge, x toward the side that the ferrule leans to, from where the axis meets the paper."""
+
+    def _repr_html_(self) -> str:
+        points = " ".join(f"{x:.2f},{-y:.2f}" for x, y in self.outline_mm)
+        return f'<svg viewBox="-40 -20 60 40" width="360"><polygon points="{points}"/></svg>'
+
+
+def models() -> tuple[str, ...]:
+    """Names of the models that `predict` draws."""
+    from brushloop.model.strokes import stroke_models
+
+    return (*stroke_models(Brush()), GENERATOR)
+
+
+def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: str = "ccd-bsm") -> Prediction:
+    """Draw a press; a fitted brush draws itself, whatever the model, and None is the published brush.
+
+    Raises `UnknownModelError`, and `DomainError` for a press that the model does not predict.
+    """
+    chosen = _model(brush or Brush(), model)
+    image = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())[Alignment.MM, Tone.GRAY]
+    loop = loop_of(chosen.profile(condition.depth_mm, condition.tilt_deg))
+    return Prediction(chosen.name, image, loop.points.reshape(-1, 2))
+
+
+def _model(brush: Brush | BrushFit, name: str) -> StrokeModel:
+    if isinstance(brush, BrushFit):
+        from brushloop.model.fitted_shape import fitted_model
+
+        return fitted_model(brush.press())
+    if name == GENERATOR:
+        from brushloop.model.train import SHIPPED_GENERATOR
+        from brushloop.model.train.checkpoint import load_generator
+
+        return load_generator(SHIPPED_GENERATOR, brush)
+    from brushloop.model.strokes import stroke_model
+
+    return stroke_model(name, brush)
+
+
+class Similarity(NamedTuple):
+    """How alike two images are, from 0 to 1."""
+
+    csim: float
+    ssim: float
+
+
+def compare(one: NDArray[Any], other: NDArray[Any]) -> Similarity:
+    """Compare two images of one shape with ink as 1 and paper as 0. Raises ValueError for a blank image."""
+    return Similarity(csim(one, other), ssim(one, other))
+
+
+Place = Session | str | os.PathLike[str]
+"""A session, or what `Session` takes."""
+
+
+def calibrate_session(session: Place, *, lens: Path | None = None) -> Calibrated:
+    """Fit scale and paper plane of a session from the board in view, as `brushloop calibrate` does."""
+    return calibrate(_path(session), lens)
+
+
+def fit(session: Place, **options: Any) -> FitResult:
+    """Fit the brush to the presses of a session, as `brushloop fit` does; `options` are fields of `FitRequest`."""
+    return fit_presses(FitRequest(_path(session), **options))
+
+
+def recover(session: Place, out: Path | None = None, **options: Any) -> Recovered:
+    """Recover depth and tilt of every press from its image, as `brushloop invert` does.
+
+    Writes `recovered.csv` and the protocol that repeats the presses, beside the recording unless `out` says where.
+    `options` are fields of `RecoverRequest`.
+    """
+    from brushloop.calibrate.invert.command import RecoverRequest
+    from brushloop.calibrate.invert.command import recover as run
+
+    path = _path(session)
+    return run(RecoverRequest(session=path, out=out or Recording(path).path.parent / "recovered.csv", **options))
+
+
+def validate(*sessions: Place, **options: Any) -> ValidationOutput:
+    """Compare every model with every press, as `brushloop validate` does; `options` are fields of its `Request`.
+
+    Raises `GateMissed` if a gate is missed, once the report is written.
+    """
+    places = tuple(str(one.recording.path) if isinstance(one, Session) else str(one) for one in sessions)
+    request = Request(places=places, command=f"brushloop.validate{places}", **options)
+    output = run_validation(request)
+    check(output, request)
+    return output
+
+
+def _path(session: Place) -> Path:
+    return session.recording.path if isinstance(session, Session) else local_path(str(session))
