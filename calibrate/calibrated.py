@@ -11,7 +11,7 @@ from brushloop.calibrate.pages.calibration import write_calibration_page
 from brushloop.calibrate.report import framed
 from brushloop.calibrate.session import calibrate_session as calibrate
 from brushloop.sessions.progress import Progress, unseen
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from brushloop.calibrate.calibrated import Calibrated
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Alignment, Field, Tone, covered
-from brushloop.calibrate.compare.images import brush_of, loop_of, prepare_press, simulated
+from brushloop.calibrate.compare.images import brush_of, prepare_press, simulated
 from brushloop.calibrate.compare.similarity import csim, ssim
 from brushloop.calibrate.crops import ink_of, rectified
 from brushloop.calibrate.errors import CalibrationError
@@ -34,8 +34,8 @@ from brushloop.calibrate.validate.sources import local_path
 from brushloop.model.brush import Brush
 from brushloop.sessions.condition import Condition
 from brushloop.sessions.export.rows import Export
-from brushloop.sessions.reader import Capture, Recording
-from brushloop.sessions.recording.schemas import Header
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Header
 
 if TYPE_CHECKING:
     from brushloop.calibrate.invert.command import Recovered
@@ -133,7 +133,10 @@ class RecordedPress:
 
 
 class Session:
-    """A finished session: a folder, an MCAP file, or a URL with a checksum. Raises `SessionError`, `CalibrationError`."""
+    """A finished session: a folder, an MCAP file, or a URL with a checksum.
+
+    Raises `SessionError`, and `CalibrationError` for a URL that cannot be read.
+    """
 
     def __init__(self, place: str | os.PathLike[str]) -> None:
         self.recording = Recording(local_path(str(place)))
@@ -209,9 +212,9 @@ class Prediction:
 
     model: str
     image: NDArray[np.float32]
-    """(128, 128) share of each pixel that is ink, at .32 mm/px, with the zero-touch point at .76 of the width."""
+    """(128, 128) share of each pixel that is ink, at .3 mm/px, with the zero-touch point at .76 of the width."""
     outline_mm: Floats
-    """(n, 2) points along its edge, x toward the side that the ferrule leans to, from where the axis meets the paper."""
+    """(n, 2) points along its edge, from where the brush axis meets the paper; the ferrule leans toward positive x."""
 
     def _repr_html_(self) -> str:
         points = " ".join(f"{x:.2f},{-y:.2f}" for x, y in self.outline_mm)
@@ -232,8 +235,8 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
     """
     chosen = _model(brush or Brush(), model)
     image = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())[Alignment.MM, Tone.GRAY]
-    loop = loop_of(chosen.profile(condition.depth_mm, condition.tilt_deg))
-    return Prediction(chosen.name, image, loop.points.reshape(-1, 2))
+    edge = chosen.profile(condition.depth_mm, condition.tilt_deg).outline().polyline()[0]
+    return Prediction(chosen.name, image, np.asarray(edge.detach().double().reshape(-1, 2), np.float64))
 
 
 def _model(brush: Brush | BrushFit, name: str) -> StrokeModel:

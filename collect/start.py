@@ -84,6 +84,20 @@ def start(
     return now.given_up
 
 
+def collect_session(
+    config: Path, protocol: Path, out: Path = Path("sessions"), *, sheet: int | None = None, armed: bool = False
+) -> Path:
+    """Carry out a protocol without a screen, as `brushloop collect --no-tui` does; return the session's folder.
+
+    `sheet` confirms that this sheet is in, `armed` lets real hardware move. An open session of the same files is
+    resumed. Raises `ConfigError`, `CollectAborted`, `SessionError` and what the devices raise.
+    """
+    opening = Opening.load(Path(out), Path(config), Path(protocol), sheet=sheet, armed=armed)
+    engine = engine_for(opening, watched=False)
+    run_headless(engine)
+    return Path(engine.snapshot().folder)
+
+
 def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_screen: bool) -> None:
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:

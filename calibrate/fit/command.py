@@ -16,7 +16,7 @@ from brushloop.calibrate.fit.run import Correction, Fitted, correction, fit_sess
 from brushloop.calibrate.fit.sizes import FEWEST_CELLS, middle
 from brushloop.calibrate.report import framed, source_label, source_note
 from brushloop.sessions.progress import Progress, unseen
-from brushloop.sessions.reader import Recording
+from brushloop.sessions.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)

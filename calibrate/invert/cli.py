@@ -33,7 +33,7 @@ def invert(
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
 
     from brushloop.calibrate.files import check_target
-    from brushloop.sessions.reader import Recording
+    from brushloop.sessions.recording import Recording
 
     check_target(out, ".csv")
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
