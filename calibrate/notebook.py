@@ -33,7 +33,8 @@ from brushloop.calibrate.validate.main import validate as run_validation
 from brushloop.calibrate.validate.sources import local_path
 from brushloop.model.brush import Brush
 from brushloop.sessions.condition import Condition
-from brushloop.sessions.export.rows import Export
+from brushloop.sessions.export_rows import SAMPLE_COLUMNS, Export, Sample
+from brushloop.sessions.progress import unseen
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header
 
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+NO_TIMES = np.empty(0, np.int64)
 GENERATOR = "ccd-bsmg"
 """The generator that comes with brushloop."""
 
@@ -119,12 +121,12 @@ class RecordedPress:
     @property
     def poses(self) -> Poses:
         """Path of the brush tip; empty for an import."""
-        return self._session.samples[0].get(self.name, Poses(*_columns([], 3, 4)))
+        return self._session.samples[0].get(self.name, Poses(NO_TIMES, np.empty((0, 3)), np.empty((0, 4))))
 
     @property
     def forces(self) -> Forces:
         """Force during the press."""
-        return self._session.samples[1].get(self.name, Forces(*_columns([], 6)))
+        return self._session.samples[1].get(self.name, Forces(NO_TIMES, np.empty((0, 6))))
 
     @cached_property
     def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
@@ -177,16 +179,12 @@ class Session:
     @cached_property
     def samples(self) -> tuple[dict[str, Poses], dict[str, Forces]]:
         """Poses and forces by name of stroke."""
-        names = list(self._export.numbers)
-        poses: dict[str, list[tuple[Any, ...]]] = {name: [] for name in names}
-        forces: dict[str, list[tuple[Any, ...]]] = {name: [] for name in names}
-        for pose in self._export.poses():
-            poses[names[pose.episode_index]].append((pose.t_ns, pose.position_mm, pose.quaternion))
-        for force in self._export.forces() if self._export.has_force else ():
-            forces[names[force.episode_index]].append((force.t_ns, force.wrench))
+        names = list(self._export.strokes)
+        poses = _by_stroke(names, self._export.poses())
+        forces = _by_stroke(names, self._export.forces())
         return (
-            {name: Poses(*_columns(rows, 3, 4)) for name, rows in poses.items()},
-            {name: Forces(*_columns(rows, 6)) for name, rows in forces.items()},
+            {name: Poses(t_ns, at[:, :3], at[:, 3:]) for name, (t_ns, at) in poses.items()},
+            {name: Forces(t_ns, wrench) for name, (t_ns, wrench) in forces.items()},
         )
 
     def presses(self) -> Iterator[RecordedPress]:
@@ -195,15 +193,19 @@ class Session:
 
     @cached_property
     def _export(self) -> Export:
-        return Export.of(self.recording)
+        return Export(self.recording, unseen, None, frames=False)
 
 
-def _columns(rows: list[tuple[Any, ...]], *widths: int) -> tuple[NDArray[Any], ...]:
-    """Times and the values beside them as arrays, (n,) and (n, width)."""
-    times = np.array([row[0] for row in rows], np.int64)
-    return times, *(
-        np.array([row[k] for row in rows], np.float64).reshape(-1, width) for k, width in enumerate(widths, 1)
-    )
+def _by_stroke(names: list[str], samples: Iterator[Sample]) -> dict[str, tuple[NDArray[np.int64], Floats]]:
+    """Times (n,) and values (n, width) of each stroke that has any."""
+    rows: dict[str, list[Sample]] = {}
+    for sample in samples:
+        rows.setdefault(names[sample[0][0]], []).append(sample)
+    at = SAMPLE_COLUMNS.index("t_ns")
+    return {
+        name: (np.array([times[at] for times, _ in found], np.int64), np.array([values for _, values in found]))
+        for name, found in rows.items()
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -69,7 +69,8 @@ class Export:
                 raise SessionDamaged(recording.path, f"holds stroke {stroke.stroke_id} twice")
         waits = {name: wait for name, stroke in self.strokes.items() if (wait := stroke.dip_to_touch_s) is not None}
         self._odd = frozenset(unlike(waits))
-        self._quality = self._judged()
+        self.quality = self._judged()
+        """`passed`, or `failed: ...`, by the name of each stroke that was judged."""
         self.left_out: list[tuple[str, str]] = []
         """(stroke, reason) of those that could not be cropped; filled while the captures are read."""
         self.pictures = ("image",) if cropper is None else ("image", "mask", "frame") if frames else ("image", "mask")
@@ -120,7 +121,7 @@ class Export:
             **_pair("anchor", "px", stroke.anchor_px),
             **_pair("px_per_mm", "", stroke.px_per_mm),
             **dict(zip(PATCH_COLUMNS, stroke.cell_mm or (None,) * len(PATCH_COLUMNS), strict=True)),
-            "quality": self._quality.get(stroke.stroke_id, ""),
+            "quality": self.quality.get(stroke.stroke_id, ""),
             "marked_bad": "",
             "licence": header.licence,
             **{f"commanded_{name}": value for name, value in stroke.commanded.items()},
