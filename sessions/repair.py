@@ -11,39 +11,38 @@ interrupted anywhere and started again ends with the same result.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
 
-from google.protobuf.message import DecodeError
-from mcap.records import Message
-from pydantic import ValidationError
-
-from brushloop.sessions.disk import check_digest, file_sha256, fsync_folder, holds, set_aside, sync
+from brushloop.sessions.disk import check_digest, file_sha256, fsync_folder, holds, set_aside
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
 from brushloop.sessions.evidence import Evidence, gather
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, without_time
 from brushloop.sessions.journal.journal import Replay, fold, read_header, replay
 from brushloop.sessions.mcap_file import Part, Record, Scan, scan
-from brushloop.sessions.mcap_writer import new_mcap
-from brushloop.sessions.messages import decode_still
 from brushloop.sessions.names import SEGMENT_NAME
-from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session, parse_header
+from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session
 from brushloop.sessions.records import (
     BEGIN_NOTE,
     DONE_NOTE,
-    HEADER_METADATA,
-    Header,
     StepEvent,
     Stroke,
     Topic,
-    header_crc,
+)
+from brushloop.sessions.salvage import (
+    Report,
+    kept_words,
+    lost_words,
+    parsed,
+    repair_file,
+    replace_damaged,
+    with_their_stills,
+    write_anew,
 )
 from brushloop.sessions.show import step_words
 from brushloop.sessions.store import closed_line, lock
-from brushloop.sessions.verify import file_problems, verify_session
+from brushloop.sessions.verify import file_problems
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 """Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""
@@ -51,23 +50,6 @@ MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 
 Step = tuple[str, int]
 """Key and attempt of a step."""
-
-
-@dataclass(slots=True)
-class Report:
-    """Result of a repair."""
-
-    session: str
-    did: list[str] = field(default_factory=list[str])
-    lost: list[str] = field(default_factory=list[str])
-    """Descriptions of what could not be recovered; empty for a repair without loss."""
-    strokes: int = 0
-    """Finished strokes in the session after the repair."""
-
-    @property
-    def lossless(self) -> bool:
-        """Whether everything recorded was recovered."""
-        return not self.lost
 
 
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
@@ -82,13 +64,13 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     try:
         check_name(path)
         if target.is_file():
-            return _repair_file(target)
+            return repair_file(target)
         files = [file.name for file in target.glob("*.mcap*")]
         if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
             final = target / f"{target.name}.mcap"
             if not final.is_file():
                 raise not_a_session(path)
-            return _repair_file(final)
+            return repair_file(final)
         held = lock(target)
         try:
             return FolderRepair(target, now_ns).run()
@@ -132,7 +114,7 @@ class FolderRepair:
                 self._segment(line)
             for name, why in self._strays.items():
                 kept = self._move_aside(self._folder / name)
-                self._report.did.append(f"put {name} aside: {why}{_kept_words(kept)}")
+                self._report.did.append(f"put {name} aside: {why}{kept_words(kept)}")
             if self._state.closed is None:
                 self._left_by_a_close()
             elif not self._final_sound:
@@ -149,8 +131,8 @@ class FolderRepair:
             path = self._folder / name
             data = text.encode()
             if not holds(path, data):
-                kept = _write_anew(path, data)
-                self._report.did.append(f"wrote {path.name} again from the journal{_kept_words(kept)}")
+                kept = write_anew(path, data)
+                self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
 
     def _segment(self, line: Line) -> None:
         path = self._folder / line["file"]
@@ -177,7 +159,7 @@ class FolderRepair:
         if missing and self._final_sound:
             kept = self._move_aside(path)
             self._log({"event": "held", "key": line["key"], "file": path.name, "by": self._final.name, "why": why})
-            held = f"{path.name} ({step_words(line)}) {why}: the merged file holds all of it{_kept_words(kept)}"
+            held = f"{path.name} ({step_words(line)}) {why}: the merged file holds all of it{kept_words(kept)}"
             self._report.did.append(held)
         elif any(topic in missing for topic in needed):
             self._lose(path, line, why)
@@ -226,12 +208,12 @@ class FolderRepair:
         counts = dict(_count(records))
         done = {name: line[name] for name in ("key", "kind", "result", "t_ns")}
         notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line.get("attempt", 1), "counts": counts}}
-        kept, counts = _replace_damaged(path, self._header, notes, {}, records)
+        kept, counts = replace_damaged(path, self._header, notes, {}, records)
         event: Line = {"event": "repaired", "key": line["key"], "file": path.name, "sha256": file_sha256(path)}
         self._log({**event, "counts": counts, "missing": missing, "aside": kept, "why": why})
         words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
         how = f"without {words}" if words else "whole"
-        self._report.did.append(f"wrote {path.name} ({step_words(line)}) again {how}: {why}{_kept_words(kept)}")
+        self._report.did.append(f"wrote {path.name} ({step_words(line)}) again {how}: {why}{kept_words(kept)}")
         if words:
             self._lost_steps.append(f"messages in {path.name} ({step_words(line)}): {words}")
 
@@ -247,7 +229,7 @@ class FolderRepair:
         kept = self._move_aside(path)
         again = "" if self._state.closed is not None else "; it is done again when the session goes on"
         self._log({"event": "lost", "key": line["key"], "file": path.name, "aside": kept, "why": why})
-        self._report.did.append(f"marked {path.name} ({step_words(line)}) as lost: {why}{_kept_words(kept)}")
+        self._report.did.append(f"marked {path.name} ({step_words(line)}) as lost: {why}{kept_words(kept)}")
         self._lost_steps.append(f"{step_words(line)}{again}")
         if self._state.closed is None:
             self._lose_its_press(line)
@@ -279,7 +261,7 @@ class FolderRepair:
         if (
             self._final.is_file()
             and self._is_ours(found)
-            and len(_with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0)
+            and len(with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0)
         ):
             self._lost_steps = self._rewrite_final(found)
             return
@@ -287,20 +269,20 @@ class FolderRepair:
         kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
         merge_session(self._folder, self._state, self._header, "damaged")
         self._log(closed_line(self._final, self._state.counts()))
-        self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{_kept_words(kept)}")
+        self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{kept_words(kept)}")
 
     def _rewrite_final(self, found: Scan) -> list[str]:
         """Rewrite the merged file, and return descriptions of what was lost."""
-        strokes = _with_their_stills(found)
+        strokes = with_their_stills(found)
         names = (self._state.opened or {}).get("snapshots", {})
         files = {a.name: a.data for a in found.attachments} | {name: text.encode() for name, text in names.items()}
         notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": self._state.repairs}} if self._state.repairs else {}
-        kept, counts = _replace_damaged(self._final, self._header, notes, files, strokes.messages())
+        kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
         before = Counter[str]((self._state.closed or {}).get("counts", {}))
         self._log(closed_line(self._final, counts))
         why = "; ".join(found.damage) or "has changed"
-        self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{_kept_words(kept)}")
-        return _lost_words(strokes, before, counts)
+        self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
+        return lost_words(strokes, before, counts)
 
     def _left_by_a_close(self) -> None:
         """Put aside a damaged merged file of an open session, which is merged again when it closes."""
@@ -308,7 +290,7 @@ class FolderRepair:
         if problems or not self._is_ours(found):
             kept = self._move_aside(self._final)
             self._report.did.append(
-                f"put {self._final.name} aside, for which the journal has no close{_kept_words(kept)}"
+                f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}"
             )
 
     def _log(self, line: Line) -> None:
@@ -348,7 +330,7 @@ def _step_of(found: Scan) -> Step | None:
             case _:
                 pass
     for _schema, _channel, message in found.messages(topics=(Topic.STEP,)):
-        event = _parsed(StepEvent, message)
+        event = parsed(StepEvent, message)
         return None if event is None else (event.key, event.attempt)
     return None
 
@@ -369,29 +351,18 @@ def _steps_in(found: Scan) -> tuple[dict[Step, list[Part]], dict[int, list[Part]
         run = [*run, part]
         step: Step | None = None
         for _schema, channel, message in found.messages([part], (Topic.STEP, Topic.STILL, Topic.STROKE)):
-            if channel.topic == Topic.STEP and (event := _parsed(StepEvent, message)) is not None:
+            if channel.topic == Topic.STEP and (event := parsed(StepEvent, message)) is not None:
                 step = event.key, event.attempt
                 run = [part] if event.phase == "begin" else run
             elif channel.topic == Topic.STILL:
                 by_still.setdefault(message.sequence, []).append(part)
-            elif channel.topic == Topic.STROKE and (stroke := _parsed(Stroke, message)) is not None:
+            elif channel.topic == Topic.STROKE and (stroke := parsed(Stroke, message)) is not None:
                 parts = by_still.setdefault(stroke.still, [])
                 parts += [] if part in parts else [part]
         if step is not None:
             known = by_step.get(step, [])
             run = by_step[step] = [*known, *(part for part in run if part not in known)]
     return by_step, by_still
-
-
-_E = TypeVar("_E", Stroke, StepEvent)
-
-
-def _parsed(kind: type[_E], message: Message) -> _E | None:
-    """The event in a message; None where it does not fit its schema."""
-    try:
-        return kind.model_validate_json(message.data)
-    except ValidationError:
-        return None
 
 
 def _repaired_journal(evidence: Evidence, session: str, now_ns: Callable[[], int], report: Report) -> Journal:
@@ -413,10 +384,10 @@ def _rewrite_journal(evidence: Evidence, session: str, now_ns: Callable[[], int]
     words = {"event": "journal", "aside": aside, "rebuilt": len(evidence.rebuilt), "lost": evidence.lost}
     lines = [*evidence.all_lines, {"t_ns": now_ns(), **words}]
     data = (encode_line(int(line.get("t_ns", 0)), without_time(line), n, session) for n, line in enumerate(lines, 1))
-    kept = _write_anew(path, b"".join(data))
+    kept = write_anew(path, b"".join(data))
     report.did.append(
         f"wrote {JOURNAL_NAME} again: {len(evidence.lines)} lines as they were, {len(evidence.rebuilt)} rebuilt "
-        f"from the files{_kept_words(kept)}"
+        f"from the files{kept_words(kept)}"
     )
     report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.faults]
     if evidence.lost:
@@ -439,126 +410,3 @@ def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], 
                 f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
                 f"go on with a fresh one, --sheet {sheet + 2}"
             )
-
-
-def _write_anew(path: Path, data: bytes) -> str:
-    """Replace a file; return the name under which the old one is kept, or an empty string. Raises `OSError`."""
-    kept = set_aside(path, "damaged").name if path.exists() else ""
-    fresh = path.with_name(path.name + ".repair")
-    with fresh.open("wb") as file:
-        file.write(data)
-        sync(file)
-    fresh.replace(path)
-    fsync_folder(path.parent)
-    return kept
-
-
-def _kept_words(name: str) -> str:
-    """Say where the damaged file is kept."""
-    return f"; the damaged file is kept as {name}" if name else ""
-
-
-def _replace_damaged(
-    path: Path, header: Header, notes: dict[str, Line], attachments: dict[str, bytes], messages: Iterable[Record]
-) -> tuple[str, dict[str, int]]:
-    """Write a file with these contents in place of `path`, and keep the damaged one beside it.
-
-    Returns the name of the damaged file (empty where there was none) and the messages by topic, as read back. Raises
-    `SessionError`; the damaged file then still has its own name.
-    """
-    fresh = path.with_name(path.name + ".repair")
-    try:
-        fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
-        with new_mcap(fresh, header, notes, attachments) as copy:
-            for record in messages:
-                copy.add(*record)
-        counts = count_messages(fresh)
-        kept = set_aside(path, "damaged").name if path.exists() else ""
-        fresh.replace(path)
-        fsync_folder(path.parent)
-    except OSError as error:
-        raise disk_error(path, "cannot write its repaired copy", error) from error
-    return kept, counts
-
-
-@dataclass(frozen=True, slots=True)
-class Strokes:
-    """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
-
-    found: Scan
-    kept: tuple[str, ...]
-    photograph_lost: tuple[str, ...]
-    """Strokes whose still cannot be read."""
-
-    def messages(self) -> Iterator[Record]:
-        """Everything readable, except strokes without a photograph and strokes that were read before."""
-        gone, seen = set(self.photograph_lost), set[str]()
-        for schema, channel, message in self.found.messages():
-            stroke = _parsed(Stroke, message) if channel.topic == Topic.STROKE else None
-            if stroke is not None:
-                if stroke.stroke_id in gone | seen:
-                    continue
-                seen.add(stroke.stroke_id)
-            yield schema, channel, message
-
-
-def _with_their_stills(found: Scan) -> Strokes:
-    """Sort the strokes of a damaged file into those with their stills and those that are lost."""
-    there = {m.sequence for _, channel, m in found.messages() if channel.topic == Topic.STILL and _shows(m)}
-    names: dict[str, bool] = {}
-    for _schema, channel, message in found.messages():
-        stroke = _parsed(Stroke, message) if channel.topic == Topic.STROKE else None
-        if stroke is not None:
-            names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
-    kept = tuple(name for name, whole in names.items() if whole)
-    lost = tuple(name for name, whole in names.items() if not whole)
-    return Strokes(found, kept, lost)
-
-
-def _lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
-    """Describe what was lost: each stroke by its name, as far as that can be read, then other messages."""
-    lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
-    unknown = before[Topic.STROKE] - now.get(Topic.STROKE, 0) - len(lost)
-    if unknown > 0:
-        lost.append(f"strokes that cannot be read: {unknown}")
-    gone = {topic: count - now.get(topic, 0) for topic, count in before.items() if topic != Topic.STROKE}
-    return lost + [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
-
-
-def _repair_file(path: Path) -> Report:
-    """Repair one MCAP file: an import, or a merged file without its session. Raises `SessionDamaged`."""
-    report = Report(path.name)
-    verdict = verify_session(path)
-    report.strokes = verdict.strokes
-    if verdict.sound:
-        return report
-    found = scan(path)
-    metadata = found.metadata.get(HEADER_METADATA)
-    if metadata is None:
-        raise SessionDamaged(path, "has lost its header; it cannot be repaired")
-    header = parse_header(path, metadata)
-    if metadata.get("crc", "") not in ("", header_crc(metadata)):
-        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
-    strokes = _with_their_stills(found)
-    notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
-    files = {attachment.name: attachment.data for attachment in found.attachments}
-    kept, counts = _replace_damaged(path, header, notes, files, strokes.messages())
-    why = "; ".join(finding.what for finding in verdict.findings)
-    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{_kept_words(kept)}")
-    report.strokes = counts.get(Topic.STROKE, 0)
-    report.lost += _lost_words(strokes, Counter(found.stated or {}), counts)
-    if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
-        report.lost.append("anything else behind the damage: without its index its amount is unknown")
-    if found.index is None:
-        return report
-    noted = {one.name for one in found.index.metadata_indexes} - {HEADER_METADATA}
-    if len(files) < len(found.index.attachment_indexes) or len(found.notes) < len(noted):
-        report.lost.append("an attached file, or a note of what was done to the recording")
-    return report
-
-
-def _shows(message: Message) -> bool:
-    try:
-        return bool(decode_still(message.data))
-    except DecodeError:
-        return False
