@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from brushloop.sessions.errors import InputError
 from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.journal import JOURNAL_NAME, encode_line, read_lines
 from brushloop.sessions.messages import encode_png, image_message, pose_message
@@ -193,22 +192,6 @@ def run(make: Make, photos: Path, out: Path) -> Callable[..., Path]:
         return import_photographs(photos, photos / "table.csv", out, options, "brushloop 0", make.clock())
 
     return run
-
-
-@pytest.fixture
-def refusal(make: Make, tmp_path: Path, run: Callable[..., Path]) -> Callable[..., str]:
-    """Runs the import; it is refused in one line with exit code 2, and nothing is left behind."""
-
-    def refusal(options: ImportOptions = PRESSES) -> str:
-        before = make.tree(tmp_path)
-        with pytest.raises(InputError) as caught:
-            run(options)
-        assert make.tree(tmp_path) == before
-        assert caught.value.exit_code == 2
-        assert "\n" not in str(caught.value)
-        return str(caught.value).removeprefix(f"{tmp_path}/")
-
-    return refusal
 
 
 @pytest.fixture

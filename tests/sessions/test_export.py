@@ -31,54 +31,19 @@ def to(tmp_path):
     return tmp_path / "exported"
 
 
-def test_png_and_csv_hold_the_photographs_byte_for_byte(make, session, to):
-    export(session, to, "png")
-    with (to / "strokes.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["stroke_id"] for row in rows] == ["H13-a05-r00", "H13-a05-r01"]
-    assert [(to / row["file"]).read_bytes() for row in rows] == [make.png(0), make.png(1)]
-    assert {row["source"] for row in rows} == {"loopback rig"}
-    assert rows[0].keys() >= {"depth_mm", "tilt_deg", "anchor_x_mm", "anchor_y_mm", "anchor_x_px", "px_per_mm_x"}
-    assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(session).sha256
-
-
-def test_values_that_were_commanded_are_columns_and_what_is_not_given_is_empty(make, tmp_path, to):
-    values = {"depth_mm": 13.0, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
-    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0, **values), make.still(1), make.stroke(1))
-    export(path, to, "png")
-    with (to / "strokes.csv").open(newline="") as file:
-        first, second = csv.DictReader(file)
-    assert [first[c] for c in ("depth_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")] == [
-        "13.0",
-        "1.5",
-        "2.5",
-        "30.0",
-    ]
-    assert [second[c] for c in ("depth_mm", "anchor_x_mm", "commanded_length_mm")] == ["", "", ""]
-
-
-def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, session, to):
-    export(session, to, "png")
-    with (to / "poses.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["episode_index"], row["frame_index"]) for row in rows] == [
-        (str(episode), str(frame)) for episode in range(2) for frame in range(5)
-    ]
-    assert [int(row["sequence"]) for row in rows[5:]] == [100, 101, 102, 103, 104]
-    assert int(rows[5]["t_ns"]) == make.pose(100).publish_ns
-    assert [float(rows[0][c]) for c in ("x_mm", "y_mm", "z_mm", "qw")] == [1.0, 2.0, 3.0, 1.0]
+@pytest.fixture
+def few(make, tmp_path):
+    """A recording of two strokes, of which only the second has values."""
+    values = {"depth_mm": 13.0, "reached_mm": 12.9, "anchor_mm": (1.5, 2.5), "commanded": {"length_mm": 30.0}}
+    return make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0), make.still(1), make.stroke(1, **values))
 
 
 @pytest.fixture
 def felt(make, tmp_path):
     """A recording of a judged press with two samples of force."""
     store = make.store(tmp_path / "felt")
-    pushes = [
-        Outgoing(
-            Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fx_n=0.1, fy_n=0.0, fz_n=-float(n), mx_nm=0.0, my_nm=0.0, mz_nm=0.0)
-        )
-        for n in range(2)
-    ]
+    still = {"fx_n": 0.1, "fy_n": 0.0, "mx_nm": 0.0, "my_nm": 0.0, "mz_nm": 0.0}
+    pushes = [Outgoing(Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fz_n=-float(n), **still)) for n in range(2)]
     make.take(store, "a press", "press", [*pushes, make.pose(0)], {"stroke_id": "H13-a05-r00"}, 0)
     checks = (Check(name="dry", passed=False, reason="is dry"), Check(name="faint", passed=True))
     judged = Outgoing(Topic.QUALITY, 30, 30, 0, Quality(stroke_id="H13-a05-r00", checks=checks))
@@ -89,60 +54,71 @@ def felt(make, tmp_path):
     return store.folder
 
 
+def rows_of(table):
+    with table.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_png_and_csv_hold_the_photographs_byte_for_byte(make, session, to):
+    to.mkdir()  # an empty folder is used
+    export(session, to, "png")
+    strokes = rows_of(to / "strokes.csv")
+    assert [row["stroke_id"] for row in strokes] == ["H13-a05-r00", "H13-a05-r01"]
+    assert [(to / row["file"]).read_bytes() for row in strokes] == [make.png(0), make.png(1)]
+    assert {row["source"] for row in strokes} == {"loopback rig"}
+    assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(session).sha256
+
+
+def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, session, to):
+    export(session, to, "png")
+    poses = rows_of(to / "poses.csv")
+    frames = [(row["episode_index"], row["frame_index"]) for row in poses]
+    assert frames == [(str(episode), str(frame)) for episode in range(2) for frame in range(5)]
+    assert [int(row["sequence"]) for row in poses[5:]] == [100, 101, 102, 103, 104]
+    assert int(poses[5]["t_ns"]) == make.pose(100).publish_ns
+    assert [float(poses[0][c]) for c in ("x_mm", "y_mm", "z_mm", "qw")] == [1.0, 2.0, 3.0, 1.0]
+
+
+def test_what_was_commanded_and_reached_are_columns_and_what_is_not_given_is_empty(few, tmp_path):
+    columns = ("depth_mm", "reached_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")
+    export(few, tmp_path / "png", "png")
+    assert [[row[c] for c in columns] for row in rows_of(tmp_path / "png" / "strokes.csv")] == [
+        [""] * 5,
+        ["13.0", "12.9", "1.5", "2.5", "30.0"],
+    ]
+    export(few, tmp_path / "npz", "npz")
+    with np.load(tmp_path / "npz" / "strokes.npz", allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(
+            [arrays[c] for c in columns], [[np.nan, 13.0], [np.nan, 12.9], [np.nan, 1.5], [np.nan, 2.5], [np.nan, 30.0]]
+        )
+
+
 def test_force_and_quality_are_exported_with_each_stroke(felt, to):
     export(felt, to, "png")
-    with (to / "forces.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["episode_index"], row["frame_index"], row["fz_n"]) for row in rows] == [
-        ("0", "0", "-0.0"),
-        ("0", "1", "-1.0"),
-    ]
-    with (to / "strokes.csv").open(newline="") as file:
-        [stroke] = csv.DictReader(file)
+    forces = [(row["episode_index"], row["frame_index"], row["fz_n"]) for row in rows_of(to / "forces.csv")]
+    assert forces == [("0", "0", "-0.0"), ("0", "1", "-1.0")]
+    [stroke] = rows_of(to / "strokes.csv")
     assert (stroke["quality"], stroke["marked_bad"]) == ("failed: dry", "")
 
 
-def test_force_is_an_array_of_its_own_in_npz(felt, to):
-    export(felt, to, "npz")
-    with np.load(to / "strokes.npz", allow_pickle=False) as arrays:
-        assert arrays["force_wrench"].shape == (2, 6)
-        assert arrays["quality"].tolist() == ["failed: dry"]
-
-
-@pytest.mark.soak  # importing `datasets` takes longer than everything else here
-def test_hugging_face_datasets_loads_strokes_poses_and_forces(make, felt, to):
-    datasets = pytest.importorskip("datasets", reason="needs `pip install datasets`, which the lock leaves out")
-    export(felt, to, "parquet")
-    cache = str(to.parent / "cache")
-    strokes, poses, forces = (
-        datasets.load_dataset(str(to), name, split="train", cache_dir=cache) for name in ("strokes", "poses", "forces")
-    )
-    assert strokes[0]["stroke_id"] == "H13-a05-r00"
-    np.testing.assert_array_equal(strokes[0]["image"], decode_gray(make.png(0), "made"))
-    assert poses[0]["observation.state"][:3] == [1.0, 2.0, 3.0]
-    assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
-
-
-def test_npz_loads_without_pickle(make, session, to):
+def test_npz_loads_without_pickle(make, session, felt, to):
     export(session, to, "npz")
     with np.load(to / "strokes.npz", allow_pickle=False) as arrays:
         assert arrays["stroke_id"].tolist() == ["H13-a05-r00", "H13-a05-r01"]
         np.testing.assert_array_equal(arrays["image_0001"], decode_gray(make.png(1), "made"))
-        assert np.isnan(arrays["depth_mm"]).all()
         assert arrays["pose_position_mm"].shape == (10, 3)
         assert arrays["pose_t_ns"].dtype == np.int64
         assert arrays["pose_episode_index"].tolist() == [0] * 5 + [1] * 5
+    export(felt, to.with_name("felt-out"), "npz")
+    with np.load(to.with_name("felt-out") / "strokes.npz", allow_pickle=False) as arrays:
+        assert arrays["force_wrench"].shape == (2, 6)
+        assert arrays["quality"].tolist() == ["failed: dry"]
 
 
-def test_equal_recordings_make_equal_arrays_and_a_value_that_only_a_later_stroke_has_is_nan_before(make, tmp_path):
-    later = make.stroke(1, reached_mm=12.9, commanded={"length_mm": 30.0})
-    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0), make.still(1), later)
-    export(path, tmp_path / "out", "npz")
-    export(path, tmp_path / "again", "npz")
+def test_equal_recordings_make_equal_arrays(few, tmp_path):
+    for name in ("out", "again"):
+        export(few, tmp_path / name, "npz")
     assert (tmp_path / "out" / "strokes.npz").read_bytes() == (tmp_path / "again" / "strokes.npz").read_bytes()
-    with np.load(tmp_path / "out" / "strokes.npz", allow_pickle=False) as arrays:
-        np.testing.assert_array_equal(arrays["commanded_length_mm"], [np.nan, 30.0])
-        np.testing.assert_array_equal(arrays["reached_mm"], [np.nan, 12.9])
 
 
 def test_parquet_is_what_datasets_reads(make, session, to):
@@ -166,6 +142,20 @@ def test_parquet_is_what_datasets_reads(make, session, to):
     assert "Source: **loopback rig**" in card
 
 
+@pytest.mark.soak  # importing `datasets` takes longer than everything else here
+def test_hugging_face_datasets_loads_strokes_poses_and_forces(make, felt, to):
+    datasets = pytest.importorskip("datasets", reason="needs `pip install datasets`, which the lock leaves out")
+    export(felt, to, "parquet")
+    cache = str(to.parent / "cache")
+    strokes, poses, forces = (
+        datasets.load_dataset(str(to), name, split="train", cache_dir=cache) for name in ("strokes", "poses", "forces")
+    )
+    assert strokes[0]["stroke_id"] == "H13-a05-r00"
+    np.testing.assert_array_equal(strokes[0]["image"], decode_gray(make.png(0), "made"))
+    assert poses[0]["observation.state"][:3] == [1.0, 2.0, 3.0]
+    assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
+
+
 def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(session, to, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match="parquet needs pyarrow: pip install pyarrow"):
@@ -174,13 +164,20 @@ def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(session,
 
 
 @pytest.mark.parametrize("kind", ["png", "npz", "parquet"])
-def test_a_damaged_photograph_or_a_full_disk_leaves_nothing(make, tmp_path, to, kind, monkeypatch):
-    path = make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0))
-    monkeypatch.setattr(
-        "brushloop.sessions.disk.fsync_folder", lambda _: (_ for _ in ()).throw(OSError(28, "No space left"))
-    )
+def test_a_full_disk_leaves_nothing(few, tmp_path, to, kind, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left")
+
+    monkeypatch.setattr("brushloop.sessions.disk.fsync_folder", full)
     with pytest.raises(SessionError, match="No space left"):
-        export(path, to, kind)
+        export(few, to, kind)
+    assert list(tmp_path.glob("*exported*")) == []
+
+
+def test_a_damaged_photograph_leaves_nothing(make, tmp_path, to):
+    path = make.record(tmp_path / "a.mcap", make.still(0, b"no image"), make.stroke(0))
+    with pytest.raises(SessionError, match="stroke H13-a05-r00: is not a complete PNG or JPEG image"):
+        export(path, to, "npz")
     assert list(tmp_path.glob("*exported*")) == []
 
 
@@ -190,12 +187,6 @@ def test_a_folder_that_holds_anything_is_left_as_it_is(session, to):
     with pytest.raises(InputError, match="not an empty folder"):
         export(session, to, "png")
     assert [path.name for path in to.iterdir()] == ["notes.txt"]
-
-
-def test_an_empty_folder_is_used(session, to):
-    to.mkdir()
-    export(session, to, "png")
-    assert (to / "strokes.csv").is_file()
 
 
 def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):

@@ -20,7 +20,7 @@ from brushloop.sessions.messages import (
     log_message,
     transforms_message,
 )
-from brushloop.sessions.records import Cadence, Check, InkState, Quality, SlowSection, Topic, Wrench
+from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, SlowSection, Topic, Wrench
 from brushloop.sessions.step_file import Outgoing
 
 JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
@@ -37,7 +37,7 @@ def each(make):
         Topic.TRANSFORMS: transforms_message(t_ns, [Transform("base", "paper", (400, -100, 5), (0, 0, 0, 1))]),
         Topic.CALIBRATION: calibration_message(t_ns, (2048, 1536), K, [0.1, 0, 0, 0, 0]),
         Topic.PREVIEW: image_message(t_ns, jpeg, "jpeg"),
-        Topic.LOG: log_message(t_ns, "brush is dry"),
+        Topic.LOG: log_message(t_ns, "brush is dry", warning=True),
         Topic.WRENCH: Wrench(fx_n=0.0, fy_n=0.1, fz_n=-1.5, mx_nm=0.0, my_nm=0.0, mz_nm=0.01),
         Topic.INK: InkState(level=0.7, dosed_ml=1.25, light=0.5),
         Topic.QUALITY: Quality(
@@ -80,8 +80,9 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
     path = make.record(tmp_path / "a.mcap", *each)
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        protobuf = [str(t) for t in (Topic.JOINTS, Topic.TRANSFORMS, Topic.CALIBRATION, Topic.PREVIEW)]
+        protobuf = [message.topic for message in each if not isinstance(message.message, Event)]
         decoded = {c.topic: m for _, c, _, m in reader.iter_decoded_messages(topics=protobuf)}
+    assert set(decoded) == set(map(str, protobuf))
     joints = decoded["/robot/joints"].joints
     assert [(joint.name, joint.position) for joint in joints][2] == ("elbow", 2.0)
     assert not joints[0].HasField("velocity")
@@ -89,7 +90,9 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
     assert (transform.parent_frame_id, transform.translation.x, transform.rotation.w) == ("base", 0.4, 1.0)
     calibration = decoded["/camera/calibration"]
     assert list(calibration.P) == [1500.0, 0, 1024.0, 0, 0, 1500.0, 768.0, 0, 0, 0, 1.0, 0]
-    assert decoded["/camera/preview"].format == "jpeg"
+    assert (decoded["/camera/preview"].format, decoded["/camera/still"].format) == ("jpeg", "png")
+    assert decoded["/camera/still"].data == make.png(0)
+    assert (decoded["/log"].message, decoded["/log"].level) == ("brush is dry", 3)
 
 
 def test_quality_passes_where_every_check_does():

@@ -1,0 +1,106 @@
+"""Photographs of strangers: whole PNG and JPEG images are read, anything else is refused before it costs anything."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from brushloop.sessions import messages
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.messages import decode_gray
+
+
+def png_stating(width, height):
+    """A small PNG that states any size."""
+    size = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", size), (b"IDAT", zlib.compress(bytes(64))), (b"IEND", b"")]
+    data = [struct.pack(">I", len(d)) + name + d + struct.pack(">I", zlib.crc32(name + d)) for name, d in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(data)
+
+
+def jpeg(side=64, *options):
+    noise = np.random.default_rng(1).integers(0, 255, (side, side), np.uint8)
+    return cv2.imencode(".jpg", noise, options)[1].tobytes()
+
+
+def jpeg_stating(width, height):
+    data = bytearray(jpeg())
+    frame_at = data.index(b"\xff\xc0")
+    data[frame_at + 5 : frame_at + 9] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+def progressive(scans):
+    """A JPEG with its last scan repeated: ten bytes of file for another pass over every pixel."""
+    gray = cv2.imencode(".jpg", np.full((64, 64), 200, np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    last, have = gray[gray.rindex(b"\xff\xda") : -2], gray.count(b"\xff\xda")
+    return gray[:-2] + last * (scans - have) + gray[-2:]
+
+
+def comment(data, text):
+    """The same JPEG with a comment before its first scan."""
+    at = data.index(b"\xff\xda")
+    return data[:at] + b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text + data[at:]
+
+
+@pytest.mark.parametrize(
+    ("bomb", "message"),
+    [
+        (png_stating(30_000, 30_000), "image of 30000 x 30000 pixels exceeds 200000000"),
+        (jpeg_stating(30_000, 30_000), "image of 30000 x 30000 pixels exceeds 200000000"),
+        (comment(progressive(60_000), b"names an end \xff\xd9"), "JPEG of 64 x 64 pixels in more than 100 scans"),
+    ],
+    ids=["png", "jpeg", "scans"],
+)
+def test_a_bomb_is_refused_by_its_header(bomb, message, monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", None)  # nothing is decoded
+    with pytest.raises(SessionDamaged, match=message):
+        decode_gray(bomb, "a still")
+
+
+@pytest.mark.parametrize(
+    ("limit", "most", "data"),
+    [
+        ("MAX_IMAGE_BYTES", 10, jpeg()),
+        ("MAX_IMAGE_PIXELS", 100, jpeg()),
+        ("MAX_SCANNED_PIXELS", 81_920, progressive(21)),
+    ],
+    ids=["bytes", "pixels", "pixels times scans"],
+)
+def test_each_limit_holds(monkeypatch, limit, most, data):
+    decode_gray(data, "a still")
+    monkeypatch.setattr(messages, limit, most)
+    with pytest.raises(SessionDamaged, match=r"exceeds|more than 20 scans"):
+        decode_gray(data, "a still")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"hello", b"BM" + bytes(100), png_stating(0, 8), jpeg()[:-2], jpeg()[:300], b"\xff\xd8" + b"\xff" * 50],
+    ids=["empty", "text", "bmp", "no pixels", "cut jpeg", "half jpeg", "filler"],
+)
+def test_what_is_no_whole_image_is_refused_in_one_line(data):
+    with pytest.raises(SessionDamaged, match="image") as caught:
+        decode_gray(data, "a still")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_png_cut_at_any_byte_or_with_a_wrong_bit_is_refused_by_us_and_not_by_a_library_on_stderr(make, capfd):
+    whole = make.png()
+    wrong = bytearray(whole)
+    wrong[wrong.index(b"IDAT") + 9] ^= 1
+    for data in [bytes(wrong), *(whole[:cut] for cut in range(len(whole) - 8))]:
+        with pytest.raises(SessionDamaged):
+            decode_gray(data, "a still")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [jpeg(), comment(progressive(12), b"\xff\xda" * 200) + b"\xff\xda film " * 2000],
+    ids=["plain", "a film behind it, and a comment that looks like scans"],
+)
+def test_a_jpeg_is_read(data):
+    assert decode_gray(data, "a still").shape == (64, 64)

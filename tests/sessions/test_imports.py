@@ -1,0 +1,281 @@
+"""Photographs from elsewhere become a session that reads like any other, or are refused in one line without a trace."""
+
+import math
+import os
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from brushloop.sessions import imports
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import InputError
+from brushloop.sessions.imports import ImportOptions
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Source
+from tests.command import brushloop
+
+START = {"start_x_px": "1", "start_y_px": "1"}
+ROWS = [
+    {"file": "a.png", "px_per_mm": "12.5", "depth_mm": "13", "tilt_deg": "5"} | START,
+    {"file": "b.png", "px_per_mm": "12.5", "depth_mm": "15", "tilt_deg": "10"} | START,
+]
+HEAD = "file,px_per_mm,start_x_px,start_y_px,depth_mm,tilt_deg"
+
+
+@pytest.fixture
+def rows(make, photos):
+    """The table and the photographs of two presses."""
+    return make.photographs(photos, *ROWS)
+
+
+@pytest.fixture
+def refusal(make, tmp_path, run):
+    """Runs the import; it is refused in one line with exit code 2, and nothing is left behind."""
+
+    def refusal(*options):
+        before = make.tree(tmp_path)
+        with pytest.raises(InputError) as caught:
+            run(*options)
+        assert make.tree(tmp_path) == before
+        assert caught.value.exit_code == 2
+        line = str(caught.value).removeprefix(f"{tmp_path}/")
+        assert "\n" not in line
+        assert len(line) < 400
+        return line
+
+    return refusal
+
+
+def test_presses_become_a_session_like_any_other(make, rows, out, run):
+    assert run() == out / "from-elsewhere.mcap"
+    recording = Recording(out)
+    header = recording.header
+    assert (header.session_id, header.source, header.software) == ("from-elsewhere", Source.IMPORT, "brushloop 0")
+    assert (header.licence, header.origin, header.brush) == ("CC0-1.0", "a museum", "wolf")
+    captures = list(recording.captures())
+    assert [capture.still_png for capture in captures] == [make.png(0), make.png(1)]
+    stroke = captures[1].stroke
+    assert (stroke.stroke_id, stroke.kind, stroke.depth_mm, stroke.tilt_deg) == ("b", "press", 15.0, 10.0)
+    assert stroke.px_per_mm == (12.5, 12.5)
+    assert [path.name for path in out.parent.iterdir()] == ["from-elsewhere"]
+
+
+@pytest.mark.parametrize(
+    ("options", "fields"),
+    [
+        ({"brush_radius_mm": 4.0, "brush_length_mm": 31.0}, {"brush_radius_mm": 4.0, "brush_length_mm": 31.0}),
+        ({"simulated": True}, {"source": Source.IMPORT_SIMULATED}),
+        ({}, {"origin": "photos, table.csv", "source": Source.IMPORT, "brush_radius_mm": None}),
+    ],
+)
+def test_the_header_holds_what_was_given(rows, out, run, options, fields):
+    run(ImportOptions(kind="press", **options))
+    assert Recording(out).header.model_dump(include=set(fields)) == fields
+
+
+def test_units_are_converted_and_the_anchor_is_kept(make, photos, out, run):
+    row = {"file": "a.png", "start_x_px": "3", "start_y_px": "4.5", "depth_nominal": "0.4", "ink_frac": "0.9"}
+    lengths = {"reach_cm": "2", "span_m": "0.01", "bend_in": "1", "turn_rad": str(math.pi), "yaw_deg": "7"}
+    make.photographs(photos, row | lengths)
+    run(ImportOptions(px_per_mm=8.0))
+    [capture] = Recording(out).captures()
+    assert capture.stroke.anchor_px == (3.0, 4.5)
+    assert capture.stroke.px_per_mm == (8.0, 8.0)
+    stored = {"reach_mm": 20.0, "span_mm": 10.0, "bend_mm": 25.4, "turn_deg": 180.0, "yaw_deg": 7.0}
+    assert capture.stroke.commanded == pytest.approx({"depth_nominal": 0.4, "ink_frac": 0.9} | stored)
+
+
+def test_a_table_may_come_from_a_spreadsheet(make, photos, out, run):
+    """Byte order mark, CRLF, quotes, an empty last line, photographs in sub-folders, one scale per axis."""
+    (photos / "day 1").mkdir(parents=True)
+    shutil.copy(make.photographs(photos, ROWS[0]).with_name("a.png"), photos / "day 1" / "ä, 1.png")
+    text = '\ufefffile, px_per_mm_x ,px_per_mm_y\r\n"day 1/ä, 1.png",10,20\r\n,,\r\n\r\n'
+    (photos / "table.csv").write_text(text, encoding="utf-8", newline="")
+    run(ImportOptions())
+    [capture] = Recording(out).captures()
+    assert capture.stroke.stroke_id == "day 1/ä, 1"
+    assert capture.stroke.px_per_mm == (10.0, 20.0)
+
+
+def turned_jpeg(image, orientation):
+    """A JPEG of the image with this EXIF orientation."""
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    tiff = b"MM\0*\0\0\0\x08\0\x01" + b"\x01\x12\0\x03\0\0\0\x01" + orientation.to_bytes(2, "big") + bytes(6)
+    exif = b"Exif\0\0" + tiff
+    return data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+
+
+def test_a_photograph_is_stored_as_a_viewer_shows_it(photos, out, run):
+    """A person found the dark square near the upper right corner of the picture that a viewer turned."""
+    stored = np.full((60, 40), 230, np.uint8)
+    stored[2:8, 2:8] = 20
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(turned_jpeg(stored, 6))
+    (photos / "b.jpg").write_bytes(turned_jpeg(stored, 1))
+    (photos / "table.csv").write_text("file,px_per_mm,start_x_px,start_y_px\na.jpg,10,55,5\nb.jpg,10,5,5\n")
+    run(ImportOptions())
+    turned, upright = Recording(out).captures()
+    as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    for image in (turned.image(), cv2.imdecode(np.frombuffer(turned.still_png, np.uint8), as_stored)):
+        assert image.shape == (40, 60)
+        assert image[5, 55] < 60
+    assert upright.still_png == (photos / "b.jpg").read_bytes()
+
+
+def test_what_a_killed_import_left_is_cleared_away(rows, out, run):
+    stage = out.with_name(".from-elsewhere.partial")
+    stage.mkdir(parents=True)
+    (stage / "from-elsewhere.mcap.part").write_bytes(b"half")
+    run()
+    assert not stage.exists()
+
+
+def row(file="a.png", scale="1", depth="1", tilt="1", more=""):
+    """The line of one press, and the head before it."""
+    return f"{HEAD}\n{file},{scale},1,1,{depth},{tilt}{more}\n"
+
+
+REFUSED = [
+    ("", "table.csv: column `file` is missing; found: none"),
+    ("name,px_per_mm", "column `file` is missing; found: name, px_per_mm"),
+    (HEAD, "has no rows"),
+    ("file,depth_mm,tilt_deg", "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing"),
+    ("file,px_per_mm_x,depth_mm,tilt_deg,start_x_px,start_y_px", "column `px_per_mm_y` is missing"),
+    ("file,px_per_mm,tilt_deg", "column `depth_mm` is missing; presses need it"),
+    ("file,px_per_mm,depth_mm", "column `tilt_deg` is missing; presses need it"),
+    ("file,px_per_mm,depth_mm,tilt_deg", "column `start_x_px` is missing; presses"),
+    ("file,px_per_mm,depth_mm,tilt_deg,start_x_px", "column `start_y_px` is missing"),
+    (f"{HEAD},l_furlong", "must end in one of: mm, cm, m, in, deg"),
+    (f"{HEAD},l_mm,l_cm", "column `l_mm` occurs twice"),
+    (f"{HEAD},file", "column `file` occurs twice"),
+    (f"{HEAD},", "column `` has no known unit"),
+    ('"fi\nle",px_per_mm', "line 1 holds control characters"),
+    (row(depth="deep"), "line 2, column `depth_mm`: 'deep' is not a finite"),
+    (row(depth="1_0"), "line 2, column `depth_mm`: '1_0' is not a finite"),
+    (row(tilt="nan"), "line 2, column `tilt_deg`: 'nan' is not a finite"),
+    (row(scale="inf"), "line 2, column `px_per_mm`: 'inf' is not a finite"),
+    (f"{HEAD},l_m\na.png,1,1,1,1,1,1e308", "column `l_m`: '1e308' is not a finite"),
+    (row(scale="0"), "line 2: px_per_mm = (0.0, 0.0), allowed: 0.01 to"),
+    (row(depth="-13"), "line 2, column `depth_mm`: '-13', allowed: 0 to 500"),
+    (row(depth="1e300"), "line 2, column `depth_mm`: '1e300', allowed: 0 to 500"),
+    (row(tilt="-5"), "line 2, column `tilt_deg`: '-5', allowed: 0 to 90"),
+    (f"{HEAD},depth_mid_cm\na.png,1,1,1,1,1,-1.5", "column `depth_mid_cm`: '-1.5', allowed: 0 to 50"),
+    (f"{HEAD},bend_mm\na.png,1,1,1,1,1,1e300", "column `bend_mm`: '1e300', allowed: -1e+06 to 1e+06"),
+    (f"{HEAD}\na.png,1,1,1,1", "line 2 has 5 fields, expected 6"),
+    (row(more=",1"), "line 2 has 7 fields, expected 6"),
+    (row(more="\u2028,1"), "line 2 has 7 fields"),
+    (row(more="\n\n./a.png,1,1,1,1,1"), "line 4: stroke a appears twice"),
+    (row("c.png"), "line 2: file 'c.png' is not in photos/"),
+    (row(""), "line 2: file '' is not in photos/"),
+    (row("."), "line 2: file '.' is not in photos/"),
+    (row("../x.png"), "line 2: file '../x.png' lies outside photos/"),
+    (row("/x.png"), "line 2: file '/x.png' lies outside photos/"),
+    (row("link.png"), "line 2: file 'link.png' lies outside photos/"),
+    (row("loop.png"), "line 2: file 'loop.png' lies outside photos/"),
+    (row("x" * 5000), "line 2: file 'xxx"),
+    (row('"a\n.png"'), "column `file`: 'a\\n.png' holds control"),
+    (row("a\0.png"), "line 2, column `file`: 'a\\x00.png' holds"),
+    (row('"a.png"x'), "line 2: ',' expected after '\"'"),
+    (row('"' + "a" * 200_000), "line 2: "),
+    (row("text.png"), "photos/text.png: is not a complete PNG or JPEG image"),
+    (row("cut.png"), "photos/cut.png: is not a complete PNG or JPEG image"),
+    ("file,größe_mm\n".encode("latin-1"), "photos/table.csv: is not UTF-8 text"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), REFUSED, ids=[message for _text, message in REFUSED])
+def test_a_table_that_cannot_be_used_is_refused(make, tmp_path, photos, rows, refusal, text, message):
+    (tmp_path / "x.png").write_bytes(make.png())
+    (photos / "link.png").symlink_to(tmp_path / "x.png")
+    (photos / "loop.png").symlink_to(photos / "loop.png")
+    (photos / "text.png").write_text("no image")
+    (photos / "cut.png").write_bytes(make.png()[:-20])
+    rows.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert message in refusal()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(ImportOptions(kind=kind), f"--kind is {kind!r}, allowed: press, drag") for kind in ("stamp", "", "Press")]
+    + [(ImportOptions(px_per_mm=scale), "allowed: 0.01 to 10000") for scale in (0.0, -1.0, math.nan, 1e9)],
+)
+def test_an_unknown_kind_and_a_scale_that_no_camera_has_are_refused(make, photos, refusal, options, message):
+    make.photographs(photos, {"file": "a.png"})
+    assert message in refusal(options)
+
+
+@pytest.mark.parametrize(
+    ("limit", "most", "message"),
+    [
+        ("MAX_ROWS", 1, "photos/table.csv: has more than 1 rows"),
+        ("MAX_TABLE_BYTES", 10, "photos/table.csv: is larger than 10 bytes"),
+        ("MAX_IMAGE_BYTES", 10, "photos/a.png: is larger than 10 bytes"),
+    ],
+)
+def test_what_is_too_large_is_refused(rows, refusal, monkeypatch, limit, most, message):
+    monkeypatch.setattr(imports, limit, most)
+    assert message in refusal()
+
+
+def test_a_folder_or_table_that_is_not_there_is_refused(photos, refusal):
+    assert refusal() == "photos: is not a folder of photographs"
+    photos.mkdir()
+    assert refusal() == "photos/table.csv: no such table"
+
+
+def test_an_existing_session_is_never_overwritten(rows, out, refusal):
+    out.mkdir(parents=True)
+    assert "exists already" in refusal()
+
+
+def test_a_name_that_is_no_session_id_is_refused(rows, photos, tmp_path):
+    with pytest.raises(InputError, match="a session's name is letters"):
+        imports.import_photographs(photos, rows, tmp_path / "-x y", ImportOptions(), "", lambda: 0)
+
+
+def test_a_photograph_that_changes_under_the_import_is_refused(rows, photos, refusal, monkeypatch):
+    (photos.parent / "sessions").mkdir()
+    read = imports.read_bounded
+    seen = []
+
+    def change(path, max_bytes):
+        seen.append(path)
+        return read(path, max_bytes) + b"x" * (len(seen) > 3)
+
+    monkeypatch.setattr(imports, "read_bounded", change)
+    assert refusal() == "photos/a.png: changed while it was imported"
+
+
+def test_a_disk_without_room_is_refused(rows, refusal, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "mkdir", full)
+    assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"
+
+
+def test_every_photograph_is_decoded_once(rows, run, monkeypatch):
+    decoded = []
+    imdecode = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(1) or imdecode(*args))
+    run()
+    assert len(decoded) == 2
+
+
+def test_the_command_imports(rows, photos, out):
+    arguments = ["import", str(photos), "--csv", str(rows), "--out", str(out), "--kind", "press"]
+    ran = CliRunner().invoke(app, arguments)
+    assert (ran.exit_code, ran.output) == (0, f"Imported into {out / 'from-elsewhere.mcap'}\n")
+
+
+def test_a_refusal_of_the_command_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, rows):
+    rows.write_text("file\n")
+    before = make.tree(tmp_path)
+    ran = brushloop("sessions", "import", "photos", "--csv", "photos/table.csv", cwd=tmp_path)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert "Traceback" not in ran.stderr
+    assert "column `px_per_mm`" in ran.stderr.splitlines()[-1]
+    assert make.tree(tmp_path) == before
