@@ -69,6 +69,8 @@ class LoadedSession:
     count: int
     place: str
     """Path or URL by which workers may open the recording."""
+    reached_mm: dict[str, float | None]
+    """Depth that the arm reached, by name of stroke; None where the recording does not say it."""
 
     @property
     def header(self) -> Header:
@@ -84,9 +86,11 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
     _check_journal(recording, digest)
     first: Stroke | None = None
     kinds, count = frozenset[str](), 0
+    reached_mm: dict[str, float | None] = {}
     for stroke in recording.stroke_records():
         first = first or stroke
         kinds |= {stroke.kind}
+        reached_mm[stroke.stroke_id] = stroke.reached_mm
         count += 1
     if first is None:
         raise CalibrationError(str(recording.path), "holds no strokes")
@@ -102,6 +106,7 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
         kinds,
         count,
         place if URL.match(place) else str(recording.path.resolve()),
+        reached_mm,
     )
 
 

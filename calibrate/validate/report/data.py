@@ -75,6 +75,14 @@ class Collected(Frozen):
     """Highest minus lowest height of the paper."""
 
 
+class DepthMiss(Frozen):
+    """A stroke, the depth that was commanded and the one that the arm reached."""
+
+    stroke_id: str
+    depth_mm: float
+    reached_mm: float
+
+
 class Session(Frozen):
     """A recording, from its header, and the artefacts that were used with it."""
 
@@ -103,6 +111,8 @@ class Session(Frozen):
     length_ratio: float | None
     width_ratio: float | None
     """Measured size divided by that of CCD-BSM as published, averaged over uncut strokes."""
+    deepest_miss: DepthMiss | None = None
+    """The stroke whose depths differ most; None where the recording has no reached depths."""
     collected: Collected | None = None
     """None without a journal: for imports, and for recordings sent without it."""
 

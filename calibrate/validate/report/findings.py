@@ -25,6 +25,8 @@ WIDE_SCALE = 0.005
 MUCH_REFUSED = 0.05
 MOVED_MM = 0.3
 """Difference between two zero touches of one session that exceeds their combined repeatability."""
+MISSED_MM = 0.1
+"""Difference between the commanded and the reached depth above which a report says so."""
 MAX_NAMED = 6
 
 
@@ -222,6 +224,13 @@ def trust(report: Report) -> Iterator[Point]:
 
 def _collection(one: Session) -> Iterator[Point]:
     """Points that the recording alone does not show: planned strokes that were left out, and paper that moved."""
+    miss = one.deepest_miss
+    if miss is not None and abs(miss.reached_mm - miss.depth_mm) > MISSED_MM:
+        yield Point(
+            False,
+            f"{one.session_id}: commanded and reached depth differ by more than {MISSED_MM:g} mm, most at "
+            f"{miss.stroke_id}: {miss.depth_mm:g} mm was commanded, {miss.reached_mm:.2f} mm was reached.",
+        )
     collected = one.collected
     if collected is None:
         return

@@ -24,20 +24,26 @@ from brushloop.calibrate.validate.run import REPEATED, Outcome
 from brushloop.sessions.cells import CsvWriter
 from brushloop.sessions.terminal import narrow
 
-COLUMNS = ("session_id", "stroke_id", "depth_mm", "tilt_deg", "model", "alignment", "tone", "csim", "ssim", "source")
+COLUMNS = (
+    *("session_id", "stroke_id", "depth_mm", "reached_mm", "tilt_deg", "model", "alignment", "tone"),
+    *("csim", "ssim", "source"),
+)
+"""`depth_mm` was commanded; `reached_mm` is empty where the recording does not say what the arm reached."""
+NUMBERS = ("depth_mm", "reached_mm", "tilt_deg", "csim", "ssim")
 GROUP = 500
 """Strokes per row group of the Parquet file."""
 MAX_REFUSED = 20
 """Refused strokes listed on the terminal."""
 SHORT = {"fitted, held-out cells": ", held out", "fitted, in sample": ", in sample"}
 """What a candidate knows of the strokes, shortened for the terminal."""
-Cells = tuple[str, str, float, float, str, str, str, float, float, str]
+Cells = tuple[str, str, float, float | None, float, str, str, str, float, float, str]
 
 
 def score_rows(outcome: Outcome) -> Iterator[Cells]:
     """Yield one row per score, by session and order of capture; missing scores are left out."""
     for k, row in enumerate(outcome.rows):
-        header = outcome.sessions[row.session].header
+        session = outcome.sessions[row.session]
+        header = session.header
         press, scores = row.press, outcome.scores.of_row(k)
         label = source_label(header.source, [header.brush])
         for m, model in enumerate(outcome.names):
@@ -48,6 +54,7 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
                         header.session_id,
                         press.stroke_id,
                         press.depth_mm,
+                        session.reached_mm.get(press.stroke_id),
                         press.tilt_deg,
                         model,
                         str(alignment),
@@ -74,7 +81,7 @@ def _lines(outcome: Outcome) -> Iterator[str]:
     writer = CsvWriter(out)
     writer.writerow(COLUMNS)
     for row in score_rows(outcome):
-        writer.writerow([f"{v:.8f}" if k in (7, 8) else v for k, v in enumerate(row)])
+        writer.writerow([f"{v:.8f}" if name in ("csim", "ssim") else v for name, v in zip(COLUMNS, row, strict=True)])
         if out.tell() > 2**16:
             yield out.getvalue()
             out.seek(0)
@@ -89,7 +96,7 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
         pq: Any = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise CalibrationError("--parquet", "needs pyarrow: pip install 'brushloop[parquet]'") from None
-    kinds = [pa.float64() if name in ("depth_mm", "tilt_deg", "csim", "ssim") else pa.string() for name in COLUMNS]
+    kinds = [pa.float64() if name in NUMBERS else pa.string() for name in COLUMNS]
     label = source_label(outcome.sessions[0].header.source, (one.header.brush for one in outcome.sessions))
     schema: Any = pa.schema(list(zip(COLUMNS, kinds, strict=True)), metadata={"source": label})
     with replacing(path) as part, pq.ParquetWriter(part, schema) as writer:

@@ -15,9 +15,11 @@ from brushloop.calibrate.compare.similarity import SSIM_SETTINGS
 from brushloop.calibrate.compare.stats import Summary, summarise
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.extras import Extras
+from brushloop.calibrate.validate.jobs import Press
 from brushloop.calibrate.validate.report.data import (
     CandidateInfo,
     Collected,
+    DepthMiss,
     Extreme,
     Interval,
     Refused,
@@ -236,8 +238,17 @@ def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
         fit=one.fit.digest if one.fit is not None else "",
         length_ratio=length,
         width_ratio=width,
+        deepest_miss=_deepest_miss(one, [outcome.rows[int(k)].press for k in mine]),
         collected=_collected(one),
     )
+
+
+def _deepest_miss(one: LoadedSession, presses: list[Press]) -> DepthMiss | None:
+    known = [(press, reached) for press in presses if (reached := one.reached_mm.get(press.stroke_id)) is not None]
+    if not known:
+        return None
+    press, reached = max(known, key=lambda pair: abs(pair[1] - pair[0].depth_mm))
+    return DepthMiss(stroke_id=press.stroke_id, depth_mm=press.depth_mm, reached_mm=round(reached, 3))
 
 
 def _collected(one: LoadedSession) -> Collected | None:

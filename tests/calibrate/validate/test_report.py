@@ -132,7 +132,9 @@ def test_every_score_of_a_twin_is_labelled_as_one() -> None:
     )
     row = SimpleNamespace(session=0, press=SimpleNamespace(stroke_id="a", depth_mm=11.0, tilt_deg=0.0))
     scores = SimpleNamespace(of_row=lambda _: np.full((1, len(KEYS), 2), 0.9))
-    outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], rows=[row], scores=scores, names=["ccd-bsm"])
+    outcome = SimpleNamespace(
+        sessions=[SimpleNamespace(header=header, reached_mm={})], rows=[row], scores=scores, names=["ccd-bsm"]
+    )
     labels = {one[COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
     assert labels == {"loopback rig, brush twin of monday, simulated"}
 
