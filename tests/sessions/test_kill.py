@@ -1,10 +1,13 @@
 """kill -9 at any moment: every step is done exactly once, and no paper patch is used twice."""
 
+import itertools
 import random
 import subprocess
 import sys
 import time
 from collections import Counter
+
+import pytest
 
 from brushloop.sessions.folders import open_sessions
 from brushloop.sessions.recording import Recording
@@ -55,13 +58,14 @@ def run(folder, kill_after_s):
     return child.returncode == 0
 
 
-def test_a_session_killed_ten_times_is_whole_in_the_end(make, tmp_path):
-    folder = tmp_path / "2026-01-02-grid-01"
-    moments = random.Random(4)
-    for _ in range(KILLS):
-        if run(folder, moments.uniform(0.0, 0.06)):
-            break
-    assert open_sessions(tmp_path) == [] or run(folder, None)
+def kill_and_finish(make, root, seed, most):
+    """Kill a session up to so many times and let it end; returns the number of kills."""
+    folder = root / "2026-01-02-grid-01"
+    moments = random.Random(seed)
+    kills = 0
+    while kills < most and not run(folder, moments.uniform(0.0, 0.06)):
+        kills += 1
+    assert open_sessions(root) == [] or run(folder, None)
 
     recording = Recording(folder)
     assert make.stroke_names(recording.path) == KEYS
@@ -69,5 +73,21 @@ def test_a_session_killed_ten_times_is_whole_in_the_end(make, tmp_path):
     assert Counter(line["key"] for line in done) == Counter(KEYS)
     patches = [line["patch"] for line in make.events(folder, "begin")]
     assert len(patches) == len(set(patches)), "a patch was pressed twice"
-    assert len(make.events(folder, "process")) > 3, "the kills came too late to test anything"
     assert sum(line["counts"]["/camera/still"] for line in done) == 48
+    return kills
+
+
+def test_a_session_killed_ten_times_is_whole_in_the_end(make, tmp_path):
+    assert kill_and_finish(make, tmp_path, 4, KILLS) > 3, "the kills came too late to test anything"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1200)
+def test_two_hundred_kills_lose_nothing_and_double_nothing(make, tmp_path):
+    kills = 0
+    for seed in itertools.count():
+        root = tmp_path / str(seed)
+        root.mkdir()
+        kills += kill_and_finish(make, root, seed, KILLS)
+        if kills >= 200:
+            return
