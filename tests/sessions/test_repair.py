@@ -189,15 +189,6 @@ def test_where_nobody_knows_which_cell_was_pressed_the_sheet_is_not_used_again(m
     assert verify_session(folder).sound
 
 
-def test_a_damaged_merged_file_is_merged_again_and_its_steps_stay(make, closed, repair):
-    final = closed / f"{closed.name}.mcap"
-    messages = make.messages(final)
-    cut(final, 0.5)
-    assert repair(closed).lossless
-    assert make.messages(final) == messages
-    assert (closed / f"{final.name}.damaged-1").exists()
-
-
 def test_a_closed_session_whose_steps_are_damaged_still_has_it_all(make, closed, repair):
     for key in ("H13-a05-r00 capture", "H13-a05-r01 capture"):
         cut(file_of(closed, key), 0.3)
@@ -244,13 +235,6 @@ def test_a_changed_configuration_comes_back_from_the_journal(make, folder, repai
     assert repair(folder).lossless
     assert {name: (folder / name).read_text() for name in make.snapshots} == make.snapshots
     assert (folder / "rig.toml.damaged-1").read_text() == 'name = "another"\n'
-
-
-def test_a_second_repair_has_nothing_to_do(folder, repair):
-    cut(file_of(folder, "H13-a05-r00 capture"), 0.3)
-    cut(file_of(folder, "H13-a05-r01 press"), 0.3)
-    repair(folder)
-    assert repair(folder).did == []
 
 
 def test_a_repair_that_was_cut_short_comes_to_the_same_end(make, folder, repair, go_on, monkeypatch):
@@ -334,28 +318,6 @@ def test_close_refuses_while_another_process_has_the_session(make, store):
     make.collect(store)
     ran = CliRunner().invoke(app, ["close", str(store.folder)])
     assert isinstance(ran.exception, SessionLocked)
-
-
-def test_two_steps_under_each_others_names_are_known_by_what_they_hold(make, folder, repair, go_on):
-    one, other = file_of(folder, "H13-a05-r00 capture"), file_of(folder, "H13-a05-r01 capture")
-    one.rename(folder / "between")
-    other.rename(one)
-    (folder / "between").rename(other)
-    assert repair(folder).lossless
-    assert make.stroke_names(go_on(folder).close()) == ["H13-a05-r00", "H13-a05-r01"]
-
-
-def test_a_stroke_in_halves_is_put_together_from_its_file_and_the_merged_one(make, closed, repair):
-    path, final = file_of(closed, "H13-a05-r00 capture"), closed / f"{closed.name}.mcap"
-    messages = make.messages(final)
-    cut(path, 0.5)
-    with final.open("rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
-    data = bytearray(final.read_bytes())
-    data[chunks[-1].chunk_start_offset + chunks[-1].chunk_length // 2] ^= 1  # of the other stroke
-    final.write_bytes(data)
-    assert repair(closed).lossless
-    assert make.messages(final) == messages
 
 
 def test_one_flipped_byte_of_a_lone_recording_costs_one_stroke(make, tmp_path, repair):
