@@ -14,7 +14,9 @@ from brushloop.collect.headless import stop_signals
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.progress import shown
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.terminal import say as print_lines
 
 Say = Callable[[str], None]
 GIVEN_UP = 3
@@ -87,9 +89,28 @@ def collected_session(say: Say, config: Path, protocol: Path, root: Path, option
         session = finished_session(root, config, protocol)
     if session is None:
         raise ConfigError(root, "", f"holds no finished session of {protocol}, although collection ended")
-    if not artefacts(session):
-        run_command(say, "calibrate", session)
+    calibrated(say, session)
     return session
+
+
+def calibrated(say: Say, session: Path) -> None:
+    """Calibrate a session that was not calibrated yet. Raises `CalibrationError`, `SessionError`."""
+    from brushloop.calibrate.calibrated import calibrate_session  # slow to import
+
+    if not artefacts(session):
+        say(f"calibrate {session}")
+        with shown() as progress:
+            print_lines(*calibrate_session(session, progress=progress).lines())
+
+
+def fitted(say: Say, session: Path) -> None:
+    """Fit the brush of a session that has no fit yet. Raises `CalibrationError`, `SessionError`."""
+    from brushloop.calibrate.fit.command import FOLDER, FitRequest, fit_presses  # slow to import
+
+    if not artefacts(session, FOLDER):
+        say(f"fit {session}")
+        with shown() as progress:
+            print_lines(*fit_presses(FitRequest(session), progress).lines())
 
 
 def ending(folder: Path, kind: str) -> str:

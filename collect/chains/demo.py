@@ -11,13 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from brushloop.calibrate.artefact import artefacts
 from brushloop.calibrate.writing.plan_record import PROTOCOL as WRITE
-from brushloop.collect.chains.commands import GIVEN_UP, finished_session, run_command
+from brushloop.collect.chains.commands import GIVEN_UP, calibrated, finished_session, fitted, run_command
 from brushloop.collect.chains.demo_rig import DemoRig
-from brushloop.collect.chains.loop import FITS, LoopRequest, run_loop
 from brushloop.collect.chains.loop import PAGE as LOOP_PAGE
 from brushloop.collect.chains.loop import PROTOCOL as REPLAY
+from brushloop.collect.chains.loop import LoopRequest, run_loop
 from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
 from brushloop.collect.chains.writing import Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
@@ -151,10 +150,8 @@ class Demo:
 
     def _fit(self) -> None:
         session = self._finished()
-        if not artefacts(session):
-            run_command(say, "calibrate", session)
-        if not artefacts(session, FITS):
-            run_command(say, "fit", session)
+        calibrated(say, session)
+        fitted(say, session)
 
     def _press_again(self) -> None:
         session = self._finished()

@@ -13,15 +13,17 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from brushloop.calibrate.artefact import artefacts, current
+from brushloop.calibrate.artefact import current
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.collect.chains.commands import Say, collected_session, run_command
+from brushloop.collect.chains.commands import Say, calibrated, collected_session, fitted, run_command
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.config_file import read_text
+from brushloop.sessions.progress import shown
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import BareName, Header
+from brushloop.sessions.terminal import say as print_lines
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"
@@ -84,14 +86,13 @@ def _check_rig(path: Path, rig: RigConfig, header: Header) -> None:
 
 def _fit(request: LoopRequest, recording: Recording, say: Say) -> Path:
     folder = recording.path.parent
-    if not recording.header.source.imported and not artefacts(folder):
-        run_command(say, "calibrate", folder)
+    if not recording.header.source.imported:
+        calibrated(say, folder)
     if request.fit is not None:
         return request.fit
     if (begun := begun_with(request.out)) is not None:
         return folder / FITS / f"{begun.fit}.json"  # even if another fit was made since
-    if not artefacts(folder, FITS):
-        run_command(say, "fit", folder)
+    fitted(say, folder)
     fit = current(folder, FITS)
     if fit is None:
         raise ConfigError(folder, "", "was not fitted")
@@ -102,12 +103,21 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, 
     """Recover depth and tilt; the protocol is written last, so where it exists this stage is done."""
     protocol = request.out / PROTOCOL
     if not protocol.exists():
-        low, high = map(str, settings.depth_range_mm)
-        options: list[str | Path] = ["--fit", fit, "--depth-range", low, high]
-        options += ["--tilt-range", *map(str, settings.tilt_range_deg)]
-        options += ["--repeats", str(settings.repeats), "--seed", str(settings.seed)]
-        options += [] if settings.presses is None else ["--presses", str(settings.presses)]
-        run_command(say, "invert", folder, "--out", request.out / RECOVERED, *options)
+        from brushloop.calibrate.invert.command import RecoverRequest, recover  # loads torch
+
+        wanted = RecoverRequest(
+            folder,
+            request.out / RECOVERED,
+            fit=fit,
+            depth_range_mm=settings.depth_range_mm,
+            tilt_range_deg=settings.tilt_range_deg,
+            presses=settings.presses,
+            repeats=settings.repeats,
+            seed=settings.seed,
+        )
+        say(f"invert {folder}")
+        with shown() as progress:
+            print_lines(*recover(wanted, progress).lines())
     check_recovered(request.out / RECOVERED)
     return protocol
 

@@ -100,6 +100,8 @@ class FakeWriting:
 def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     made = Chain()
     monkeypatch.setattr(demo, "run_command", made)
+    monkeypatch.setattr(demo, "calibrated", lambda say, session: made(say, "calibrate", session))
+    monkeypatch.setattr(demo, "fitted", lambda say, session: made(say, "fit", session))
     monkeypatch.setattr(demo, "run_loop", made.loop)
     monkeypatch.setattr(demo, "DemoRig", lambda folder, **_: FakeRig(made, folder))
     monkeypatch.setattr(demo, "Writing", lambda request, _say: FakeWriting(made, request))
