@@ -7,16 +7,12 @@ Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from brushloop.sessions.terminal import say
-
-if TYPE_CHECKING:
-    from brushloop.sessions.imports import ImportOptions
 
 LOSSY, DAMAGED = 3, 6
 Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap file.")]
@@ -131,21 +127,6 @@ def close(session: Annotated[Path, typer.Argument(help="The folder of a session 
     say(f"Closed: {final}")
 
 
-def _import(
-    run: Callable[..., Path], folder: Path, table: Path | None, out: Path | None, options: ImportOptions, *more: object
-) -> None:
-    import time
-    from importlib.metadata import version
-
-    from brushloop.sessions.progress import shown
-
-    target = out or Path("sessions") / folder.resolve().name
-    with shown() as progress:
-        software = f"brushloop {version('brushloop')}"
-        path = run(folder, table, target, options, software, time.time_ns, *more, progress=progress)
-    say(f"Imported into {path}")
-
-
 @app.command("import")
 def import_(
     folder: Annotated[Path, typer.Argument(help="Folder of photographs.")],
@@ -161,7 +142,15 @@ def import_(
     simulated: Simulated = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
+    import time
+    from importlib.metadata import version
+
     from brushloop.sessions.imports import ImportOptions, import_photographs
+    from brushloop.sessions.progress import shown
 
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
-    _import(import_photographs, folder, csv, out, options)
+    target = out or Path("sessions") / folder.resolve().name
+    with shown() as progress:
+        software = f"brushloop {version('brushloop')}"
+        path = import_photographs(folder, csv, target, options, software, time.time_ns, progress=progress)
+    say(f"Imported into {path}")

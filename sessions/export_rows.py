@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
@@ -17,9 +17,6 @@ from brushloop.sessions.messages import PNG_START
 from brushloop.sessions.progress import Progress, counted
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Quality, StepEvent, Stroke, Topic, Wrench
-
-if TYPE_CHECKING:
-    pass
 
 TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
 CROP_TEXT_COLUMNS = ("mask_file", "flags")

@@ -13,7 +13,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from brushloop.sessions.cells import as_text, number
 from brushloop.sessions.disk import read_bounded, staged_folder
@@ -79,10 +78,9 @@ def import_photographs(
 ) -> Path:
     """Import into the new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind."""
     _check_target(folder, table, out, options)
-    kind = "press" if options.kind == "press" else "drag"
-    rows = parse_table(folder, table, read_text(table), kind, options.px_per_mm)
+    rows = _read_table(folder.resolve(), table, options)
     checked = counted(rows, "photographs checked", len(rows), progress)
-    digests = [_check(_read(row.image), row.image) for row in checked]
+    digests = [_check(row.image) for row in checked]
     header = Header(
         session_id=out.name,
         source=Source.IMPORT_SIMULATED if options.simulated else Source.IMPORT,
@@ -115,7 +113,7 @@ def _check_target(folder: Path, table: Path, out: Path, options: ImportOptions) 
 
 
 def _write(
-    rows: list[Row],
+    rows: list[_Row],
     digests: list[bytes],
     final: Path,
     header: Header,
@@ -126,12 +124,13 @@ def _write(
     try:
         pairs = zip(rows, digests, strict=True)
         for row, digest in counted(pairs, "photographs written", len(rows), progress):
-            data, still = _read(row.image), row.stroke.still
+            data, still = read_bounded(row.image, MAX_IMAGE_BYTES), row.stroke.still
             if hashlib.sha256(data).digest() != digest:
                 raise InputError(row.image, "changed while it was imported")
             data = upright(data)
+            image_kind = "png" if data.startswith(PNG_START) else "jpeg"
             t_ns = now_ns()
-            writer.write(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, _kind(data))), WAIT_S)
+            writer.write(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, image_kind)), WAIT_S)
             writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke), WAIT_S)
     except BaseException:
         writer.abandon()
@@ -139,26 +138,18 @@ def _write(
     writer.finish()
 
 
-def _kind(data: bytes) -> str:
-    return "png" if data.startswith(PNG_START) else "jpeg"
-
-
-def _check(data: bytes, path: Path) -> bytes:
+def _check(photograph: Path) -> bytes:
     """Check that a photograph can be decoded, and return its digest for later checks. Raises `InputError`."""
+    data = read_bounded(photograph, MAX_IMAGE_BYTES)
     try:
-        decode_gray(data, str(path))
+        decode_gray(data, str(photograph))
     except SessionDamaged as error:
-        raise InputError(path, error.what) from None
+        raise InputError(photograph, error.what) from None
     return hashlib.sha256(data).digest()
 
 
-def _read(path: Path) -> bytes:
-    """Bytes of a photograph. Raises `InputError` if it is too large or cannot be read."""
-    return read_bounded(path, MAX_IMAGE_BYTES)
-
-
 @dataclass(frozen=True, slots=True)
-class Row:
+class _Row:
     """Photograph, and what was commanded for it."""
 
     image: Path
@@ -167,70 +158,53 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Header line of the table, and the settings that hold for every line."""
+    """Header line of the table, and what holds for every line."""
 
     table: Path
     folder: Path
-    kind: Literal["press", "drag"]
-    px_per_mm: float | None
+    """Of the photographs, with links resolved."""
+    options: ImportOptions
     names: list[str]
     commanded: dict[str, tuple[str, float]]
     """Stored name and unit factor of each column that is not in `SPECIAL`."""
 
 
-def parse_table(
-    folder: Path, table: Path, text: str, kind: Literal["press", "drag"], px_per_mm: float | None
-) -> list[Row]:
-    """Read and check every line of `text`, the table at the path `table`, without opening a photograph.
-
-    Raises `InputError` naming line and column.
-    """
-    lines = csv.reader((found[0] for found in LINE.finditer(text)), strict=True)
-    rows: list[Row] = []
-    seen: set[str] = set()
+def _read_table(folder: Path, table: Path, options: ImportOptions) -> list[_Row]:
+    """Read and check every line of the table, without opening a photograph. Raises `InputError` for line and column."""
+    if not table.is_file():
+        raise InputError(table, "no such table")
     try:
-        columns = _columns(
-            folder,
-            table,
-            kind,
-            px_per_mm,
-            [EARLIER_NAMES.get(name.strip(), name.strip()) for name in next(lines, list[str]())],
-        )
+        text = read_bounded(table, MAX_TABLE_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(table, "is not UTF-8 text") from None
+    lines = csv.reader((found[0] for found in LINE.finditer(text)), strict=True)
+    rows: dict[str, _Row] = {}
+    try:
+        names = [EARLIER_NAMES.get(name.strip(), name.strip()) for name in next(lines, list[str]())]
+        columns = _Columns(table, folder, options, names, _checked_names(table, options, names))
         for cells in filter(any, lines):
             if len(rows) == MAX_ROWS:
                 raise InputError(table, f"has more than {MAX_ROWS} rows")
             row = _row(columns, lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
-            if row.stroke.stroke_id in seen:
+            if rows.setdefault(row.stroke.stroke_id, row) is not row:
                 raise InputError(table, f"line {lines.line_num}: stroke {row.stroke.stroke_id} appears twice")
-            seen.add(row.stroke.stroke_id)
-            rows.append(row)
     except csv.Error as error:
         raise InputError(table, f"line {lines.line_num}: {error}") from None
     if not rows:
         raise InputError(table, "has no rows")
-    return rows
+    return list(rows.values())
 
 
-def read_text(table: Path) -> str:
-    """Text of a table. Raises `InputError` where it is missing, too large or not UTF-8."""
-    if not table.is_file():
-        raise InputError(table, "no such table")
-    try:
-        return read_bounded(table, MAX_TABLE_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(table, "is not UTF-8 text") from None
-
-
-def _columns(
-    folder: Path, table: Path, kind: Literal["press", "drag"], px_per_mm: float | None, names: list[str]
-) -> _Columns:
+def _checked_names(table: Path, options: ImportOptions, names: list[str]) -> dict[str, tuple[str, float]]:
+    """Check the header line; return stored name and unit factor of each column that is not in `SPECIAL`."""
     if not all(name.isprintable() for name in names):
         raise InputError(table, "line 1 holds control characters: the names of the columns are expected there")
     if "file" not in names:
         raise InputError(table, f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
-    if "px_per_mm" not in names and "px_per_mm_x" not in names and px_per_mm is None:
+    if "px_per_mm" not in names and "px_per_mm_x" not in names and options.px_per_mm is None:
         raise InputError(table, "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm")
-    required = [(name, "presses need it") for name in ("depth_mm", "tilt_deg", "start_x_px") if kind == "press"]
+    pressed = options.kind == "press"
+    required = [(name, "presses need it") for name in ("depth_mm", "tilt_deg", "start_x_px") if pressed]
     for first, second in PAIRS:
         required += [(b, f"`{a}` needs it") for a, b in ((first, second), (second, first)) if a in names]
     for name, why in required:
@@ -241,7 +215,7 @@ def _columns(
     for name in stored:
         if stored.count(name) > 1:
             raise InputError(table, f"column `{name}` occurs twice, perhaps in two units")
-    return _Columns(table, folder.resolve(), kind, px_per_mm, names, commanded)
+    return commanded
 
 
 def _unit(table: Path, column: str) -> tuple[str, float]:
@@ -257,7 +231,7 @@ def _unit(table: Path, column: str) -> tuple[str, float]:
     raise InputError(table, f"column `{column}` has no known unit; its name must end in one of: {allowed}")
 
 
-def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
+def _row(columns: _Columns, line: int, cells: list[str], still: int) -> _Row:
     table = columns.table
     if len(cells) != len(columns.names):
         raise InputError(table, f"line {line} has {len(cells)} fields, expected {len(columns.names)}")
@@ -270,7 +244,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
             parsed = math.nan
         if not math.isfinite(parsed):
             raise InputError(table, f"line {line}, column `{name}`: {fields[name][:80]!r} is not a finite number")
-        least, most = _range(name, columns.kind)
+        least, most = _range(name, columns.options.kind)
         if not least <= parsed <= most:
             wrong = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
             raise InputError(table, f"line {line}, column `{name}`: {wrong}")
@@ -281,15 +255,15 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
 
     image = _image(columns, line, fields["file"])
     scale = pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0])
-    if scale is None and columns.px_per_mm is not None:
-        scale = (columns.px_per_mm, columns.px_per_mm)
+    if scale is None and columns.options.px_per_mm is not None:
+        scale = (columns.options.px_per_mm, columns.options.px_per_mm)
     if scale is None or not all(MIN_PX_PER_MM <= s <= MAX_PX_PER_MM for s in scale):
         raise InputError(table, f"line {line}: px_per_mm = {scale}, allowed: {MIN_PX_PER_MM} to {MAX_PX_PER_MM}")
     stroke = Stroke(
         stroke_id=_name(columns, line, fields["name"])
         if "name" in fields
         else image.relative_to(columns.folder).with_suffix("").as_posix(),
-        kind=columns.kind,
+        kind="press" if columns.options.kind == "press" else "drag",
         still=still,
         depth_mm=value("depth_mm") if "depth_mm" in fields else None,
         tilt_deg=value("tilt_deg") if "tilt_deg" in fields else None,
@@ -297,7 +271,7 @@ def _row(columns: _Columns, line: int, cells: list[str], still: int) -> Row:
         px_per_mm=scale,
         commanded={stored: value(name, factor) for name, (stored, factor) in columns.commanded.items()},
     )
-    return Row(image, stroke)
+    return _Row(image, stroke)
 
 
 def _range(column: str, kind: str) -> tuple[float, float]:

@@ -71,6 +71,8 @@ class McapWriter:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: Counter[int] = Counter()
+        self._numbers: dict[tuple[str, str], int] = {}
+        """Of the channels to which messages of other files are copied, by topic and name of the schema."""
         self._crc = 0
         """Of everything written to the file so far."""
         self._write(MCAP0_MAGIC)
@@ -96,23 +98,11 @@ class McapWriter:
         length = self._write(_packed(Attachment(0, 0, name, media_type, data)))
         self._attachments.append(AttachmentIndex(offset, length, 0, 0, len(data), name, media_type))
 
-    def fits(self, schema: Schema | None, channel: Channel) -> bool:
-        """Whether the numbers of a channel and its schema are free, or stand for exactly these."""
-        return self.channels.get(channel.id, channel) == channel and (
-            schema is None or self.schemas.get(schema.id, schema) == schema
-        )
-
     def add_channel(self, schema: Schema | None, channel: Channel) -> None:
-        """Put a channel that `fits`, and its schema, into the chunk in progress."""
+        """Put a channel and its schema into the chunk in progress; their numbers must be free."""
         for record in (schema, channel) if schema is not None else (channel,):
             self._records += _packed(record)
-        self.list_channel(schema, channel)
-
-    def list_channel(self, schema: Schema | None, channel: Channel) -> None:
-        """List a channel in the index only: `add_chunk` brings its record along."""
-        if schema is not None:
-            self.schemas[schema.id] = schema
-        self.channels[channel.id] = channel
+        self._list(schema, channel)
 
     def add_message(self, *, channel_id: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         """Add a message to the chunk in progress."""
@@ -124,15 +114,33 @@ class McapWriter:
         if len(records) > CHUNK_BYTES:
             self._end_chunk()
 
-    def add_chunk(self, data: bytes, index: ChunkIndex, counts: Mapping[int, int]) -> None:
-        """Add a chunk of another file as it is, with the indexes of its messages; `index` says where it was there."""
-        self._end_chunk()
-        shift = self._file.tell() - index.chunk_start_offset
-        self._write(data)
-        offsets = {number: at + shift for number, at in index.message_index_offsets.items()}
-        start = index.chunk_start_offset + shift
-        self._chunks.append(replace(index, chunk_start_offset=start, message_index_offsets=offsets))
-        self._counts.update(counts)
+    def add(self, schema: Schema | None, channel: Channel, message: Message) -> None:
+        """Add a message of another file as it is: times, sequence number and data stay."""
+        self.add_message(
+            channel_id=self._number(schema, channel),
+            log_time=message.log_time,
+            publish_time=message.publish_time,
+            sequence=message.sequence,
+            data=message.data,
+        )
+        if channel.topic == Topic.STROKE:
+            self.flush()  # ends the chunk, so that a damaged chunk costs one stroke
+
+    def add_file(self, path: Path) -> None:
+        """Add all messages of a file as they are, every CRC checked. Raises `SessionDamaged`.
+
+        Chunks are copied whole where the numbers of the channels agree, as they do in files of one session.
+        """
+        source = McapFile(path)
+        channels = list(source.channels.values())
+        if not all(self._fits(*pair) for pair in channels):
+            for record in source.messages():
+                self.add(*record)
+            return
+        for pair in channels:
+            self._list(*pair)
+        for packed in source.packed_chunks():
+            self._add_chunk(*packed)
 
     def flush(self) -> None:
         """End the chunk in progress unless it has no messages, and hand everything to the operating system."""
@@ -165,6 +173,45 @@ class McapWriter:
         self._write(summary)
         self._write(_packed(Footer(start, offsets_start, zlib.crc32(footer, zlib.crc32(summary)))))
         self._write(MCAP0_MAGIC)
+
+    def _fits(self, schema: Schema | None, channel: Channel) -> bool:
+        """Whether the numbers of a channel and its schema are free, or stand for exactly these."""
+        return self.channels.get(channel.id, channel) == channel and (
+            schema is None or self.schemas.get(schema.id, schema) == schema
+        )
+
+    def _list(self, schema: Schema | None, channel: Channel) -> None:
+        """List a channel in the index only: a chunk of another file brings its record along."""
+        if schema is not None:
+            self.schemas[schema.id] = schema
+        self.channels[channel.id] = channel
+
+    def _number(self, schema: Schema | None, channel: Channel) -> int:
+        """Number of the channel for messages of this channel of another file."""
+        ident = (channel.topic, schema.name if schema else "")
+        if ident not in self._numbers:
+            known = {(one.topic, self._schema_name(one)): number for number, one in self.channels.items()}
+            if ident not in known:
+                if not self._fits(schema, channel):
+                    number = max([*self.channels, *self.schemas]) + 1
+                    schema = replace(schema, id=number) if schema else None
+                    channel = replace(channel, id=number, schema_id=number if schema else 0)
+                self.add_channel(schema, channel)
+            self._numbers[ident] = known.get(ident, channel.id)
+        return self._numbers[ident]
+
+    def _schema_name(self, channel: Channel) -> str:
+        return self.schemas[channel.schema_id].name if channel.schema_id else ""
+
+    def _add_chunk(self, data: bytes, index: ChunkIndex, counts: Mapping[int, int]) -> None:
+        """Add a chunk of another file as it is, with the indexes of its messages; `index` says where it was there."""
+        self._end_chunk()
+        shift = self._file.tell() - index.chunk_start_offset
+        self._write(data)
+        offsets = {number: at + shift for number, at in index.message_index_offsets.items()}
+        start = index.chunk_start_offset + shift
+        self._chunks.append(replace(index, chunk_start_offset=start, message_index_offsets=offsets))
+        self._counts.update(counts)
 
     def _statistics(self) -> Statistics:
         return Statistics(
@@ -238,71 +285,13 @@ def start_mcap(
     return writer
 
 
-class Copy:
-    """A new file that takes messages of other files as they are: times, sequence numbers and data stay."""
-
-    def __init__(self, writer: McapWriter) -> None:
-        self._writer = writer
-        self._numbers: dict[tuple[str, str], int] = {}
-
-    def add(self, schema: Schema | None, channel: Channel, message: Message) -> None:
-        """Add one message."""
-        self._writer.add_message(
-            channel_id=self._number(schema, channel),
-            log_time=message.log_time,
-            publish_time=message.publish_time,
-            sequence=message.sequence,
-            data=message.data,
-        )
-        if channel.topic == Topic.STROKE:
-            self._writer.flush()  # ends the chunk, so that a damaged chunk costs one stroke
-
-    def add_file(self, path: Path) -> None:
-        """Add all messages of a file, every CRC checked. Raises `SessionDamaged`.
-
-        Chunks are copied as they are where the numbers of the channels agree, as they do in files of one session.
-        """
-        source = McapFile(path)
-        channels = list(source.channels.values())
-        if not all(self._writer.fits(*pair) for pair in channels):
-            for record in source.messages():
-                self.add(*record)
-            return
-        for pair in channels:
-            self._writer.list_channel(*pair)
-        for packed in source.packed_chunks():
-            self._writer.add_chunk(*packed)
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Messages by topic; complete once the file is finished."""
-        return self._writer.counts
-
-    def _number(self, schema: Schema | None, channel: Channel) -> int:
-        ident = (channel.topic, schema.name if schema else "")
-        if ident not in self._numbers:
-            writer = self._writer
-            known = {(one.topic, self._schema_name(one)): number for number, one in writer.channels.items()}
-            if ident not in known:
-                if not writer.fits(schema, channel):
-                    number = max([*writer.channels, *writer.schemas]) + 1
-                    schema = replace(schema, id=number) if schema else None
-                    channel = replace(channel, id=number, schema_id=number if schema else 0)
-                writer.add_channel(schema, channel)
-            self._numbers[ident] = known.get(ident, channel.id)
-        return self._numbers[ident]
-
-    def _schema_name(self, channel: Channel) -> str:
-        return self._writer.schemas[channel.schema_id].name if channel.schema_id else ""
-
-
 @contextlib.contextmanager
 def new_mcap(
     path: Path, header: Header, notes: Mapping[str, Mapping[str, Any]], attachments: Mapping[str, bytes]
-) -> Generator[Copy]:
+) -> Generator[McapWriter]:
     """A new file to copy messages into; finished and durable after the block. Raises `OSError`."""
     with path.open("xb") as file:
         writer = start_mcap(file, header, notes, attachments)
-        yield Copy(writer)
+        yield writer
         writer.finish()
         sync(file)

@@ -10,7 +10,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 
 from brushloop.sessions.mcap_file import McapFile
-from brushloop.sessions.mcap_writer import CHUNK_BYTES, Copy, McapWriter
+from brushloop.sessions.mcap_writer import CHUNK_BYTES, McapWriter
 
 PLACES = {"chunk_length", "chunk_start_offset", "compressed_size", "message_index_offsets"}
 """What depends on how well a chunk was compressed; the library compresses at another level."""
@@ -99,7 +99,7 @@ def test_messages_of_another_file_are_copied_whatever_numbers_its_channels_have(
         for channel in others:
             writer.add_channel(None, channel)
         for _ in range(2):
-            Copy(writer).add_file(source)
+            writer.add_file(source)
         writer.finish()
 
     def messages_of(path):
