@@ -17,15 +17,13 @@ from pathlib import Path
 from brushloop.sessions.cells import as_text, number
 from brushloop.sessions.disk import read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
+from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message, upright
 from brushloop.sessions.names import SESSION_ID
 from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.records import MAX_PX_PER_MM, MIN_PX_PER_MM, Header, Source, Stroke, Topic
-from brushloop.sessions.step_file import Outgoing, SegmentWriter
+from brushloop.sessions.step_file import ChannelTable, Outgoing
 
-QUEUE_LIMIT = 16
-"""Most photographs queued for writing; an import waits when the queue is full, and memory stays bounded."""
-WAIT_S = 60.0
 MAX_TABLE_BYTES = 16 * 1024 * 1024
 MAX_ROWS = 100_000
 LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
@@ -120,8 +118,8 @@ def _write(
     now_ns: Callable[[], int],
     progress: Progress,
 ) -> None:
-    writer = SegmentWriter(final, header, QUEUE_LIMIT)
-    try:
+    with new_mcap(final, header, {}, {}) as writer:
+        channels = ChannelTable(writer)
         pairs = zip(rows, digests, strict=True)
         for row, digest in counted(pairs, "photographs written", len(rows), progress):
             data, still = read_bounded(row.image, MAX_IMAGE_BYTES), row.stroke.still
@@ -130,12 +128,8 @@ def _write(
             data = upright(data)
             image_kind = "png" if data.startswith(PNG_START) else "jpeg"
             t_ns = now_ns()
-            writer.write(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, image_kind)), WAIT_S)
-            writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke), WAIT_S)
-    except BaseException:
-        writer.abandon()
-        raise
-    writer.finish()
+            channels.add(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, image_kind)))
+            channels.add(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke))
 
 
 def _check(photograph: Path) -> bytes:

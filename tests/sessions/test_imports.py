@@ -249,11 +249,14 @@ def test_a_photograph_that_changes_under_the_import_is_refused(rows, photos, ref
     assert refusal() == "photos/a.png: changed while it was imported"
 
 
-def test_a_disk_without_room_is_refused(rows, refusal, monkeypatch):
+@pytest.mark.parametrize("call", ["mkdir", "fsync"])
+def test_a_disk_without_room_is_refused(rows, photos, refusal, monkeypatch, call):
+    (photos.parent / "sessions").mkdir()
+
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "mkdir", full)
+    monkeypatch.setattr(os, call, full)
     assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"
 
 

@@ -10,7 +10,6 @@ import pytest
 from mcap.reader import make_reader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.decoder import DecoderFactory
-from pydantic import ValidationError
 
 from brushloop.sessions.messages import (
     Transform,
@@ -107,22 +106,12 @@ def test_quality_passes_where_every_check_does():
         lambda: Wrench(fx_n=float("nan"), fy_n=0, fz_n=0, mx_nm=0, my_nm=0, mz_nm=0),
         lambda: InkState(level=1.2),
         lambda: Cadence(topic="/x", expected_hz=0, received=0, missed=0),
-    ],
-)
-def test_what_cannot_be_is_not_recorded(wrong):
-    with pytest.raises(ValidationError):
-        wrong()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
         lambda: joints_message(0, JOINTS, [0.0] * 5),
         lambda: calibration_message(0, (1, 1), [[1.0] * 4] * 3, []),
     ],
 )
-def test_lists_of_the_wrong_length_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"shorter|3 x 3"):
+def test_what_cannot_be_is_not_recorded(wrong):
+    with pytest.raises(ValueError, match=r"validation error|shorter|3 x 3"):
         wrong()
 
 

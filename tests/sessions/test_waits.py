@@ -8,7 +8,6 @@ import pytest
 
 from brushloop.sessions.export import export
 from brushloop.sessions.history import unlike, waits_of
-from brushloop.sessions.records import Stroke
 
 
 def step(kind: str, stroke_id: str, **result: object) -> dict[str, object]:
@@ -58,7 +57,3 @@ def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp
         rows = list(csv.DictReader(file))
     assert [row["dip_to_touch_s"] for row in rows] == ["1.0", "1.1", "10.0", "1.2", ""]
     assert [row["dip_to_touch_unlike"] for row in rows] == ["0.0", "0.0", "1.0", "0.0", ""]
-
-
-def test_strokes_of_older_sessions_are_read():
-    assert Stroke.model_validate_json('{"stroke_id": "a", "kind": "press", "still": 0}').dip_to_touch_s is None
