@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from brushloop.calibrate.calibrated import Calibrated
     from brushloop.calibrate.errors import CalibrationError, CaptureRefused
     from brushloop.calibrate.fit.artefact import BrushFit
-    from brushloop.calibrate.fit.command import FitResult
-    from brushloop.calibrate.invert.command import Recovered
     from brushloop.calibrate.notebook import (
         Prediction,
         RecordedPress,
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
         recover,
         validate,
     )
-    from brushloop.calibrate.validate.main import ValidationOutput
     from brushloop.collect.errors import CollectAborted, ConfigError
     from brushloop.collect.start import collect_session
     from brushloop.drivers.loopback import LoopbackRig, simulate
@@ -39,13 +36,10 @@ _NAMES = {
     "brushloop.calibrate.calibrated": ("Calibrated",),
     "brushloop.calibrate.errors": ("CalibrationError", "CaptureRefused"),
     "brushloop.calibrate.fit.artefact": ("BrushFit",),
-    "brushloop.calibrate.fit.command": ("FitResult",),
-    "brushloop.calibrate.invert.command": ("Recovered",),
     "brushloop.calibrate.notebook": (
         *("Prediction", "RecordedPress", "Session", "Similarity"),
         *("calibrate_session", "compare", "fit", "models", "predict", "recover", "validate"),
     ),
-    "brushloop.calibrate.validate.main": ("ValidationOutput",),
     "brushloop.collect.errors": ("CollectAborted", "ConfigError"),
     "brushloop.collect.start": ("collect_session",),
     "brushloop.drivers.loopback": ("LoopbackRig", "simulate"),
@@ -64,16 +58,13 @@ __all__ = [
     "Condition",
     "ConfigError",
     "DomainError",
-    "FitResult",
     "LoopbackRig",
     "Prediction",
     "RecordedPress",
-    "Recovered",
     "Session",
     "SessionDamaged",
     "SessionError",
     "Similarity",
-    "ValidationOutput",
     "calibrate_session",
     "collect_session",
     "compare",

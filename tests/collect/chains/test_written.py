@@ -20,7 +20,7 @@ CROSS = {"strokes": [[[12, 24, 5], [36, 24, 5]], [[24, 37, 5], [24, 11, 5]]]}
 
 def write(bench: Bench, what: Path, *more: str) -> subprocess.CompletedProcess[str]:
     words = ["write", what, "--config", bench.rig, "--out", bench.folder / "written", "--sessions", bench.sessions]
-    return bench.run(*words, "--no-tui", "--patch-mm", "48", *more)
+    return bench.run(*words, "--no-tui", "--cell-mm", "48", *more)
 
 
 def strict(rows: list[Table3Row], pair: str, alignment: str = "mm") -> Table3Row:
@@ -64,7 +64,7 @@ def test_a_character_is_written_twice_and_compared(bench: Bench) -> None:
 
     # A session is compared with the plan that it was drawn from, and with no other.
     plan = bench.folder / "plan"
-    bench.run("write", "plan", "--out", str(plan), "--steps", "1", "--patch-mm", "48", str(what))
+    bench.run("write", "plan", "--out", str(plan), "--steps", "1", "--cell-mm", "48", str(what))
     strange = bench.run("write", "compare", str(session), "--plan", str(plan))
     assert strange.returncode == 2
     assert "'cross' was not drawn from this plan" in strange.stderr
