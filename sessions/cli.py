@@ -60,7 +60,7 @@ def show(
         say(json.dumps(asdict(found), ensure_ascii=False))
         return
 
-    from brushloop.sessions.show_text import renderables
+    from brushloop.sessions.show import renderables
 
     say(*renderables(found, files=files))
 

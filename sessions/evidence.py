@@ -16,14 +16,18 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, read_bounded
 from brushloop.sessions.errors import SessionDamaged, SessionError
+from brushloop.sessions.events import Begin, Done, Event, Open, line_of, parse_event, serial_of
 from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, read_journal
-from brushloop.sessions.journal.events import NONSENSE, serial_of
-from brushloop.sessions.journal.journal import Account, DoneTwice, Replay, account, fold
 from brushloop.sessions.mcap_file import Scan, scan
 from brushloop.sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
 from brushloop.sessions.recording import count_messages, parse_header
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Recorded, Topic
-from brushloop.sessions.store import closed_line, done_line, open_line
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Topic
+from brushloop.sessions.run_state import Account, DoneTwice, RunState, account
+from brushloop.sessions.show import step_words
+from brushloop.sessions.store import closed
+
+NONSENSE = (KeyError, TypeError, ValueError)
+"""Exceptions that a malformed note may cause."""
 
 
 @dataclass(slots=True)
@@ -50,7 +54,7 @@ class Evidence:
     """Id of the session: neither lines nor files of another one are evidence of anything."""
     foreign: dict[str, str] = field(default_factory=dict[str, str])
     """Files of other sessions that the journal does not list, and the ids of those sessions."""
-    state: Replay = field(default_factory=Replay)
+    state: RunState = field(default_factory=RunState)
     """State after all trusted and rebuilt lines."""
 
     @property
@@ -87,19 +91,29 @@ def gather(folder: Path) -> Evidence:
         header = header or _from_any_segment(found) or _from_final(found)
         if header is None:
             raise SessionDamaged(path, "has no `open` event, and no file holds its header")
-        found.rebuilt.insert(0, {"t_ns": 0, **open_line(header, _snapshots(folder))})
+        found.rebuilt.insert(0, full_line(Open(t_ns=0, header=header, snapshots=_snapshots(folder))))
     _fold(found)
     _closed(found)
     found.lost = _lost(journal, found.all_lines)
     return found
 
 
-def _named_in(state: Replay) -> str:
-    header = (state.opened or {}).get("header", {})
-    return str(header.get("session_id", ""))
+def full_line(event: Event) -> Line:
+    """The line of an event, with its time."""
+    return {"t_ns": event.t_ns, **line_of(event)}
 
 
-def _session(folder: Path, state: Replay) -> str:
+def line_words(line: Line) -> str:
+    """Name of the step of a line, for people."""
+    event = parse_event(line)
+    return step_words(event) if isinstance(event, Begin | Done) else "the session"
+
+
+def _named_in(state: RunState) -> str:
+    return "" if state.opened is None else state.opened.header.session_id
+
+
+def _session(folder: Path, state: RunState) -> str:
     """Id of the session in a folder: its name, unless neither journal nor files say it; then the id of most files."""
     named = _named_in(state)
     if named == folder.name:
@@ -115,7 +129,7 @@ def _session(folder: Path, state: Replay) -> str:
 def _fold(found: Evidence) -> None:
     for line in found.all_lines:
         try:
-            fold(found.state, line)
+            found.state.apply(parse_event(line))
         except DoneTwice:
             # Only a rebuilt line can raise this: the journal's own lines were applied before.
             found.rebuilt = [other for other in found.rebuilt if other is not line]
@@ -150,24 +164,24 @@ def _place(lines: list[Line], line: Line) -> int:
     """Index for a rebuilt line: `open` first, `closed` last, the lines of a step before those of the next."""
     if line["event"] == "open":
         return 0
-    serial = serial_of(line)
+    serial = serial_of(str(line.get("file", "")))
     if line["event"] == "closed" or serial is None:
         return len(lines)
     for at, other in enumerate(lines):
-        later = serial_of(other) if other["event"] in ("begin", "done") else None
+        later = serial_of(str(other["file"])) if other["event"] in ("begin", "done") else None
         if other["event"] == "closed" or (later is not None and later > serial):
             return at
     return len(lines)
 
 
-def _from_files(found: Evidence, live: dict[str, Line]) -> Header | None:
+def _from_files(found: Evidence, live: dict[str, Done]) -> Header | None:
     """Rebuild `begin` and `done` lines from the notes in the files of steps; return the header from one of them.
 
     `live` are the journal's `done` lines that no `lost` line revokes.
     """
     begun = {str(line.get("file")) for line in found.lines if line["event"] == "begin"}
     done = {str(line.get("file")) for line in [*found.lines, *found.rebuilt] if line["event"] == "done"}
-    celled = {line["kind"] for line in found.lines if line["event"] == "begin" and line["patch"] is not None}
+    celled = {line["kind"] for line in found.lines if line["event"] == "begin" and line.get("patch") is not None}
     uncelled = {line["kind"] for line in found.lines if line["event"] == "begin"} - celled
     doubted = {line.get("file") for line in found.lines if line["event"] == "doubt"}
     header: Header | None = None
@@ -223,7 +237,7 @@ def _uncovered(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[
 def _begin_line(note: dict[str, Any]) -> Line | None:
     try:
         line: Line = {"t_ns": note["t_ns"], **note["line"]}
-        fold(Replay(), line)
+        parse_event(line)
     except NONSENSE:
         return None
     return line if line["event"] == "begin" else None
@@ -232,19 +246,17 @@ def _begin_line(note: dict[str, Any]) -> Line | None:
 def _done_line(note: dict[str, Any], name: str) -> Line | None:
     """Make the `done` line from a file's note, without a digest; None where the note makes no sense."""
     try:
-        identity = {field: note[field] for field in ("key", "kind", "attempt")}
-        line = done_line(identity, name, Recorded(note["counts"], "", 0), note["result"])
-        line = {"t_ns": note.get("t_ns", 0), **line}
-        fold(Replay(), line)
+        line: Line = {"event": "done", **note, "file": name, "sha256": ""}
+        parse_event(line)
     except NONSENSE:
         return None
     return line
 
 
-def _superseded(found: Evidence, finish: Line, live: dict[str, Line]) -> bool:
+def _superseded(found: Evidence, finish: Line, live: dict[str, Done]) -> bool:
     """Whether the attempt was cut or lost, or its step begun or done again, according to the journal."""
     held = live.get(finish["key"])
-    if held is not None and (held.get("attempt", 1) > finish["attempt"] or Topic.STROKE in held["counts"]):
+    if held is not None and (held.attempt > finish["attempt"] or Topic.STROKE in held.counts):
         return True
     for line in [*found.lines, *found.rebuilt]:
         if line.get("key") != finish["key"]:
@@ -306,6 +318,6 @@ def _closed(found: Evidence) -> None:
         and Counter(counts) >= Counter(found.state.counts())
         and scan(final, read_chunks=False).session in ("", found.session)
     ):
-        line: Line = {"t_ns": found.state.last_ns, **closed_line(final, counts)}
-        found.rebuilt.append(line)
-        fold(found.state, line)
+        event = closed(final, counts, found.state.last_ns)
+        found.rebuilt.append(full_line(event))
+        found.state.apply(event)

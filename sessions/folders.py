@@ -7,8 +7,8 @@ from pathlib import Path
 
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.journal.journal import is_open, replay
 from brushloop.sessions.names import SEGMENT_NAME, check_folder
+from brushloop.sessions.run_state import replay
 
 
 def check_name(folder: Path) -> None:
@@ -54,7 +54,7 @@ def not_a_session(folder: Path) -> InputError:
 
 def _is_open(folder: Path) -> bool:
     try:
-        return (folder / JOURNAL_NAME).is_file() and is_open(replay(folder / JOURNAL_NAME))
+        return (folder / JOURNAL_NAME).is_file() and replay(folder / JOURNAL_NAME).is_open
     except SessionError:
         return False
 
@@ -77,7 +77,7 @@ def open_sessions(root: Path) -> list[Path]:
     for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")):
         try:
             check_folder(journal.parent)
-            if is_open(replay(journal)):
+            if replay(journal).is_open:
                 found.append(journal.parent)
         except SessionError:
             continue

@@ -1,4 +1,9 @@
-"""History of a session's strokes: takes that did not count, paper heights, waits from dip to touch."""
+"""History of a session's strokes: takes that did not count, paper heights, waits from dip to touch, and remarks.
+
+Remarks (bad, good again, a note) are added to captures afterwards. `remarks.jsonl` holds one line per remark, with a
+CRC as in the journal; the latest remark on a still counts. The recording itself is never changed, so that a closed
+session stays byte for byte as recorded.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from brushloop.sessions.errors import SessionDamaged, in_one_line
-from brushloop.sessions.journal import JOURNAL_NAME, Line
-from brushloop.sessions.journal.events import NONSENSE
-from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, read_lines
+from brushloop.sessions.run_state import RunState, replay
 
-CAPTURE, DIP, ZERO_TOUCH = "capture", "dip", "zero_touch"
+REMARKS_NAME = "remarks.jsonl"
 LEAST_S = 2.0
 """Smallest difference between waits that can be visible in the ink, s."""
 SPREADS = 3.0
@@ -21,18 +26,9 @@ SPREADS = 3.0
 LEAST_STROKES = 4
 """Number of strokes below which no wait can be called an outlier."""
 WAIT = "dip_to_touch_s"
-"""Name of the wait in a step's result, in a stroke and in an export's columns."""
+"""Name of the wait in an export's columns."""
 
 _K = TypeVar("_K")
-
-
-@dataclass(frozen=True, slots=True)
-class ZeroTouch:
-    """One zero touch."""
-
-    method: str
-    touch_z_mm: float
-    """Height of the paper at the sheet's origin, base frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +41,13 @@ class History:
     """Strokes of takes that did not count and were repeated on another patch."""
     left_out: tuple[str, ...]
     """Strokes that were given up, or skipped by the operator."""
-    found: tuple[ZeroTouch, ...]
+    touches: tuple[ZeroTouchResult, ...]
     """Zero touches in order of time."""
 
     @property
     def moved_mm(self) -> float:
         """Difference between the highest and the lowest paper found, mm."""
-        heights = [one.touch_z_mm for one in self.found]
+        heights = [touch.touch_z_mm for touch in self.touches]
         return max(heights) - min(heights) if heights else 0.0
 
 
@@ -60,50 +56,23 @@ def history_of(folder: Path) -> History | None:
     journal = folder / JOURNAL_NAME
     if not journal.is_file():
         return None
-    done = replay(journal).segments
-    try:
-        return _history(done)
-    except NONSENSE as error:
-        raise SessionDamaged(journal, f"a result makes no sense: {in_one_line(error)}") from None
-
-
-def _history(done: list[Line]) -> History:
-    captures = [line["result"] for line in done if line["kind"] == CAPTURE]
-    dips = [line["result"] for line in done if line["kind"] == DIP]
-    rejected = [result for result in captures if not result.get("kept", True)]
-    given_up = [*(r for r in rejected if not r.get("retake")), *(r for r in dips if r.get("skipped"))]
+    state = replay(journal)
+    captures = state.results(CaptureResult)
+    rejected = [capture for capture in captures if not capture.kept]
+    skipped = [dip.skipped for dip in state.results(DipResult) if dip.skipped is not None]
+    left_out = [*(capture.press for capture in rejected if not capture.retake), *skipped]
     return History(
         len(captures),
-        tuple(str(result["stroke_id"]) for result in rejected if result.get("retake")),
-        tuple(str(result["stroke_id"]) for result in given_up),
-        tuple(_zero_touch(line) for line in done if line["kind"] == ZERO_TOUCH),
+        tuple(capture.press.stroke_id for capture in rejected if capture.retake),
+        tuple(press.stroke_id for press in left_out),
+        tuple(state.results(ZeroTouchResult)),
     )
 
 
-def _zero_touch(line: Line) -> ZeroTouch:
-    result = line["result"]
-    return ZeroTouch(str(result.get("method", "")), float(result["touch_z_mm"]))
-
-
-def waits_of(segments: Iterable[Line]) -> dict[int, float]:
-    """Seconds from dip to touch, by number of the still that shows the stroke, from a journal's finished steps.
-
-    Empty for sessions recorded before waits were measured.
-    """
-    pressed: dict[str, float] = {}
-    waits: dict[int, float] = {}
-    for line in segments:
-        result = line["result"]
-        match line["kind"]:
-            case "press" | "draw":
-                pressed.pop(str(result.get("stroke_id")), None)
-                if isinstance(wait := result.get(WAIT), int | float):
-                    pressed[str(result["stroke_id"])] = float(wait)
-            case "capture" if (wait := pressed.get(str(result.get("stroke_id")))) is not None:
-                waits[int(result["still"])] = wait
-            case _:
-                pass
-    return waits
+def waits_of(state: RunState) -> dict[int, float]:
+    """Seconds from dip to touch, by number of the still that shows the stroke; of those that were measured."""
+    captures = state.results(CaptureResult)
+    return {one.still: one.press.dip_to_touch_s for one in captures if one.press.dip_to_touch_s is not None}
 
 
 def limit_s(waits: Iterable[float]) -> tuple[float, float] | None:
@@ -117,11 +86,56 @@ def limit_s(waits: Iterable[float]) -> tuple[float, float] | None:
 
 def unlike(waits: Mapping[_K, float]) -> dict[_K, str]:
     """Reason for each stroke whose wait differs from the others'."""
-    if (found := limit_s(waits.values())) is None:
+    if (limit := limit_s(waits.values())) is None:
         return {}
-    median, most_s = found
+    median, most_s = limit
     return {
         key: f"touched the paper {wait:.1f} s after its dip, the others after {median:.1f} s"
         for key, wait in waits.items()
         if abs(wait - median) > most_s
     }
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """Remark on one capture."""
+
+    still: int
+    """`sequence` of the capture's still, unique in the session."""
+    stroke_id: str
+    bad: bool = False
+    note: str = ""
+    t_ns: int = 0
+    """Time of the remark by the host's clock."""
+
+
+def add_remark(folder: Path, remark: Remark) -> None:
+    """Append a remark and wait until it is on disk. Raises `SessionError` where that fails."""
+    journal = Journal(folder / REMARKS_NAME, remark.t_ns)
+    try:
+        line = {"event": "remark", "still": remark.still, "stroke_id": remark.stroke_id}
+        journal.append(remark.t_ns, {**line, "bad": remark.bad, "note": remark.note})
+    finally:
+        journal.close()
+
+
+def mark_bad_or_good(folder: Path, still: int, stroke_id: str, t_ns: int) -> bool:
+    """Switch a capture between bad and good, keep its note, and return whether it is bad now. Raises `SessionError`."""
+    known = remarks_of(folder).get(still, Remark(still, stroke_id))
+    add_remark(folder, Remark(still, stroke_id, not known.bad, known.note, t_ns))
+    return not known.bad
+
+
+def remarks_of(folder: Path) -> dict[int, Remark]:
+    """Latest remark for each still; empty where there is none. Raises `SessionDamaged`."""
+    path = folder / REMARKS_NAME
+    found: dict[int, Remark] = {}
+    for line in read_lines(path) if path.is_file() else ():
+        if line["event"] != "remark":
+            continue
+        try:
+            still, t_ns = int(line["still"]), int(line["t_ns"])
+            found[still] = Remark(still, str(line["stroke_id"]), bool(line["bad"]), str(line["note"]), t_ns)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SessionDamaged(path, f"a remark has a missing or wrong field: {error}") from None
+    return found

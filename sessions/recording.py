@@ -19,14 +19,14 @@ from pydantic import ValidationError
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, fsync_folder, read_bounded, set_aside
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error, in_one_line
 from brushloop.sessions.folders import check_name, not_a_session
+from brushloop.sessions.history import remarks_of
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.journal.journal import Replay, is_open, replay
 from brushloop.sessions.mcap_file import McapFile, Record, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.names import SNAPSHOT_NAMES, check_companions
 from brushloop.sessions.records import HEADER_METADATA, Event, Header, StepEvent, Stroke, Topic, header_crc
-from brushloop.sessions.remarks import remarks_of
+from brushloop.sessions.run_state import RunState, replay
 
 if TYPE_CHECKING:
     import numpy as np
@@ -152,7 +152,7 @@ def _find_mcap(path: Path) -> Path:
     if not path.is_dir():
         raise not_a_session(path)
     merged = path / f"{path.resolve().name}.mcap"
-    if (path / JOURNAL_NAME).is_file() and is_open(replay(path / JOURNAL_NAME)):
+    if (path / JOURNAL_NAME).is_file() and replay(path / JOURNAL_NAME).is_open:
         raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
     if not merged.is_file():
         raise not_a_session(path)
@@ -210,7 +210,7 @@ def count_messages(path: Path) -> dict[str, int]:
     return dict(found.counts)
 
 
-def merge_session(folder: Path, state: Replay, header: Header, tag: str = "superseded") -> Path:
+def merge_session(folder: Path, state: RunState, header: Header, tag: str = "superseded") -> Path:
     """Merge the finished steps of a session into its one MCAP file, in the order of the journal.
 
     The file includes the configuration and a note of any repairs, so that it can be shared alone. It gets its name
@@ -226,12 +226,13 @@ def merge_session(folder: Path, state: Replay, header: Header, tag: str = "super
     expected = state.counts()
     try:
         part.unlink(missing_ok=True)  # only a copy of steps that still exist
-        notes = {REPAIRS_NOTE: {"repairs": list(state.repairs)}} if state.repairs else {}
+        repairs = [repair.model_dump(mode="json") for repair in state.repairs]
+        notes = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
         snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
         attachments = {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES) for path in snapshots}
         with new_mcap(part, header, notes, attachments) as copy:
-            for line in state.segments:
-                copy.add_file(folder / str(line["file"]))
+            for file in state.files:
+                copy.add_file(folder / file)
         counts = count_messages(part)
         if counts != expected:
             raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
@@ -242,7 +243,7 @@ def merge_session(folder: Path, state: Replay, header: Header, tag: str = "super
     return final
 
 
-def _check_not_emptier(final: Path, state: Replay, header: Header) -> None:
+def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
     try:
         more = Counter(count_messages(final)) - Counter(state.counts())
     except SessionError:

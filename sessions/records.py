@@ -208,13 +208,6 @@ class Header(Event):
     """For imports: the folder's name and its table."""
 
 
-class TornTail(Event):
-    """Bytes of an incomplete journal line, left by a crash and kept so that nothing written is ever lost."""
-
-    event: Literal["torn"] = "torn"
-    hex: str
-
-
 @dataclass(frozen=True, slots=True)
 class Recorded:
     """Number of messages by topic, and the digest of the file that holds them."""

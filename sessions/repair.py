@@ -16,10 +16,10 @@ from pathlib import Path
 
 from brushloop.sessions.disk import check_digest, file_sha256, fsync_folder, holds, set_aside
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
-from brushloop.sessions.evidence import Evidence, gather
+from brushloop.sessions.events import DrawResult, PressResult, line_of, parse_event
+from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, without_time
-from brushloop.sessions.journal.journal import Replay, fold, read_header, replay
 from brushloop.sessions.mcap_file import Part, Record, Scan, scan
 from brushloop.sessions.names import SEGMENT_NAME
 from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session
@@ -30,6 +30,7 @@ from brushloop.sessions.records import (
     Stroke,
     Topic,
 )
+from brushloop.sessions.run_state import RunState, read_header, replay
 from brushloop.sessions.salvage import (
     Report,
     kept_words,
@@ -41,7 +42,7 @@ from brushloop.sessions.salvage import (
     write_anew,
 )
 from brushloop.sessions.show import step_words
-from brushloop.sessions.store import closed_line, lock
+from brushloop.sessions.store import closed, lock
 from brushloop.sessions.verify import file_problems
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
@@ -110,8 +111,8 @@ class FolderRepair:
         """Repair configuration, steps and merged file."""
         try:
             self._snapshots()
-            for line in list(self._state.segments):
-                self._segment(line)
+            for step in self._state.segments:
+                self._segment(full_line(step))
             for name, why in self._strays.items():
                 kept = self._move_aside(self._folder / name)
                 self._report.did.append(f"put {name} aside: {why}{kept_words(kept)}")
@@ -122,12 +123,12 @@ class FolderRepair:
         finally:
             self._journal.close()
         self._report.lost += self._lost_steps
-        counts = (self._state.closed or {}).get("counts", self._state.counts())
+        counts = self._state.counts() if self._state.closed is None else self._state.closed.counts
         self._report.strokes = counts.get(Topic.STROKE, 0)
         return self._report
 
     def _snapshots(self) -> None:
-        for name, text in (self._state.opened or {}).get("snapshots", {}).items():
+        for name, text in ({} if self._state.opened is None else self._state.opened.snapshots).items():
             path = self._folder / name
             data = text.encode()
             if not holds(path, data):
@@ -136,7 +137,7 @@ class FolderRepair:
 
     def _segment(self, line: Line) -> None:
         path = self._folder / line["file"]
-        if "held" in line and self._final_sound:
+        if line["file"] in self._state.held and self._final_sound:
             return
         try:
             check_digest(path, str(line["sha256"]))
@@ -159,7 +160,7 @@ class FolderRepair:
         if missing and self._final_sound:
             kept = self._move_aside(path)
             self._log({"event": "held", "key": line["key"], "file": path.name, "by": self._final.name, "why": why})
-            held = f"{path.name} ({step_words(line)}) {why}: the merged file holds all of it{kept_words(kept)}"
+            held = f"{path.name} ({line_words(line)}) {why}: the merged file holds all of it{kept_words(kept)}"
             self._report.did.append(held)
         elif any(topic in missing for topic in needed):
             self._lose(path, line, why)
@@ -168,7 +169,7 @@ class FolderRepair:
 
     def _copies(self, path: Path, line: Line) -> Iterator[list[Record]]:
         """What is intact of a step in each file that names it inside, whatever its name, and in the merged file."""
-        step: Step = line["key"], line.get("attempt", 1)
+        step: Step = line["key"], line["attempt"]
         others = (other for other in sorted(self._folder.glob("*.mcap*")) if other not in (path, self._final))
         for file in (path, *others):
             if file.is_file():
@@ -203,49 +204,48 @@ class FolderRepair:
         self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str
     ) -> None:
         begin = {"t_ns": line["t_ns"], "header": self._header.model_dump(mode="json"), "line": self._begin_of(line)}
-        if self._look(path)[1] == (line["key"], line.get("attempt", 1)) if path.is_file() else False:
+        if self._look(path)[1] == (line["key"], line["attempt"]) if path.is_file() else False:
             begin = found.notes.get(BEGIN_NOTE, begin)
         counts = dict(_count(records))
-        done = {name: line[name] for name in ("key", "kind", "result", "t_ns")}
-        notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line.get("attempt", 1), "counts": counts}}
+        done = {name: line[name] for name in ("key", "result", "t_ns")}
+        notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line["attempt"], "counts": counts}}
         kept, counts = replace_damaged(path, self._header, notes, {}, records)
         event: Line = {"event": "repaired", "key": line["key"], "file": path.name, "sha256": file_sha256(path)}
         self._log({**event, "counts": counts, "missing": missing, "aside": kept, "why": why})
         words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
         how = f"without {words}" if words else "whole"
-        self._report.did.append(f"wrote {path.name} ({step_words(line)}) again {how}: {why}{kept_words(kept)}")
+        self._report.did.append(f"wrote {path.name} ({line_words(line)}) again {how}: {why}{kept_words(kept)}")
         if words:
-            self._lost_steps.append(f"messages in {path.name} ({step_words(line)}): {words}")
+            self._lost_steps.append(f"messages in {path.name} ({line_words(line)}): {words}")
 
     def _begin_of(self, line: Line) -> Line:
         """The attempt's `begin` line in the journal; without one, a line made from its `done` line."""
         for begin in self._begins:
             if begin["file"] == line["file"]:
                 return without_time(begin)
-        known = {"event": "begin", "key": line["key"], "kind": line["kind"], "attempt": line.get("attempt", 1)}
-        return {**known, "sheet": line["result"].get("sheet", self._state.sheet), "patch": None, "file": line["file"]}
+        known = {"event": "begin", "key": line["key"], "kind": line["result"]["kind"], "attempt": line["attempt"]}
+        return {**known, "sheet": self._state.sheet, "file": line["file"]}
 
     def _lose(self, path: Path, line: Line, why: str) -> None:
         kept = self._move_aside(path)
         again = "" if self._state.closed is not None else "; it is done again when the session goes on"
         self._log({"event": "lost", "key": line["key"], "file": path.name, "aside": kept, "why": why})
-        self._report.did.append(f"marked {path.name} ({step_words(line)}) as lost: {why}{kept_words(kept)}")
-        self._lost_steps.append(f"{step_words(line)}{again}")
+        self._report.did.append(f"marked {path.name} ({line_words(line)}) as lost: {why}{kept_words(kept)}")
+        self._lost_steps.append(f"{line_words(line)}{again}")
         if self._state.closed is None:
             self._lose_its_press(line)
 
     def _lose_its_press(self, line: Line) -> None:
         """Mark the press as lost too if its sheet was removed: it cannot be photographed again."""
-        stroke = line["result"].get("stroke_id")
-        for other in list(self._state.segments):
-            result = other["result"]
-            if stroke is None or result.get("stroke_id") != stroke or "sheet" not in result:
+        stroke = line["result"].get("press", {}).get("stroke_id")
+        for other in self._state.segments:
+            if not isinstance(other.result, PressResult | DrawResult) or other.result.press.stroke_id != stroke:
                 continue
-            if result["sheet"] != self._state.sheet:
-                why = f"its photograph is lost and its sheet {int(result['sheet']) + 1} is no longer in"
-                event = {"event": "lost", "key": other["key"], "file": other["file"], "aside": "", "why": why}
-                self._log(event)
-                self._report.did.append(f"marked {other['file']} ({step_words(other)}) as lost: {why}")
+            sheet = other.result.press.sheet
+            if sheet is not None and sheet != self._state.sheet:
+                why = f"its photograph is lost and its sheet {sheet + 1} is no longer in"
+                self._log({"event": "lost", "key": other.key, "file": other.file, "aside": "", "why": why})
+                self._report.did.append(f"marked {other.file} ({step_words(other)}) as lost: {why}")
 
     def _move_aside(self, path: Path) -> str:
         if not path.exists():
@@ -268,18 +268,19 @@ class FolderRepair:
         why = "; ".join(found.damage) or ("has changed" if self._final.is_file() else "is missing")
         kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
         merge_session(self._folder, self._state, self._header, "damaged")
-        self._log(closed_line(self._final, self._state.counts()))
+        self._log(line_of(closed(self._final, self._state.counts(), 0)))
         self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{kept_words(kept)}")
 
     def _rewrite_final(self, found: Scan) -> list[str]:
         """Rewrite the merged file, and return descriptions of what was lost."""
         strokes = with_their_stills(found)
-        names = (self._state.opened or {}).get("snapshots", {})
+        names = {} if self._state.opened is None else self._state.opened.snapshots
         files = {a.name: a.data for a in found.attachments} | {name: text.encode() for name, text in names.items()}
-        notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": self._state.repairs}} if self._state.repairs else {}
+        repairs = [line_of(repair) for repair in self._state.repairs]
+        notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
         kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
-        before = Counter[str]((self._state.closed or {}).get("counts", {}))
-        self._log(closed_line(self._final, counts))
+        before = Counter[str]({} if self._state.closed is None else self._state.closed.counts)
+        self._log(line_of(closed(self._final, counts, 0)))
         why = "; ".join(found.damage) or "has changed"
         self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
         return lost_words(strokes, before, counts)
@@ -296,7 +297,7 @@ class FolderRepair:
     def _log(self, line: Line) -> None:
         t_ns = self._now_ns()
         self._journal.append(t_ns, line)
-        fold(self._state, {"t_ns": t_ns, **line})
+        self._state.apply(parse_event({"t_ns": t_ns, **line}))
 
 
 def _needed(counts: Counter[str]) -> tuple[str, ...]:
@@ -304,15 +305,15 @@ def _needed(counts: Counter[str]) -> tuple[str, ...]:
     return MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
 
 
-def _final_is_sound(folder: Path, state: Replay) -> bool:
+def _final_is_sound(folder: Path, state: RunState) -> bool:
     """Whether the merged file is unchanged since the close, and reads back with every CRC."""
     final = folder / f"{folder.name}.mcap"
     if state.closed is None or not final.is_file():
         return False
     try:
-        if "sha256" in state.closed and file_sha256(final) != state.closed["sha256"]:
+        if file_sha256(final) != state.closed.sha256:
             return False
-        return count_messages(final) == state.closed.get("counts", state.counts()) and not file_problems(final)[1]
+        return count_messages(final) == state.closed.counts and not file_problems(final)[1]
     except (SessionError, OSError):
         return False
 
@@ -399,7 +400,7 @@ def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], 
     if evidence.intact:
         for line in evidence.rebuilt:
             journal.append(int(line["t_ns"]), without_time(line))
-            what = step_words(line) if line["event"] != "closed" else "the session"
+            what = line_words(line) if line["event"] != "closed" else "the session"
             shown = str(line.get("file", "the header"))
             report.did.append(f"journalled {line['event']!r} of {what}, which {shown} shows")
     sheet = evidence.state.sheet

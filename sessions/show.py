@@ -1,29 +1,35 @@
 """Contents of one session (steps, strokes per cell of the grid, sheets, files, devices), and lists of sessions.
 
+`renderables` prints them on a terminal.
+
 Only journals and headers are read, no photographs.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
-from pydantic import ValidationError
+from pydantic import BaseModel, Field, ValidationError
+from rich.console import RenderableType
+from rich.table import Column, Table
+from rich.text import Text
 
-from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
+from brushloop.sessions.errors import InputError, SessionError
+from brushloop.sessions.events import Begin, CaptureResult, DipResult, Done, DrawResult, PressResult
 from brushloop.sessions.folders import check_name, recording_of_renamed
-from brushloop.sessions.journal import JOURNAL_NAME, Line
-from brushloop.sessions.journal.events import NONSENSE
-from brushloop.sessions.journal.journal import Replay, is_open, read_header, replay, replay_lines
+from brushloop.sessions.history import remarks_of
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.names import check_folder
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Header, Stroke, Topic
-from brushloop.sessions.remarks import remarks_of
+from brushloop.sessions.records import Header
+from brushloop.sessions.run_state import KILLED, RunState, read_header, replay
 
+Cell = tuple[float | None, float | None]
+"""H in mm and alpha in degrees; None where a recording does not state them."""
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
 
 
@@ -94,12 +100,13 @@ def details(path: Path) -> Details:
         check_name(path)
         return _of_journal(path.resolve())
     recording = Recording(path)
-    found = _of_header(recording.header, "recording")
+    shown = _of_header(recording.header, "recording")
     strokes = list(recording.stroke_records())
-    found.strokes, found.grid = len(strokes), _grid(strokes, recording.header)
-    found.messages = recording.counts
-    found.file, found.size_bytes = recording.path.name, recording.path.stat().st_size
-    return found
+    shown.strokes = len(strokes)
+    shown.grid = _grid(((stroke.depth_mm, stroke.tilt_deg) for stroke in strokes), _planned(recording.header))
+    shown.messages = recording.counts
+    shown.file, shown.size_bytes = recording.path.name, recording.path.stat().st_size
+    return shown
 
 
 def _of_header(header: Header, state: str) -> Details:
@@ -109,112 +116,84 @@ def _of_header(header: Header, state: str) -> Details:
 
 
 def _of_journal(folder: Path) -> Details:
-    """Raise `SessionDamaged` also for well-formed lines that make no sense, such as a grid without numbers."""
-    state, lines = replay_lines(folder / JOURNAL_NAME)
-    try:
-        return _read(folder, state, lines)
-    except (*NONSENSE, ValidationError) as error:
-        raise SessionDamaged(folder / JOURNAL_NAME, f"makes no sense: {in_one_line(error)}") from None
-
-
-def _read(folder: Path, state: Replay, lines: list[Line]) -> Details:
+    state = replay(folder / JOURNAL_NAME)
     header = read_header(folder, state)
-    found = _of_header(header, "open" if state.closed is None else "closed")
-    found.session_id = folder.name
-    found.processes = sum(line["event"] == "process" for line in lines)
-    found.finished = dict(Counter(str(line["kind"]) for line in state.segments))
-    found.void, found.next = _voids(lines, state)
-    found.messages = state.counts()
-    found.segments = [_segment(folder, line) for line in state.segments]
-    used = {sheet for sheet, _cell in state.used_patches} | {state.sheet}
-    found.sheets = [
-        Sheet(n + 1, sorted(cell for sheet, cell in state.used_patches if sheet == n)) for n in sorted(used)
-    ]
-    with_stroke = [line for line in state.segments if Topic.STROKE in line["counts"]]
+    shown = _of_header(header, "open" if state.closed is None else "closed")
+    shown.session_id = folder.name
+    shown.processes = state.processes
+    shown.finished = dict(Counter(str(step.kind) for step in state.segments))
+    shown.void, shown.next = _cut(state)
+    shown.messages = state.counts()
+    shown.segments = [_segment(folder, step) for step in state.segments]
+    patches: dict[int, list[int]] = {state.sheet: []}
+    for sheet, patch in sorted(state.used_patches):
+        patches.setdefault(sheet, []).append(patch)
+    shown.sheets = [Sheet(sheet + 1, used) for sheet, used in sorted(patches.items())]
     bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
-    counted = [line for line in with_stroke if line["result"].get("still") not in bad]
-    found.marked_bad = len(with_stroke) - len(counted)
-    found.strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in counted)
-    found.grid = _grid([_commanded(line, lines) for line in counted], header)
-    found.planned = sum(cell.planned or 0 for cell in found.grid) if _protocol(header) else None
-    found.repairs = [f"{line['event']} {line['file']}: {line.get('why', '')}" for line in state.repairs]
+    kept = [capture for capture in state.results(CaptureResult) if capture.kept]
+    counted = [capture.press.condition for capture in kept if capture.still not in bad]
+    shown.strokes, shown.marked_bad = len(counted), len(kept) - len(counted)
+    planned = _planned(header)
+    shown.grid = _grid(((condition.depth_mm, condition.tilt_deg) for condition in counted), planned)
+    shown.planned = sum(planned.values()) if planned else None
+    shown.repairs = [f"{repair.event} {repair.file}: {repair.why}" for repair in state.repairs]
     final = folder / f"{folder.name}.mcap"
     if state.closed is not None and final.is_file():
-        found.file, found.size_bytes = final.name, final.stat().st_size
-    return found
+        shown.file, shown.size_bytes = final.name, final.stat().st_size
+    return shown
 
 
-def _voids(lines: list[Line], state: Replay) -> tuple[list[str], str]:
+def _cut(state: RunState) -> tuple[list[str], str]:
     """Attempts that were cut, and the step under way when the last process ended."""
-    began: dict[tuple[Any, Any], Line] = {}
-    voids: list[str] = []
-    last = ""
-    for line in lines:
-        ident = (line.get("key"), line.get("attempt"))
-        match line["event"]:
-            case "begin":
-                began[ident] = line
-            case "done":
-                began.pop(ident, None)
-            case "void" if ident in began:
-                cut = began.pop(ident)
-                voids.append(f"{step_words(cut)}, attempt {line['attempt']}: {line.get('why', '')}")
-                last = step_words(cut) if cut["key"] not in state.done else ""
-            case _:
-                pass
-    for line in began.values():
-        voids.append(f"{step_words(line)}, attempt {line['attempt']}: the process ended during it")
-        last = step_words(line) if line["key"] not in state.done else last
-    return voids, last if state.closed is None else ""
+    cut = [*state.cut, *((begin, KILLED) for begin in state.running.values())]
+    lines = [f"{step_words(begin)}, attempt {begin.attempt}: {why}" for begin, why in cut]
+    open_steps = [step_words(begin) for begin, _ in cut if begin.key not in state.done]
+    return lines, open_steps[-1] if open_steps and state.closed is None else ""
 
 
-def step_words(line: Line) -> str:
-    """Name of the step of a `begin` or `done` line for people: `capture H13-a05-r02`."""
-    stroke = {**line.get("params", {}), **line.get("result", {})}.get("stroke_id", "")
-    return f"{line.get('kind', 'step')} {stroke}".strip().replace("_", " ")
+def step_words(step: Begin | Done) -> str:
+    """Name of a step for people: `capture H13-a05-r02`."""
+    press = None
+    match step:
+        case Begin(press=press):
+            pass
+        case Done(result=PressResult(press=press) | DrawResult(press=press) | CaptureResult(press=press)):
+            pass
+        case Done(result=DipResult(skipped=press)):
+            pass
+        case _:
+            pass
+    return f"{step.kind} {'' if press is None else press.stroke_id}".strip().replace("_", " ")
 
 
-def _segment(folder: Path, line: Line) -> Segment:
-    path = folder / str(line["file"])
+def _segment(folder: Path, step: Done) -> Segment:
+    path = folder / step.file
     size = path.stat().st_size if path.is_file() else None
-    return Segment(path.name, step_words(line), size, line["counts"])
+    return Segment(path.name, step_words(step), size, step.counts)
 
 
-def _commanded(line: Line, lines: list[Line]) -> Stroke:
-    """Stroke as the journal describes it: height and tilt from its parameters or its result."""
-    params: Line = {}
-    for begin in lines:
-        if begin["event"] == "begin" and begin["key"] == line["key"]:
-            params = begin.get("params", {})
-    values = {**params, **line["result"]}
-    height, tilt = (values.get(name) for name in ("depth_mm", "tilt_deg"))
-    return Stroke(stroke_id=str(values.get("stroke_id", "")), kind="press", still=0, depth_mm=height, tilt_deg=tilt)
+class _GridPlan(BaseModel):
+    """Protocol of a grid session; `few-strokes` presses only part of the grid that it names."""
+
+    kind: Literal["grid"]
+    depths_mm: tuple[float, ...]
+    tilts_deg: tuple[float, ...]
+    repeats: Annotated[int, Field(ge=0)]
 
 
-def _protocol(header: Header) -> dict[str, Any]:
-    """Protocol of a grid session; empty for any other recording."""
+def _planned(header: Header) -> dict[Cell, int]:
+    """Strokes that a grid plans for each condition; empty for any other recording."""
     try:
-        found: Any = json.loads(header.protocol)
-    except ValueError:
+        plan = _GridPlan.model_validate_json(header.protocol)
+    except ValidationError:
         return {}
-    protocol: dict[str, Any] = dict(found) if isinstance(found, dict) else {}  # pyright: ignore[reportUnknownArgumentType]
-    # `few-strokes`, and `adaptive` of earlier versions, press only part of the grid that they name.
-    is_grid = protocol.get("kind", "grid") == "grid" and protocol.keys() >= {"depths_mm", "tilts_deg", "repeats"}
-    return protocol if is_grid else {}
+    return {(depth, tilt): plan.repeats for depth in plan.depths_mm for tilt in plan.tilts_deg}
 
 
-def _grid(strokes: list[Stroke], header: Header) -> list[GridCell]:
-    have = Counter((stroke.depth_mm, stroke.tilt_deg) for stroke in strokes)
-    protocol = _protocol(header)
-    planned = {
-        (float(h), float(a)): int(protocol["repeats"])
-        for h in protocol.get("depths_mm", ())
-        for a in protocol["tilts_deg"]
-    }
+def _grid(pressed: Iterable[Cell], planned: dict[Cell, int]) -> list[GridCell]:
+    have = Counter(pressed)
     cells = sorted({*have, *planned}, key=lambda cell: (cell[0] is None, cell[0] or 0.0, cell[1] or 0.0))
-    return [
-        GridCell(h, a, have[h, a], planned.get((h, a)) if h is not None and a is not None else None) for h, a in cells
-    ]
+    return [GridCell(*cell, have[cell], planned.get(cell)) for cell in cells]
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,9 +223,8 @@ def summaries(root: Path) -> Iterator[Summary]:
 def _summary(folder: Path) -> Summary | None:
     check_folder(folder)
     collected = (folder / JOURNAL_NAME).is_file()
-    if collected and is_open(state := replay(folder / JOURNAL_NAME)):
-        strokes = sum(line["counts"].get(Topic.STROKE, 0) for line in state.segments)
-        return Summary(folder.name, "open", "", strokes, "")
+    if collected and (state := replay(folder / JOURNAL_NAME)).is_open:
+        return Summary(folder.name, "open", "", state.strokes(), "")
     merged = folder / f"{folder.name}.mcap"
     renamed = None if merged.is_file() else recording_of_renamed(folder)
     if renamed is None and not merged.is_file():
@@ -256,3 +234,92 @@ def _summary(folder: Path) -> Summary | None:
     if renamed is not None:
         return Summary(folder.name, "renamed", recording.header.source, recording.strokes(), renamed.name)
     return Summary(folder.name, state_name, recording.header.source, recording.strokes(), merged.name)
+
+
+def renderables(details: Details, *, files: bool = False) -> Iterator[RenderableType]:
+    """Parts to print, top to bottom; `files` adds a row for each step's file, which may be hundreds of lines."""
+    yield _facts(details, files=files)
+    if details.grid:
+        yield _grid_table(details)
+    if files and details.segments:
+        yield _segment_table(details)
+    for title, lines in (("Cut attempts", details.void), ("Repaired", details.repairs)):
+        if lines:
+            yield Text(title, "bold")
+            yield from (f"  {line}" for line in lines)
+
+
+def _facts(details: Details, *, files: bool) -> Table:
+    table = Table(show_header=False, box=None)
+    table.add_row("session", Text.assemble((details.session_id, "bold"), f", {details.state}, {details.source}"))
+    of = f" of {details.planned} planned" if details.planned else ""
+    bad = f", and {details.marked_bad} marked bad" if details.marked_bad else ""
+    table.add_row("strokes", f"{details.strokes}{of}{bad}")
+    steps = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in details.finished.items())
+    if details.finished or details.void:
+        table.add_row("steps", f"finished: {steps or 'none'}; cut: {len(details.void)}")
+    if details.next:
+        table.add_row("next", f"{details.next} (under way when the last process ended)")
+    for sheet in details.sheets:
+        table.add_row(f"sheet {sheet.sheet}", f"{len(sheet.used_patches)} patches used: {ranges(sheet)}")
+    for name, value in details.devices.items():
+        table.add_row(name.replace("_", " "), value)
+    processes = f", {details.processes} processes" if details.processes else ""
+    table.add_row("recorded by", f"{details.software}, schema {details.schema_version}{processes}")
+    messages = ", ".join(f"{count} {topic}" for topic, count in sorted(details.messages.items()))
+    table.add_row("messages", messages or "none")
+    if details.segments:
+        table.add_row("files", f"{_files(details)}{'' if files else ' (--files lists them)'}")
+    if details.file:
+        table.add_row("recording", f"{details.file}, {_size(details.size_bytes)}")
+    return table
+
+
+def _grid_table(details: Details) -> Table:
+    heights = sorted({cell.depth_mm for cell in details.grid}, key=lambda h: (h is None, h or 0.0))
+    tilts = sorted({cell.tilt_deg for cell in details.grid}, key=lambda a: (a is None, a or 0.0))
+    counts = {(c.depth_mm, c.tilt_deg): (c.strokes, c.planned) for c in details.grid}
+    table = Table("H \\ alpha", *(_number(tilt, "°") for tilt in tilts), title="Strokes per cell of the grid")
+    for height in heights:
+        row = [counts.get((height, tilt)) for tilt in tilts]
+        table.add_row(_number(height, " mm"), *("" if c is None else _count(*c) for c in row))
+    return table
+
+
+def _segment_table(details: Details) -> Table:
+    file = Column("file", overflow="fold")
+    table = Table(file, "step", "size", "messages", title=f"{len(details.segments)} finished steps")
+    for segment in details.segments:
+        messages = ", ".join(f"{count} {topic}" for topic, count in segment.messages.items())
+        table.add_row(segment.file, segment.step, _size(segment.size_bytes), messages)
+    return table
+
+
+def _files(details: Details) -> str:
+    """Text such as `2 of finished steps, 0.01 MB, 1 missing`."""
+    sizes = [segment.size_bytes for segment in details.segments]
+    missing = f", {sizes.count(None)} missing" if None in sizes else ""
+    return f"{len(sizes)} of finished steps, {_size(sum(size or 0 for size in sizes))}{missing}"
+
+
+def ranges(sheet: Sheet) -> str:
+    """Patches as `0-3, 7`, with consecutive numbers joined."""
+    parts: list[list[int]] = []
+    for patch in sheet.used_patches:
+        if parts and patch == parts[-1][-1] + 1:
+            parts[-1].append(patch)
+        else:
+            parts.append([patch])
+    return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else str(p[0]) for p in parts) or "none"
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "not given" if value is None else f"{value:g}{unit}"
+
+
+def _count(strokes: int, planned: int | None) -> str:
+    return str(strokes) if planned is None else f"{strokes}/{planned}"
+
+
+def _size(size_bytes: int | None) -> str:
+    return "missing" if size_bytes is None else f"{size_bytes / 1e6:.2f} MB"

@@ -5,17 +5,32 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
 from brushloop.sessions.disk import check_digest, check_room, file_sha256, free_bytes, fsync_folder, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
-from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line
-from brushloop.sessions.journal.journal import Replay, read_header, replay
+from brushloop.sessions.events import (
+    Begin,
+    Clock,
+    Closed,
+    Done,
+    Ended,
+    Event,
+    FreshSheet,
+    Open,
+    Press,
+    Process,
+    StepKind,
+    StepResult,
+    Void,
+    line_of,
+)
+from brushloop.sessions.journal import JOURNAL_NAME, Journal
 from brushloop.sessions.names import SEGMENT_NAME, check_folder
 from brushloop.sessions.recording import merge_session
-from brushloop.sessions.records import Header, Recorded
+from brushloop.sessions.records import Header
+from brushloop.sessions.run_state import RunState, read_header, replay
 from brushloop.sessions.step_file import QUEUE_LIMIT, SegmentWriter
 
 STEP_BYTES = 64 * 1024 * 1024
@@ -28,13 +43,10 @@ Snapshots = dict[str, str]
 class Attempt:
     """One attempt at a step, with its file open."""
 
-    key: str
-    kind: str
+    begin: Begin
     serial: int
     """Number of the attempt, unique in the session."""
-    attempt: int
     writer: SegmentWriter
-    patch: int | None
 
 
 class SessionStore:
@@ -56,16 +68,15 @@ class SessionStore:
         self._lock = lock(folder)
         self._journal: Journal | None = None
         try:
-            self.state = Replay() if header is not None else replay(folder / JOURNAL_NAME)
+            self.state = RunState() if header is not None else replay(folder / JOURNAL_NAME)
             if self.state.closed is not None:
                 raise InputError(folder, "is closed; a finished recording is never changed")
             self.header = header or read_header(folder, self.state)
             self._journal = Journal(folder / JOURNAL_NAME, now_ns(), self.header.session_id)
             if header is not None:
-                self._log(open_line(header, snapshots or {}))
-                self.state = replay(folder / JOURNAL_NAME)
+                self._log(Open(t_ns=now_ns(), header=header, snapshots=snapshots or {}))
             self._check_serials()
-            self._log({"event": "process"})
+            self._log(Process(t_ns=now_ns()))
         except SessionDamaged as error:
             error.add_note(f"Try `brushloop sessions repair {folder}`.")
             self.release()
@@ -96,73 +107,79 @@ class SessionStore:
         """Raise `DiskFull` unless the disk has that much room. `begin` checks this before it journals anything."""
         check_room(self.folder, need_bytes)
 
-    def begin(self, key: str, kind: str, *, patch: int | None, notes: Line) -> Attempt:
+    def begin(
+        self,
+        key: str,
+        kind: StepKind,
+        *,
+        patch: int | None = None,
+        more_patches: tuple[int, ...] = (),
+        press: Press | None = None,
+    ) -> Attempt:
         """Journal that an attempt starts, then open its file.
 
-        Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold an unrecorded one, before anything
-        is written.
+        `patch` and `more_patches` are those that it marks. Raises `DiskFull`, or `SessionError` for a press on a sheet
+        that may hold an unrecorded one, before anything is written.
         """
         self.check_room()
-        if patch is not None and self.state.sheet in self.state.doubtful_sheets:
-            sheet = self.state.sheet + 1
+        state = self.state
+        if patch is not None and state.sheet in state.doubtful_sheets:
             raise SessionError(
                 self.folder,
-                f"the record of a press on sheet {sheet} was lost, so any of its patches may already hold ink. "
-                f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}",
+                f"the record of a press on sheet {state.sheet + 1} was lost, so any of its patches may already hold "
+                f"ink. Put a fresh sheet in, then run the same command with --sheet {state.sheet + 2}",
             )
-        attempt = self.state.attempts.get(key, 0) + 1
-        serial = self.state.begun
-        name = f"{serial:04d}-{kind}-{key[:8]}.mcap"
-        line: Line = {
-            "event": "begin",
-            "key": key,
-            "kind": kind,
-            "attempt": attempt,
-            "sheet": self.state.sheet,
-            "patch": patch,
-            "file": name,
-            **notes,
-        }
-        t_ns = self._log(line)
-        self.state.attempts[key] = attempt
-        self.state.begun += 1
-        if patch is not None:
-            self.state.used_patches |= {(self.state.sheet, one) for one in (patch, *notes.get("more_patches", ()))}
-        begun = {"t_ns": t_ns, "header": self.header.model_dump(mode="json"), "line": line}
-        writer = SegmentWriter(self.folder / name, self.header, QUEUE_LIMIT, begun)
-        return Attempt(key, kind, serial, attempt, writer, patch)
+        serial = state.begun
+        begin = Begin(
+            t_ns=self._now_ns(),
+            key=key,
+            kind=kind,
+            attempt=state.attempts.get(key, 0) + 1,
+            sheet=state.sheet,
+            patch=patch,
+            more_patches=more_patches,
+            press=press,
+            file=f"{serial:04d}-{kind}-{key[:8]}.mcap",
+        )
+        self._log(begin)
+        begun = {"t_ns": begin.t_ns, "header": self.header.model_dump(mode="json"), "line": line_of(begin)}
+        return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, QUEUE_LIMIT, begun))
 
-    def done(self, attempt: Attempt, result: dict[str, Any]) -> None:
+    def done(self, attempt: Attempt, result: StepResult) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""
-        t_ns = self._now_ns()
-        identity = {"key": attempt.key, "kind": attempt.kind, "attempt": attempt.attempt}
-        file = attempt.writer.final.name
-        recorded = attempt.writer.finish({"t_ns": t_ns, **identity, "result": result})
-        line = done_line(identity, file, recorded, result)
-        self._log(line, t_ns)
-        self.state.done[attempt.key] = line
-        self.state.segments.append(line)
+        begin, t_ns = attempt.begin, self._now_ns()
+        identity = {"t_ns": t_ns, "key": begin.key, "attempt": begin.attempt}
+        noted = {**identity, "result": result.model_dump(mode="json", exclude_none=True)}
+        recorded = attempt.writer.finish(noted)
+        done = Done(
+            t_ns=t_ns,
+            key=begin.key,
+            attempt=begin.attempt,
+            file=begin.file,
+            sha256=recorded.sha256,
+            counts=recorded.counts,
+            result=result,
+        )
+        self._log(done)
 
     def void(self, attempt: Attempt, why: str) -> None:
         """Journal that an attempt was cut; its part file is kept as evidence, and its patch stays used."""
         attempt.writer.abandon()
-        self._log({"event": "void", "key": attempt.key, "attempt": attempt.attempt, "why": why})
-        self.state.voids += 1
+        self._log(Void(t_ns=self._now_ns(), key=attempt.begin.key, attempt=attempt.begin.attempt, why=why))
 
     def fresh_sheet(self) -> None:
         """Journal that the operator put a fresh sheet in: its patches are all free."""
-        self.state.sheet += 1
-        self._log({"event": "sheet", "sheet": self.state.sheet})
+        self._log(FreshSheet(t_ns=self._now_ns(), sheet=self.state.sheet + 1))
 
     def ended(self, why: str) -> None:
         """Journal how a run ended before its time: it is shown to whoever resumes the session."""
-        self._log({"event": "ended", "why": why})
+        self._log(Ended(t_ns=self._now_ns(), why=why))
 
     def verify(self) -> None:
         """Raise `SessionDamaged` naming the first finished step whose file is missing or has changed."""
         try:
-            for line in self.state.segments:
-                check_digest(self.folder / str(line["file"]), str(line["sha256"]))
+            for step in self.state.segments:
+                check_digest(self.folder / step.file, step.sha256)
         except SessionDamaged as error:
             error.add_note(f"Try `brushloop sessions repair {self.folder}`.")
             raise
@@ -173,9 +190,9 @@ class SessionStore:
         Raises `SessionDamaged`, or `DiskFull` before anything is written; the session then stays open.
         """
         self.verify()
-        self.check_room(sum((self.folder / str(line["file"])).stat().st_size for line in self.state.segments))
+        self.check_room(sum((self.folder / file).stat().st_size for file in self.state.files))
         final = merge_session(self.folder, self.state, self.header)
-        self._log(closed_line(final, self.state.counts()))
+        self._log(closed(final, self.state.counts(), self._now_ns()))
         return final
 
     def release(self) -> None:
@@ -187,14 +204,15 @@ class SessionStore:
             self._journal = None
             self._lock.release()
 
-    def _log(self, line: Line, t_ns: int | None = None) -> int:
+    def _log(self, event: Event) -> None:
+        if event.t_ns < self.state.last_ns:
+            self._append(Clock(t_ns=event.t_ns, back_s=(self.state.last_ns - event.t_ns) / 1e9))
+        self._append(event)
+        self.state.apply(event)
+
+    def _append(self, event: Event) -> None:
         assert self._journal is not None, "the store was released"
-        t_ns = self._now_ns() if t_ns is None else t_ns
-        if t_ns < self.state.last_ns:
-            self._journal.append(t_ns, {"event": "clock", "back_s": (self.state.last_ns - t_ns) / 1e9})
-        self.state.last_ns = t_ns
-        self._journal.append(t_ns, line)
-        return t_ns
+        self._journal.append(event.t_ns, line_of(event))
 
     def _check_serials(self) -> None:
         """Raise `SessionDamaged` if the journal lost its last lines: their numbers and patches would be used again."""
@@ -217,17 +235,6 @@ def lock(folder: Path) -> FileLock:
     return held
 
 
-def open_line(header: Header, snapshots: Snapshots) -> Line:
-    """The journal's first event."""
-    return {"event": "open", "header": header.model_dump(mode="json"), "snapshots": snapshots}
-
-
-def done_line(identity: Line, file: str, recorded: Recorded, result: Line) -> Line:
-    """The event of a finished step."""
-    counts = dict(recorded.counts)
-    return {"event": "done", **identity, "file": file, "sha256": recorded.sha256, "counts": counts, "result": result}
-
-
-def closed_line(final: Path, counts: dict[str, int]) -> Line:
+def closed(final: Path, counts: dict[str, int], t_ns: int) -> Closed:
     """The event of a closed session."""
-    return {"event": "closed", "file": final.name, "sha256": file_sha256(final), "counts": counts}
+    return Closed(t_ns=t_ns, file=final.name, sha256=file_sha256(final), counts=counts)

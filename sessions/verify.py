@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import check_digest, holds
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
-from brushloop.sessions.evidence import Evidence, gather
+from brushloop.sessions.events import Lost, Repaired
+from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Line
 from brushloop.sessions.mcap_file import Scan, scan
@@ -20,7 +21,7 @@ from brushloop.sessions.names import SEGMENT_NAME
 from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
-from brushloop.sessions.show import details, step_words
+from brushloop.sessions.show import details
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +97,9 @@ def _verify_folder(folder: Path, progress: Progress) -> Verdict:
         return verdict
     _journal(verdict, evidence)
     state = evidence.state
-    for line in counted(state.segments, "files of steps read", len(state.segments), progress):
-        verdict.findings += _segment(verdict, evidence, line)
-    for name, text in (state.opened or {}).get("snapshots", {}).items():
+    for step in counted(state.segments, "files of steps read", len(state.segments), progress):
+        verdict.findings += _segment(verdict, evidence, full_line(step))
+    for name, text in ({} if state.opened is None else state.opened.snapshots).items():
         path = folder / str(name)
         if not path.is_file():
             verdict.findings.append(Finding(str(name), "is missing, though the journal holds its text"))
@@ -114,8 +115,8 @@ def _verify_folder(folder: Path, progress: Progress) -> Verdict:
         verdict.findings += [Finding(final.name, problem) for problem in _foreign(found, evidence) or problems]
     if verdict.sound:
         _shown(verdict, folder)
-    _count(verdict, Counter((state.closed or {}).get("counts", state.counts())))
-    verdict.notes += [f"{line['file']}: {_repair_words(line)}" for line in state.repairs]
+    _count(verdict, Counter(state.counts() if state.closed is None else state.closed.counts))
+    verdict.notes += [f"{repair.file}: {_repair_words(repair)}" for repair in state.repairs]
     kept = [p for p in folder.iterdir() if ".damaged-" in p.name or ".superseded-" in p.name]
     if kept:
         verdict.notes.append(f"{len(kept)} damaged or replaced files are kept beside the session's own")
@@ -126,10 +127,10 @@ def _count(verdict: Verdict, counts: Counter[str]) -> None:
     verdict.strokes, verdict.messages = counts[Topic.STROKE], counts.total()
 
 
-def _repair_words(line: Line) -> str:
-    if line["event"] == "lost":
-        return f"was lost: {line.get('why', '')}"
-    missing = ", ".join(f"{count} of {topic}" for topic, count in line.get("missing", {}).items())
+def _repair_words(repair: Repaired | Lost) -> str:
+    if isinstance(repair, Lost):
+        return f"was lost: {repair.why}"
+    missing = ", ".join(f"{count} of {topic}" for topic, count in repair.missing.items())
     return f"was repaired; missing: {missing or 'nothing'}"
 
 
@@ -158,7 +159,7 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
             case "begin":
                 verdict.findings.append(Finding(JOURNAL_NAME, f"does not mention {line['file']}"))
             case "done":
-                verdict.notes.append(f"{line['file']}: {step_words(line)} is finished, but not journalled as done")
+                verdict.notes.append(f"{line['file']}: {line_words(line)} is finished, but not journalled as done")
             case "closed":
                 verdict.notes.append(f"{line['file']} is complete, but not journalled as closed")
             case _:
@@ -172,8 +173,8 @@ def _journal(verdict: Verdict, evidence: Evidence) -> None:
 
 
 def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:
-    path, step = evidence.folder / str(line["file"]), step_words(line)
-    if "held" in line:
+    path, step = evidence.folder / str(line["file"]), line_words(line)
+    if line["file"] in evidence.state.held:
         return []
     verdict.files += 1
     try:
@@ -202,21 +203,19 @@ def _foreign(found: Scan, evidence: Evidence) -> list[str]:
 
 def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progress) -> None:
     state = evidence.state
-    closed = state.closed or {}
+    closed = state.closed
+    assert closed is not None
     path = folder / f"{folder.name}.mcap"
     verdict.files += 1
     try:
-        if "sha256" in closed:
-            check_digest(path, str(closed["sha256"]))
-        elif not path.is_file():
-            raise SessionDamaged(path, "is missing, though the journal says it was closed")
+        check_digest(path, closed.sha256)
     except SessionDamaged as error:
         verdict.findings.append(Finding(path.name, error.what))
     if not path.is_file():
         return
     found, problems = file_problems(path, progress)
     problems = _foreign(found, evidence) or problems
-    expected = closed.get("counts", state.counts())
+    expected = closed.counts
     if dict(found.counts) != expected and not problems:
         problems.append(f"holds {dict(found.counts)}, but the journal says {expected}")
     verdict.findings += [Finding(path.name, problem) for problem in problems]

@@ -20,8 +20,8 @@ from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.report.tables import table_1
 from brushloop.sessions.journal import read_lines
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.run_state import replay
 from tests.waiting import wait_until
 
 SMALL = """
@@ -61,7 +61,7 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     session, again = sorted((out / "sessions").iterdir())
     for folder in (session, again):
         begun = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
-        cells = [(line["sheet"], line["patch"]) for line in begun if line["patch"] is not None]
+        cells = [(line["sheet"], line["patch"]) for line in begun if "patch" in line]
         assert len(cells) == len(set(cells)), "no cell is ever pressed twice"
     strokes = [capture.stroke for capture in Recording(session).captures()]
     assert len(strokes) == 4
@@ -79,11 +79,8 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
             if channel.topic == "/camera/still":
                 data = np.frombuffer(CompressedImage.FromString(message.data).data, np.uint8)
                 assert cv2.imdecode(data, cv2.IMREAD_GRAYSCALE).shape == (1536, 2048)
-    assert counts == Counter(state.closed["counts"])
-    journalled: Counter[str] = Counter()
-    for line in state.segments:
-        journalled.update(line["counts"])
-    assert counts == journalled
+    assert counts == Counter(state.closed.counts)
+    assert counts == Counter(state.counts())
 
     printed = re.search(r"Report: (\S+report\.html)\nMCAP:   (\S+\.mcap)", ran.stdout)
     assert printed is not None

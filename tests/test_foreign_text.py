@@ -13,6 +13,7 @@ from random import Random
 import pytest
 
 import brushloop.__main__
+from brushloop.sessions.events import StepKind
 from brushloop.sessions.store import SessionStore
 from brushloop.sessions.terminal import plain
 from tests.sessions.conftest import Make
@@ -42,8 +43,8 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
         header = HEADER.model_copy(update={"session_id": name, "protocol": HOSTILE})
         store = SessionStore.create(folder / name, header, make.snapshots, make.clock())
         make.perform(store, f"key{NAME}", patch=1)
-        store.void(store.begin("cut", f"press{NAME}", patch=2, notes={"params": {"stroke_id": HOSTILE}}), HOSTILE)
-        store.begin("begun", f"press{NAME}", patch=3, notes={"params": {"stroke_id": HOSTILE}}).writer.abandon()
+        store.void(store.begin(f"cut{NAME}", StepKind.PRESS, patch=2, press=make.press(HOSTILE)), HOSTILE)
+        store.begin(f"begun{NAME}", StepKind.PRESS, patch=3, press=make.press(HOSTILE)).writer.abandon()
         if name == "closed":
             store.close()
         store.release()
@@ -59,9 +60,8 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make.take(
         store,
         "a",
-        "capture",
         [still, make.stroke(0, kind="drag", px_per_mm=(1.0, 1.0))],
-        {"stroke_id": "a", "still": 0},
+        make.captured("a", 0),
     )
     store.close()
     store.release()

@@ -28,9 +28,9 @@ from brushloop.calibrate.session import calibration_of
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Source, Stroke
+from brushloop.sessions.run_state import replay
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3
@@ -126,7 +126,7 @@ def _check_journal(recording: Recording, digest: str) -> None:
     if not journal.is_file():
         return
     closed = replay(journal).closed
-    if closed is not None and closed.get("sha256", digest) != digest:
+    if closed is not None and closed.sha256 != digest:
         raise SessionDamaged(recording.path, "is not the file that the session was closed with: its SHA-256 differs")
 
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from brushloop.collect.engine.dry_run import lifted
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig, overrides
 from brushloop.collect.rig.devices import Rig
 from brushloop.drivers.clock import Clock
@@ -27,8 +26,8 @@ from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unw
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.folders import next_session_id, open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.records import Header, Source
+from brushloop.sessions.run_state import replay
 from brushloop.sessions.store import SessionStore, Snapshots
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
@@ -219,9 +218,7 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
         return
     if sheet != now + 1:
         raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in")
-    results = [(line["kind"], line["result"]) for line in store.state.segments]
-    pressed = {r["stroke_id"] for kind, r in results if kind in (StepKind.PRESS, StepKind.DRAW)}
-    waiting = sorted(pressed - {r["stroke_id"] for kind, r in results if kind == StepKind.CAPTURE})
+    waiting = sorted(press.stroke_id for press in store.state.not_photographed())
     if waiting:
         raise ConfigError(
             "--sheet",

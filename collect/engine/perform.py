@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any
 
 from brushloop.collect.engine.force_guard import ForceGuard
 from brushloop.collect.engine.live import LiveView
@@ -14,9 +13,22 @@ from brushloop.collect.engine.steps.context import RunContext, StepContext, unin
 from brushloop.collect.engine.telemetry import Telemetry
 from brushloop.collect.errors import PosesLate, describe
 from brushloop.collect.operator import OperatorRequest
-from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.protocols.steps import (
+    MARKING,
+    BoardStep,
+    CaptureStep,
+    DipStep,
+    DrawStep,
+    PressStep,
+    ReviewStep,
+    SelfCheckStep,
+    Step,
+    TouchStep,
+    ZeroTouchStep,
+)
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.errors import ArmMoved
+from brushloop.sessions.events import DipResult, Press, StepKind, StepResult
 from brushloop.sessions.records import StepEvent
 
 HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
@@ -37,7 +49,7 @@ class Performer:
         self._run.memory.left_ink_ns = None
         await self._run.procedures.retreat()
 
-    async def perform(self, step: Step) -> Result:
+    async def perform(self, step: Step) -> StepResult:
         """Do the step once. If it is cut short, the attempt is void and its patch stays used.
 
         Raises `SheetFull` before anything is begun.
@@ -48,23 +60,26 @@ class Performer:
         used = run.used_patches()
         marks = step.kind in MARKING
         # Checked before the dip too, so that a brush full of ink does not wait for a fresh sheet.
-        free = run.sheet.free(used, store.state.sheet + 1) if marks or step.kind == StepKind.DIP else None
+        free = run.sheet.free(used, store.state.sheet + 1) if marks or isinstance(step, DipStep) else None
         patch = free if marks else None
-        more = partners(run.sheet, patch, used) if patch is not None and step.kind == StepKind.SELF_CHECK else ()
-        notes: dict[str, Any] = {"params": dict(step.params)}
-        if more:
-            notes["more_patches"] = [other.index for other in more]
-        attempt = store.begin(step.key, step.kind, patch=patch.index if patch else None, notes=notes)
+        more = partners(run.sheet, patch, used) if patch is not None and isinstance(step, SelfCheckStep) else ()
+        index = None if patch is None else patch.index
+        attempt = store.begin(
+            step.key,
+            step.kind,
+            patch=index,
+            more_patches=tuple(other.index for other in more),
+            press=_press_of(step),
+        )
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
-        place = None if patch is None else (store.state.sheet, patch.index)
-        progress.begun(step, place)
+        progress.begun(step)
         guard = ForceGuard(rig, recorder.force)
         event = StepEvent(
             key=step.key,
             kind=step.kind,
             index=step.index,
-            attempt=attempt.attempt,
+            attempt=attempt.begin.attempt,
             phase="begin",
             params=step.params,
         )
@@ -74,7 +89,7 @@ class Performer:
             guard.listen()
             try:
                 with guard.also(self._telemetry.force) if self._telemetry is not None else contextlib.nullcontext():
-                    result = await self._do(StepContext(run, step, patch, more, attempt, recorder, guard))
+                    result = await self._do(step, StepContext(run, patch, more, attempt, recorder, guard))
                 if step.kind in HEIGHTS:
                     with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
                         await rig.robot.confirm()
@@ -88,42 +103,44 @@ class Performer:
             recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
             run.memory.left_ink_ns = None
-            progress.cut(place)
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
+            progress.cut()
             raise
-        if step.kind == StepKind.DIP and run.requests.take(OperatorRequest.SKIP):
-            result = {**result, **progress.skipped(step)}
-            progress.log(f"{result['stroke_id']}: is left out, as the operator requested")
+        if isinstance(result, DipResult) and run.requests.take(OperatorRequest.SKIP):
+            left_out = progress.planned(step).press()
+            result = result.model_copy(update={"skipped": left_out})
+            progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)
         progress.finished(step, result)
         return result
 
-    async def _do(self, context: StepContext) -> Result:
-        match context.step.kind:
-            case StepKind.ZERO_TOUCH:
-                return await touch.zero_touch(context)
-            case StepKind.TOUCH:
-                return await touch.touch(context)
-            case StepKind.SELF_CHECK:
+    async def _do(self, step: Step, context: StepContext) -> StepResult:
+        match step:
+            case ZeroTouchStep():
+                return await touch.zero_touch(context, step)
+            case TouchStep():
+                return await touch.touch(context, step)
+            case SelfCheckStep():
                 return await touch.check_rig(context)
-            case StepKind.BOARD:
+            case BoardStep():
                 return await capture.board(context)
-            case StepKind.DIP:
+            case DipStep():
                 return await dip.dip(context)
-            case StepKind.PRESS:
-                return await press.press(context)
-            case StepKind.DRAW:
-                return await press.draw(context)
-            case StepKind.CAPTURE:
-                return await capture.capture(context)
-            case StepKind.REVIEW:
-                return await retake.review(context)
+            case PressStep():
+                return await press.press(context, step)
+            case DrawStep():
+                return await press.draw(context, step)
+            case CaptureStep():
+                return await capture.capture(context, step)
+            case ReviewStep():
+                return await retake.review(context.run)
+
+
+def _press_of(step: Step) -> Press | None:
+    return step.press if isinstance(step, PressStep | DrawStep | CaptureStep) else None
 
 
 def _in_words(step: Step) -> str:
-    match step.kind:
-        case StepKind.PRESS | StepKind.DRAW | StepKind.CAPTURE:
-            return f"{step.kind} {step.params['stroke_id']}"
-        case _:
-            return step.kind.replace("_", " ")
+    made = _press_of(step)
+    return step.kind.replace("_", " ") if made is None else f"{step.kind} {made.stroke_id}"

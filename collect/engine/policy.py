@@ -15,7 +15,7 @@ from brushloop.collect.errors import (
     describe,
 )
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import Step
 from brushloop.drivers.errors import (
     ArmMoved,
     DeviceError,
@@ -28,6 +28,7 @@ from brushloop.drivers.errors import (
     Stuck,
 )
 from brushloop.drivers.ink.port import InkRefused
+from brushloop.sessions.events import StepKind
 
 MAX_FAILURES = 3
 """Failures of one step after which a person decides: so many are no coincidence."""

@@ -12,13 +12,15 @@ from pathlib import Path
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.last_capture import LastCapture
 from brushloop.collect.engine.snapshot import CellCount, Snapshot, in_set_up
-from brushloop.collect.engine.tally import Place, Tally
+from brushloop.collect.engine.tally import Tally, tally_of
 from brushloop.collect.operator import Prompt
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.plan import AGAIN, Planned, with_review
-from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.protocols.steps import MARKING, Step
 from brushloop.collect.rig.paper import Layout, Sheet
 from brushloop.drivers.clock import Clock
+from brushloop.sessions.events import ReviewResult, StepKind, StepResult
+from brushloop.sessions.run_state import RunState
 from brushloop.sessions.store import SessionStore
 
 LOG_LINES = 200
@@ -37,6 +39,8 @@ class Progress:
         self._by_index = {p.index: p for p in self._plan}
         self._first_free_index = 1 + max(self._by_index, default=0)
         self._tally = Tally()
+        self._state = RunState()
+        self._sheet: Sheet | None = None
         self._done_at_start = 0
         self._started_ns = clock.now_ns()
         self._first_stroke_ns: int | None = None
@@ -45,16 +49,14 @@ class Progress:
         self._session_id = "" if resumes is None else resumes.name
         self._source = ""
         self._folder = "" if resumes is None else str(resumes)
-        self._sheet = 0
         self._step = ""
         self._index: int | None = None
-        self._voids = 0
         self._ink_level: float | None = None
         self._error = ""
         self._logged = 0
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
         self._last: LastCapture | None = None
-        self.found: dict[StepKind, Result] = {}
+        self.found: dict[StepKind, StepResult] = {}
         """Results of the set-up steps of this process."""
         self.set_up: StepKind | None = None
         """Set-up step in progress."""
@@ -65,13 +67,13 @@ class Progress:
         """Begin with what a new or resumed session holds. `sheet` is how the paper is divided into patches."""
         with self._lock:
             self._folder = str(store.folder)
-            self._sheet = store.state.sheet
+            self._sheet = sheet
+            self._state = store.state
             self._session_id = store.header.session_id
             self._source = store.header.source
-            self._voids = store.state.voids
-            self._tally.opened(store.state, sheet.columns, sheet.rows)
-            for line in store.state.segments:
-                self._count(line["kind"], line["result"])
+            self._tally = tally_of(store.state)
+            for review in store.state.results(ReviewResult):
+                self._reviewed(review)
             self._done_at_start = self._tally.done.total()
         verb = f"resumed with {self._done_at_start} strokes" if self._done_at_start else "session"
         self.log(f"{verb}: {store.folder}")
@@ -89,20 +91,22 @@ class Progress:
         yield
         self.doing(before)
 
-    def begun(self, step: Step, place: Place | None) -> None:
-        """Note that a step begins; `place` is the sheet and patch that it marks."""
+    def begun(self, step: Step) -> None:
+        """Note that a step begins."""
         with self._lock:
-            self._tally.begun(step, place)
+            self._tally = tally_of(self._state)
             self.set_up_over = self.set_up_over or not in_set_up(step)
             if in_set_up(step):
                 self.set_up = step.kind
             elif step.kind in (StepKind.DIP, StepKind.CAPTURE) or step.kind in MARKING:
                 self._index = step.index
 
-    def finished(self, step: Step, result: Result) -> None:
+    def finished(self, step: Step, result: StepResult) -> None:
         """Note that a step is done."""
         with self._lock:
-            self._count(step.kind, result)
+            self._tally = tally_of(self._state)
+            if isinstance(result, ReviewResult):
+                self._reviewed(result)
             self.set_up = None
             if in_set_up(step):
                 self.found[step.kind] = result
@@ -110,12 +114,11 @@ class Progress:
                 self._last_stroke_ns = self._clock.now_ns()
                 self._first_stroke_ns = self._first_stroke_ns or self._last_stroke_ns
 
-    def cut(self, place: Place | None) -> None:
+    def cut(self) -> None:
         """Note that a step was cut short."""
         with self._lock:
-            self._tally.voided(place)
+            self._tally = tally_of(self._state)
             self.set_up = None
-            self._voids += 1
 
     @property
     def first_free_index(self) -> int:
@@ -132,16 +135,9 @@ class Progress:
         with self._lock:
             return next(p for p in self._plan if p.stroke_id == f"{stroke_id}{AGAIN}")
 
-    def skipped(self, step: Step) -> Result:
-        """Result of a dip whose stroke is left out."""
-        stroke = self._by_index[step.index]
-        named = {"stroke_id": stroke.stroke_id, "depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
-        return {"skipped": True, **named}
-
-    def sheet_in(self, sheet: int) -> None:
-        """Note that `sheet`, counted from 0, was put in."""
-        with self._lock:
-            self._sheet = sheet
+    def planned(self, step: Step) -> Planned:
+        """The stroke that a step belongs to."""
+        return self._by_index[step.index]
 
     def show(self, last: LastCapture) -> None:
         """Show the newest capture."""
@@ -189,18 +185,19 @@ class Progress:
             current = self._current()
             waiting = (p for p in self._plan if p.stroke_id not in tally.over and p is not current)
             following = next(waiting, None)
-            counts = Counter((p.depth_mm, p.tilt_deg) for p in self._plan)
+            counts = Counter(p.condition for p in self._plan)
             grid = tuple(
                 CellCount(
-                    *patch,
-                    tally.done[patch],
+                    asked.depth_mm,
+                    asked.tilt_deg,
+                    tally.done[asked],
                     count,
-                    tally.bad[patch],
-                    tally.left_out[patch],
-                    current is not None and patch == (current.depth_mm, current.tilt_deg),
-                    following is not None and patch == (following.depth_mm, following.tilt_deg),
+                    tally.bad[asked],
+                    tally.left_out[asked],
+                    current is not None and asked == current.condition,
+                    following is not None and asked == following.condition,
                 )
-                for patch, count in sorted(counts.items())
+                for asked, count in sorted(counts.items(), key=lambda item: (item[0].depth_mm, item[0].tilt_deg))
             )
             return Snapshot(
                 session_id=self._session_id,
@@ -210,7 +207,7 @@ class Progress:
                 strokes_done=tally.done.total(),
                 strokes_planned=len(self._plan),
                 grid=grid,
-                voids=self._voids,
+                voids=self._state.voids - len(self._state.running),
                 given_up=tally.left_out.total(),
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
                 eta_s=self._eta_s(),
@@ -221,18 +218,16 @@ class Progress:
                 messages=tuple(self._messages),
                 error=self._error,
                 messages_before=self._logged - len(self._messages),
-                sheet=tally.sheet(self._sheet) if self._source else None,
+                sheet=None if self._sheet is None else tally.sheet(self._state.sheet, self._sheet.layout),
                 last=self._last,
                 stroke="" if current is None else current.stroke_id,
                 folder=self._folder,
             )
 
-    def _count(self, kind: str, result: Result) -> None:
-        self._tally.finished(kind, result)
-        # A stroke that is marked bad in review is replaced by its repeat.
-        if kind == StepKind.REVIEW:
-            self._plan = with_review(self._plan, result)
-            self._by_index = {p.index: p for p in self._plan}
+    def _reviewed(self, result: ReviewResult) -> None:
+        """Replace each stroke that was marked bad by its repeat."""
+        self._plan = with_review(self._plan, result)
+        self._by_index = {p.index: p for p in self._plan}
 
     def _current(self) -> Planned | None:
         """The stroke in progress."""

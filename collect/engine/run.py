@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from brushloop.collect.engine.control import RunControl, State
 from brushloop.collect.engine.perform import Performer
 from brushloop.collect.engine.policy import GO_ON, STOP, Action, decide, question
-from brushloop.collect.engine.set_up import again
+from brushloop.collect.engine.set_up import by_method
 from brushloop.collect.engine.set_up import question as set_up_question
 from brushloop.collect.engine.snapshot import in_set_up
 from brushloop.collect.engine.steps.context import RunContext
@@ -18,9 +18,10 @@ from brushloop.collect.engine.steps.retake import marked_bad
 from brushloop.collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols.plan import takes
-from brushloop.collect.protocols.steps import Protocol, Result, Step, StepKind
+from brushloop.collect.protocols.steps import DipStep, Protocol, ReviewStep, Step, ZeroTouchStep
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.events import ReviewResult, StepResult
 
 KEEP_SHEET = Choice("o", "keep the old sheet")
 
@@ -42,11 +43,13 @@ class Run:
         await self._once_arm_is_free(self._recover)
         await self._walk(protocol)
         for number in itertools.count():
-            step = Step(StepKind.REVIEW, number)
+            step = ReviewStep(number)
             if step.key not in self.context.store.state.done and not marked_bad(self.context):
                 break
-            for stroke_id, _ in (await self._result(step))["again"]:
-                await self._walk(takes(self.context.progress.made_again(str(stroke_id))))
+            reviewed = await self._result(step)
+            assert isinstance(reviewed, ReviewResult)
+            for again in reviewed.again:
+                await self._walk(takes(self.context.progress.made_again(again.stroke_id)))
         await self._once_arm_is_free(self._recover)  # the arm may have left for a dip that does not follow
 
     async def _walk(self, protocol: Protocol) -> None:
@@ -72,22 +75,22 @@ class Run:
                 await self._ask(error)
                 released = True
 
-    async def _result(self, step: Step) -> Result:
+    async def _result(self, step: Step) -> StepResult:
         """Return the result of a step: from the journal if it is done, else by doing it until it succeeds."""
         known = self.context.store.state.done.get(step.key)
         if known is not None and (not step.run_scoped or step.key in self.context.memory.done):
-            return known["result"]
+            return known.result
         failures, asked = 0, self.guided and in_set_up(step)
         while True:
             await self._between(step)
             try:
                 result = await self.performer.perform(step)
-                answer = await self._ask_about(step, result) if asked else GO_ON
+                answer = await self._ask_about(result) if asked else GO_ON
                 if answer == GO_ON:
                     self.context.memory.done.add(step.key)
                     return result
                 self.context.forget_camera()
-                step = again(step, answer)
+                step = by_method(step, answer)
             except (StepError, DeviceError) as error:
                 if isinstance(error, NeedsOperator) and self.control.park_wanted:
                     await self._park()  # a question of this step was left open
@@ -100,7 +103,7 @@ class Run:
                     await self._lift(error)
                     raise
                 if action is Action.ASK:
-                    step = again(step, await self._ask(error))
+                    step = by_method(step, await self._ask(error))
                     failures = 0
                 released = action is Action.ASK and isinstance(error, MotionError)
                 await self._once_arm_is_free(self._recover, released=released)
@@ -115,9 +118,9 @@ class Run:
             await self._park()
         await self.control.pause_point()
         await self._back_in_control()
-        if step.kind is StepKind.DIP and self.context.requests.take(OperatorRequest.NEW_SHEET):
+        if isinstance(step, DipStep) and self.context.requests.take(OperatorRequest.NEW_SHEET):
             await self._new_sheet()
-        if step.kind is StepKind.DIP and self.context.requests.take(OperatorRequest.JOG):
+        if isinstance(step, DipStep) and self.context.requests.take(OperatorRequest.JOG):
             await self._touch_again(step)
         if self.control.park_wanted:
             await self._park()
@@ -152,7 +155,7 @@ class Run:
 
     async def _touch_again(self, step: Step) -> None:
         """Zero touch by jog between two strokes; if it fails, the plane stays as it was."""
-        touch = Step(StepKind.ZERO_TOUCH, step.index + 1, {"method": "jog", "between_strokes": True})
+        touch = ZeroTouchStep(step.index + 1, method="jog", between_strokes=True)
         released = False
         try:
             await self.performer.perform(touch)
@@ -165,9 +168,9 @@ class Run:
                 released = isinstance(error, MotionError)
         await self._once_arm_is_free(self._recover, released=released)
 
-    async def _ask_about(self, step: Step, result: Result) -> str:
+    async def _ask_about(self, result: StepResult) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
-        answer = await self.context.asker.ask_or_default(set_up_question(step.kind, result, self.context.rig.config))
+        answer = await self.context.asker.ask_or_default(set_up_question(result, self.context.rig.config))
         if answer == STOP.key:
             await self._park()
         return answer

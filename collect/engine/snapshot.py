@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
-from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import Step
+from brushloop.sessions.events import StepKind
 
 if TYPE_CHECKING:
     import numpy as np

@@ -1,107 +1,86 @@
-"""Counts of a session's strokes and the state of its paper cells, computed from the results of its steps."""
+"""Counts of a session's strokes and the state of its patches, as screens show them."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
 from brushloop.collect.engine.snapshot import Mark, SheetMap
-from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.events import (
+    CaptureResult,
+    Condition,
+    DipResult,
+    DrawResult,
+    Press,
+    PressResult,
+    ReviewResult,
+    SelfCheckResult,
+)
+from brushloop.sessions.run_state import RunState
 
-if TYPE_CHECKING:
-    from brushloop.sessions.journal.journal import Replay
 
-Place = tuple[int, int]
-"""Sheet and paper cell, both from 0."""
-GridCell = tuple[float, float]
-"""H in mm, alpha in deg."""
-
-
+@dataclass(slots=True)
 class Tally:
-    """Counts of strokes and marks of paper cells. Not thread-safe: `Progress` holds its lock around every call."""
+    """Strokes counted by condition, and the marks on patches by (sheet, patch)."""
 
-    def __init__(self) -> None:
-        self._marks: dict[Place, Mark] = {}
-        self._stroke_at: dict[str, Place] = {}
-        self._cell_of: dict[str, GridCell] = {}
-        self._shape = (0, 0)
-        self.done: Counter[GridCell] = Counter()
-        """Captures that count."""
-        self.bad: Counter[GridCell] = Counter()
-        """Captures that do not count."""
-        self.left_out: Counter[GridCell] = Counter()
-        """Strokes that were given up."""
-        self.over: set[str] = set()
-        """Names of finished strokes, kept or given up."""
+    marks: dict[tuple[int, int], Mark] = field(default_factory=dict[tuple[int, int], Mark])
+    done: Counter[Condition] = field(default_factory=Counter[Condition])
+    """Captures that count."""
+    bad: Counter[Condition] = field(default_factory=Counter[Condition])
+    """Captures that do not count."""
+    left_out: Counter[Condition] = field(default_factory=Counter[Condition])
+    """Strokes that were given up."""
+    over: set[str] = field(default_factory=set[str])
+    """Names of finished strokes, kept or given up."""
 
-    def opened(self, state: Replay, columns: int, rows: int) -> None:
-        """Begin with the used cells of a session, on sheets of that shape; then pass its results to `finished`."""
-        self._shape = (columns, rows)
-        self._marks = dict.fromkeys(state.used_patches, Mark.VOID)
+    def sheet(self, number: int, layout: Layout) -> SheetMap:
+        """Return the map of sheet `number`, counted from 0."""
+        marks = tuple(self.marks.get((number, patch)) for patch in range(layout.capacity))
+        return SheetMap(number + 1, layout.columns, layout.rows, marks)
 
-    def begun(self, step: Step, place: Place | None) -> None:
-        """Note that a step begins; `place` is where it marks the paper."""
-        if place is not None and step.kind in MARKING:
-            self._marks[place] = Mark.NOW
 
-    def voided(self, place: Place | None) -> None:
-        """Note that a step was cut short; its cell stays used."""
-        if place is not None and self._marks.get(place) is Mark.NOW:
-            self._marks[place] = Mark.VOID
-
-    def finished(self, kind: str, result: Result) -> None:
-        """Note that a step is done."""
-        match kind:
-            case StepKind.PRESS | StepKind.DRAW:
-                place = (int(result["sheet"]), int(result["patch"]))
-                self._marks[place] = Mark.WAITING
-                self._stroke_at[str(result["stroke_id"])] = place
-            case StepKind.SELF_CHECK if "patch" in result:
-                for cell in result.get("patches", [result["patch"]]):
-                    self._marks[(int(result["sheet"]), int(cell))] = Mark.CHECK
-            case StepKind.CAPTURE:
-                self._captured(result)
-            case StepKind.REVIEW:
-                self._reviewed(result)
+def tally_of(state: RunState) -> Tally:
+    """Count what the journal holds; of the strokes that were pressed again after a review, only the repetition."""
+    tally = Tally(dict.fromkeys(state.used_patches, Mark.VOID))
+    for begin in state.running.values():
+        if begin.patch is not None:
+            tally.marks[begin.sheet, begin.patch] = Mark.NOW
+    kept: dict[str, Press] = {}
+    for step in state.files.values():
+        match step.result:
+            case PressResult(press=press) | DrawResult(press=press):
+                _mark(tally, press, Mark.WAITING)
+            case SelfCheckResult(sheet=sheet, patches=patches):
+                tally.marks |= {(sheet, patch): Mark.CHECK for patch in patches}
+            case CaptureResult(press=press, kept=True):
+                _mark(tally, press, Mark.KEPT)
+                kept[press.stroke_id] = press
+                tally.done[press.condition] += 1
+                tally.over.add(press.stroke_id)
+            case CaptureResult(press=press, retake=retake):
+                _mark(tally, press, Mark.BAD)
+                tally.bad[press.condition] += 1
+                if not retake:
+                    _leave_out(tally, press)
+            case DipResult(skipped=Press() as press):
+                _leave_out(tally, press)
+            case ReviewResult(again=again):
+                for stroke in again:
+                    press = kept[stroke.stroke_id]
+                    _mark(tally, press, Mark.BAD)
+                    tally.bad[press.condition] += 1
+                    tally.done[press.condition] -= 1
             case _:
                 pass
-        if result.get("skipped"):
-            self._leave_out(result)
-
-    def sheet(self, number: int) -> SheetMap:
-        """Return the map of sheet `number`, counted from 0."""
-        columns, rows = self._shape
-        marks = tuple(self._marks.get((number, cell)) for cell in range(columns * rows))
-        return SheetMap(number + 1, columns, rows, marks)
-
-    def _captured(self, result: Result) -> None:
-        stroke_id, cell = str(result["stroke_id"]), _cell(result)
-        kept = bool(result.get("kept", True))
-        self._cell_of[stroke_id] = cell
-        place = self._stroke_at.get(stroke_id)
-        if place is not None:
-            self._marks[place] = Mark.KEPT if kept else Mark.BAD
-        if kept:
-            self.done[cell] += 1
-            self.over.add(stroke_id)
-        else:
-            self.bad[cell] += 1
-            if not result.get("retake"):
-                self._leave_out(result)
-
-    def _reviewed(self, result: Result) -> None:
-        """Stop counting captures that were marked bad. Their strokes stay finished; others replace them."""
-        for name, _index in result["again"]:
-            stroke_id = str(name)
-            self._marks[self._stroke_at[stroke_id]] = Mark.BAD
-            cell = self._cell_of[stroke_id]
-            self.bad[cell] += 1
-            self.done[cell] -= 1
-
-    def _leave_out(self, result: Result) -> None:
-        self.left_out[_cell(result)] += 1
-        self.over.add(str(result["stroke_id"]))
+    return tally
 
 
-def _cell(result: Result) -> GridCell:
-    return float(result["depth_mm"]), float(result["tilt_deg"])
+def _mark(tally: Tally, press: Press, mark: Mark) -> None:
+    if press.sheet is not None and press.patch is not None:
+        tally.marks[press.sheet, press.patch] = mark
+
+
+def _leave_out(tally: Tally, press: Press) -> None:
+    tally.left_out[press.condition] += 1
+    tally.over.add(press.stroke_id)

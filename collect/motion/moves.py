@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from brushloop.collect.protocols.plan import TrajectoryPoint
+from brushloop.collect.protocols.steps import TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig, WashConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
 from brushloop.drivers.geometry import brush_pose, interpolate, lean

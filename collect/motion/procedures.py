@@ -18,7 +18,7 @@ from brushloop.collect.motion.moves import (
     zero_touch_moves,
 )
 from brushloop.collect.photograph.photographer import ArmTrips, Photographer
-from brushloop.collect.protocols.plan import Drawn, TrajectoryPoint
+from brushloop.collect.protocols.steps import Drawn, TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_paper

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.motion.moves import park_moves
-from brushloop.collect.planning.walk import moves_of, sheet_of, steps_on
+from brushloop.collect.planning.walk import as_planned, moves_of, sheet_of, steps_on
 from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.presses import GridConfig
-from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.protocols.steps import MARKING, CaptureStep, SelfCheckStep, Step
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
@@ -30,7 +30,6 @@ from brushloop.drivers.rotation import inverse, product, turned
 from brushloop.drivers.samples import Pose
 
 TOUCH_CLEAR_MM = 5.0
-MARKED = {"sheet": 0, "patch": 0}
 
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
@@ -50,13 +49,13 @@ def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step
     try:
         step = next(generator)
         while True:
-            names = sorted(set(step.params) - {"stroke_id", "again_of", "dwell_s", "sheet", "patch"})
-            asked = (step.kind, *(step.params[name] for name in names if step.kind != StepKind.CAPTURE))
+            params = {} if isinstance(step, CaptureStep) else step.params
+            names = sorted(set(params) - {"stroke_id", "again_of", "dwell_s"})
+            asked = (step.kind, *(params[name] for name in names))
             if asked not in seen:
                 seen.add(asked)
                 yield step
-            answer: Result = MARKED if step.kind in MARKING else {}
-            step = generator.send(answer)
+            step = generator.send(as_planned(step, 0, 0))
     except StopIteration:
         return
 
@@ -190,7 +189,7 @@ def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch | None, tu
         return
     for patch in patches:
         yield patch, ()
-        if step.kind is StepKind.SELF_CHECK:
+        if isinstance(step, SelfCheckStep):
             yield patch, (patch, patch)
 
 

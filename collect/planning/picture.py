@@ -11,7 +11,7 @@ from typing import Any
 from brushloop.collect.planning.summary import PlacedStroke, Plan
 from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.plan import Drawn
+from brushloop.collect.protocols.steps import Drawn
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
 from brushloop.collect.rig.paper import Sheet, to_paper

@@ -16,14 +16,12 @@ from brushloop.collect.planning.estimate import OMITTED, InkNeed, ink_need, reac
 from brushloop.collect.planning.walk import StepMoves, Walked, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.presses import ReplayConfig
-from brushloop.collect.protocols.steps import MARKING, StepKind
+from brushloop.collect.protocols.steps import MARKING, DrawStep, PressStep, SelfCheckStep, TouchStep
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.samples import Pose
-
-STROKES = frozenset({StepKind.PRESS, StepKind.DRAW})
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,21 +85,21 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         seconds[kind] = seconds.get(kind, 0.0) + took_s
         dips += walked.moves.dips
         poses += len(walked.moves.poses)
-        if step.kind == StepKind.TOUCH:
-            touches.append((float(step.params["x_mm"] or 0.0), float(step.params["y_mm"] or 0.0)))
-        if step.kind in STROKES and walked.patch is not None:
-            stroke_id = str(step.params["stroke_id"])
+        if isinstance(step, TouchStep):
+            touches.append((step.x_mm, step.y_mm))
+        if isinstance(step, PressStep | DrawStep) and walked.patch is not None:
+            stroke_id, condition = step.press.stroke_id, step.press.condition
             if placed and walked.sheet != placed[-1].sheet:
                 changes.append(stroke_id)
             placed.append(
                 PlacedStroke(
                     len(placed) + 1,
                     stroke_id,
-                    float(step.params["depth_mm"] or 0.0),
-                    float(step.params["tilt_deg"] or 0.0),
+                    condition.depth_mm,
+                    condition.tilt_deg,
                     walked.sheet,
                     walked.patch.index,
-                    step.kind == StepKind.DRAW,
+                    isinstance(step, DrawStep),
                 )
             )
     return Plan(
@@ -123,7 +121,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
 
 def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Walked) -> float:
     """Seconds that the arm waits over the patch for the ink; of a figure, before its first stroke."""
-    if protocol.wait_after_dip_s is None or walked.step.kind not in STROKES:
+    if protocol.wait_after_dip_s is None or not isinstance(walked.step, PressStep | DrawStep):
         return 0.0
     over_s, _ = step_s(config, here, StepMoves(walked.moves.parts[:1]))
     return max(0.0, protocol.wait_after_dip_s - over_s)
@@ -168,7 +166,7 @@ def _sheets(config: RigConfig, protocol: ProtocolConfig) -> tuple[int, int]:
     for walked in walk(config, protocol):
         if walked.patch is not None and walked.step.kind in MARKING:
             sheets = walked.sheet
-        if walked.step.kind is StepKind.SELF_CHECK:
+        if isinstance(walked.step, SelfCheckStep):
             taken = 1 + len(walked.more_patches)
     return sheets, taken
 

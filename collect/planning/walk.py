@@ -19,8 +19,22 @@ from brushloop.collect.motion.moves import (
     zero_touch_moves,
 )
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.plan import Drawn
-from brushloop.collect.protocols.steps import MARKING, Protocol, Result, Step, StepKind, with_self_check
+from brushloop.collect.protocols.steps import (
+    MARKING,
+    BoardStep,
+    CaptureStep,
+    DipStep,
+    Drawn,
+    DrawStep,
+    PressStep,
+    Protocol,
+    ReviewStep,
+    SelfCheckStep,
+    Step,
+    TouchStep,
+    ZeroTouchStep,
+    with_self_check,
+)
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import Layout, PaperPlane, Patch, Sheet
@@ -28,6 +42,7 @@ from brushloop.collect.touch.heights import lowest_z_mm
 from brushloop.collect.touch.places import patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.events import DrawResult, PressResult, StepResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,22 +74,22 @@ def moves_of(
     `patch` is where a press or a figure goes; `more` are the further patches of a self-check. `dips` is the number of
     dips before the step, which decides when the brush is washed.
     """
-    match step.kind:
-        case StepKind.ZERO_TOUCH | StepKind.TOUCH:
+    match step:
+        case ZeroTouchStep() | TouchStep():
             return _touches(config, plane, step, dips)
-        case StepKind.DIP:
+        case DipStep():
             return StepMoves([*inking_moves(config, dips)], dips=1)
-        case StepKind.REVIEW:
+        case ReviewStep():
             return StepMoves()
-        case StepKind.BOARD:
+        case BoardStep():
             return StepMoves([*photograph_moves(config)], captures=1)
-        case StepKind.CAPTURE:
+        case CaptureStep():
             return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
-        case StepKind.PRESS:
+        case PressStep(press=press, dwell_s=dwell_s):
             assert patch is not None
-            down, up = press_moves(config, plane, patch, _number(step, "depth_mm"), _number(step, "tilt_deg"))
-            return StepMoves([*down, *up], dwell_s=_number(step, "dwell_s"))
-        case StepKind.SELF_CHECK:
+            down, up = press_moves(config, plane, patch, press.condition.depth_mm, press.condition.tilt_deg)
+            return StepMoves([*down, *up], dwell_s=dwell_s)
+        case SelfCheckStep():
             assert patch is not None
             moves = [
                 move
@@ -82,27 +97,27 @@ def moves_of(
                 for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
             return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
-        case StepKind.DRAW:
+        case DrawStep(drawn=drawn):
             assert patch is not None
-            return _figure(config, plane, Drawn.of(step), patch, dips)
+            return _figure(config, plane, drawn, patch, dips)
 
 
-def touch_of(config: RigConfig, step: Step) -> TouchConfig:
+def touch_of(config: RigConfig, step: ZeroTouchStep | TouchStep) -> TouchConfig:
     """How and where a ZERO_TOUCH or TOUCH step touches. Raises ValueError for too few points for its method."""
     asked: dict[str, object] = {}
-    if step.kind is StepKind.TOUCH:
-        asked["points_mm"] = [(_number(step, "x_mm"), _number(step, "y_mm"))]
-    if (method := step.params.get("method")) is not None:
+    if isinstance(step, TouchStep):
+        asked["points_mm"] = [(step.x_mm, step.y_mm)]
+    elif step.method is not None:
         # The operator may measure even where the taught height is configured.
-        asked["method"] = method
+        asked["method"] = step.method
     return TouchConfig.model_validate(config.touch.model_dump() | asked) if asked else config.touch
 
 
-def _touches(config: RigConfig, plane: PaperPlane, step: Step, dips: int) -> StepMoves:
+def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchStep, dips: int) -> StepMoves:
     """A touch by force or jog decides how deep it goes; a touch by camera also chooses its next spot."""
     touch = touch_of(config, step)
     if touch.method == "taught":
-        [point] = touch.points_mm if step.kind is StepKind.TOUCH else [None]
+        [point] = touch.points_mm if isinstance(step, TouchStep) else [None]
         return StepMoves([*zero_touch_moves(config)] if point is None else [*visit_moves(config, plane, *point)])
     parts: list[Part] = []
     for rect_mm in touch_rects(config.paper, touch):
@@ -128,12 +143,6 @@ def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, patch: Patch, di
             made += 1
         parts += stroke_moves(config, plane, patch, points, drawn.speed_mm_s).parts
     return StepMoves(parts, dips=made)
-
-
-def _number(step: Step, name: str) -> float:
-    value = step.params[name]
-    assert isinstance(value, float | int)
-    return float(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +179,17 @@ def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
     return with_self_check(found) if config.self_check.enabled else found
 
 
+def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:
+    """The result of a step that makes its press there, as commanded; None for a step that makes none."""
+    match step:
+        case PressStep(press=press):
+            return PressResult(press=press.model_copy(update={"sheet": sheet, "patch": patch}))
+        case DrawStep(press=press):
+            return DrawResult(press=press.model_copy(update={"sheet": sheet, "patch": patch}), depths_mm=())
+        case _:
+            return None
+
+
 def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
     """Every step in order, each mark on the next free patch, with a fresh sheet whenever one is full.
 
@@ -182,7 +202,7 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
     try:
         step = next(generator)
         while True:
-            answer: Result = {}
+            answer: StepResult | None = None
             patch, shown = None, number
             more: tuple[Patch, ...] = ()
             if step.kind in MARKING:
@@ -190,12 +210,12 @@ def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
                     number += 1
                     used.clear()
                 patch, shown = sheet.free(used, number + 1), number
-                more = partners(sheet, patch, used) if step.kind == StepKind.SELF_CHECK else ()
+                more = partners(sheet, patch, used) if isinstance(step, SelfCheckStep) else ()
                 used |= {one.index for one in (patch, *more)}
-                answer = {"sheet": number, "patch": patch.index}
-            elif step.kind == StepKind.CAPTURE:
-                shown = int(step.params["sheet"] or 0)
-                patch = sheet.patch(int(step.params["patch"] or 0))
+                answer = as_planned(step, number, patch.index)
+            elif isinstance(step, CaptureStep):
+                shown = step.press.sheet or 0
+                patch = sheet.patch(step.press.patch or 0)
             moves = moves_of(config, plane, step, patch, more, dips=dips)
             dips += moves.dips
             yield Walked(step, shown + 1, patch, moves, list(more))

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from brushloop.collect.protocols.base import ProtocolBase, check_count
-from brushloop.collect.protocols.steps import Protocol, Step, StepKind
+from brushloop.collect.protocols.steps import BoardStep, Protocol, TouchStep, ZeroTouchStep
 from brushloop.collect.rig.config_file import Finite
 from brushloop.collect.rig.paper import Layout
 
@@ -36,12 +36,12 @@ class CalibrationConfig(ProtocolBase):
 
     def steps(self, layout: Layout | None = None) -> Protocol:
         """Zero touch, then in each round every touch and every view of the board."""
-        yield Step(StepKind.ZERO_TOUCH, 0)
+        yield ZeroTouchStep(0)
         touches = views = 0
         for _ in range(self.rounds):
             for x_mm, y_mm in self.touches_mm:
-                yield Step(StepKind.TOUCH, touches, {"x_mm": x_mm, "y_mm": y_mm})
+                yield TouchStep(touches, x_mm, y_mm)
                 touches += 1
             for _ in range(self.board_views):
-                yield Step(StepKind.BOARD, views)
+                yield BoardStep(views)
                 views += 1

@@ -9,65 +9,32 @@ affects every condition alike. A void press shifts what follows by one patch: on
 from __future__ import annotations
 
 import itertools
-import json
 import random
-from collections.abc import Generator, Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
 
-from pydantic import Field
-
-from brushloop.collect.protocols.steps import Params, Protocol, Result, Step, StepKind
+from brushloop.collect.protocols.steps import (
+    BoardStep,
+    CaptureStep,
+    DipStep,
+    Drawn,
+    DrawStep,
+    PressStep,
+    Protocol,
+    ZeroTouchStep,
+)
 from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.events import (
+    CaptureResult,
+    Condition,
+    DipResult,
+    DrawResult,
+    Press,
+    PressResult,
+    ReviewResult,
+)
 
-InCellMm = Annotated[float, Field(ge=0.0, le=500.0)]
-PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]
-TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]
-HeadingDeg = Annotated[float, Field(ge=-720.0, le=720.0)]
-TrajectoryPoint = tuple[InCellMm, InCellMm, PathDepthMm, TiltDeg, HeadingDeg]
-"""x, y in the figure's patch; depth below the touch height, negative above the paper; tilt; direction in which the
-ferrule leans, counter-clockwise from the sheet's x."""
 AGAIN = "-again"
-
-
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """The figure that a DRAW step draws."""
-
-    strokes: list[list[TrajectoryPoint]]
-    cell_mm: tuple[float, float]
-    """Size of the figure's patch."""
-    speed_mm_s: float
-    blend_mm: float
-    dip_every_strokes: int
-
-    @classmethod
-    def of(cls, step: Step) -> Drawn:
-        """The figure in a step's parameters. Raises KeyError or ValueError for a step that draws nothing."""
-        params = step.params
-        return cls(
-            strokes_of(str(params["strokes"])),
-            (float(params["cell_w_mm"] or 0), float(params["cell_h_mm"] or 0)),
-            float(params["speed_mm_s"] or 0),
-            float(params["blend_mm"] or 0),
-            int(params["dip_every_strokes"] or 0),
-        )
-
-    @property
-    def params(self) -> Params:
-        """The figure as a step's parameters."""
-        return {
-            "strokes": strokes_text(self.strokes),
-            "cell_w_mm": self.cell_mm[0],
-            "cell_h_mm": self.cell_mm[1],
-            "speed_mm_s": self.speed_mm_s,
-            "blend_mm": self.blend_mm,
-            "dip_every_strokes": self.dip_every_strokes,
-        }
-
-    def dips_before(self, stroke: int) -> bool:
-        """Whether the brush dips again before that stroke, counted from 0; the DIP step already served stroke 0."""
-        return stroke > 0 and self.dip_every_strokes > 0 and stroke % self.dip_every_strokes == 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,85 +57,51 @@ class Planned:
     again_of: str | None = None
     """The stroke of another session that this one repeats."""
 
+    @property
+    def condition(self) -> Condition:
+        """What is commanded."""
+        return Condition(depth_mm=self.depth_mm, tilt_deg=self.tilt_deg)
+
+    def press(self, take: int = 1) -> Press:
+        """The press of one take."""
+        return Press(stroke_id=self.stroke_id, condition=self.condition, take=take)
+
 
 def made_again(marked: Planned, index: int) -> Planned:
     """The same press under a new name: the recording holds both, and the first stays marked bad."""
     return replace(marked, stroke_id=f"{marked.stroke_id}{AGAIN}", index=index)
 
 
-def with_review(plan: Iterable[Planned], reviewed: Result) -> list[Planned]:
-    """The plan after a REVIEW step: each stroke that was marked bad is replaced by its repetition.
-
-    `reviewed` holds `again`: [stroke_id, index] of each.
-    """
-    indices = {str(stroke_id): int(index) for stroke_id, index in reviewed["again"]}
+def with_review(plan: Iterable[Planned], reviewed: ReviewResult) -> list[Planned]:
+    """The plan after a REVIEW step: each stroke that was marked bad is replaced by its repetition."""
+    indices = {again.stroke_id: again.index for again in reviewed.again}
     return [made_again(p, indices[p.stroke_id]) if p.stroke_id in indices else p for p in plan]
 
 
 def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protocol:
     """Zero touch, board, then dip, press or draw, capture for each stroke of the plan."""
-    yield Step(StepKind.ZERO_TOUCH, 0)
-    yield Step(StepKind.BOARD, 0)
+    yield ZeroTouchStep(0)
+    yield BoardStep(0)
     for number, stroke in enumerate(plan):
         if board_every is not None and number > 0 and number % board_every == 0:
-            yield Step(StepKind.BOARD, number // board_every)
+            yield BoardStep(number // board_every)
         yield from takes(stroke)
 
 
-def takes(stroke: Planned) -> Generator[Step, Result, None]:
+def takes(stroke: Planned) -> Protocol:
     """Steps of one stroke: dip, press or draw, capture; repeated while the capture asks for a retake."""
+    index, drawn, again_of = stroke.index, stroke.drawn, stroke.again_of
     for take in itertools.count(1):
-        # Only later takes are numbered, so that the keys of first takes match those of older sessions.
-        taken: Params = {} if take == 1 else {"take": take}
-        dipped = yield Step(StepKind.DIP, stroke.index, taken)
-        if dipped.get("skipped"):
+        dipped = yield DipStep(index, take)
+        if isinstance(dipped, DipResult) and dipped.skipped is not None:
             break
-        kind = StepKind.PRESS if stroke.drawn is None else StepKind.DRAW
-        marked = yield Step(kind, stroke.index, _mark_params(stroke) | taken)
-        # A capture belongs to one patch: a capture of another patch is another step.
-        place = _capture_params(stroke, int(marked["sheet"]), int(marked["patch"]))
-        seen = yield Step(StepKind.CAPTURE, stroke.index, place | taken)
-        if not seen.get("retake"):
+        press = stroke.press(take)
+        step = PressStep(index, press, stroke.dwell_s, again_of) if drawn is None else DrawStep(index, press, drawn)
+        marked = yield step
+        assert isinstance(marked, PressResult | DrawResult)
+        seen = yield CaptureStep(index, marked.press, again_of, drawn is not None)
+        if not (isinstance(seen, CaptureResult) and seen.retake):
             break
-
-
-def strokes_text(strokes: Iterable[Iterable[TrajectoryPoint]]) -> str:
-    """Trajectories as text for a step's parameter: JSON, [stroke][point][x, y, height, tilt, heading]."""
-    return json.dumps([[list(point) for point in stroke] for stroke in strokes], separators=(",", ":"))
-
-
-def strokes_of(text: str) -> list[list[TrajectoryPoint]]:
-    """The inverse of `strokes_text`. Raises ValueError for anything else."""
-    try:
-        return [
-            [(float(x), float(y), float(h), float(t), float(d)) for x, y, h, t, d in stroke]
-            for stroke in json.loads(text)
-        ]
-    except TypeError as error:
-        raise ValueError(f"no trajectories: {error}") from None
-
-
-def _mark_params(stroke: Planned) -> Params:
-    params: Params = {"stroke_id": stroke.stroke_id, "depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
-    if stroke.drawn is not None:
-        return params | stroke.drawn.params
-    params["dwell_s"] = stroke.dwell_s
-    return params if stroke.again_of is None else {**params, "again_of": stroke.again_of}
-
-
-def _capture_params(stroke: Planned, sheet: int, patch: int) -> Params:
-    params: Params = {
-        "stroke_id": stroke.stroke_id,
-        "depth_mm": stroke.depth_mm,
-        "tilt_deg": stroke.tilt_deg,
-        "sheet": sheet,
-        "patch": patch,
-    }
-    if stroke.again_of is not None:
-        params["again_of"] = stroke.again_of
-    if stroke.drawn is not None:
-        params["drawn"] = True
-    return params
 
 
 def numbered(rounds: list[list[Planned]], seed: int | None, layout: Layout | None) -> list[Planned]:

@@ -22,7 +22,8 @@ from brushloop.collect.protocols.base import (
     check_distinct,
     stroke_id_problem,
 )
-from brushloop.collect.protocols.plan import Planned, TiltDeg, numbered, shuffled
+from brushloop.collect.protocols.plan import Planned, numbered, shuffled
+from brushloop.collect.protocols.steps import TiltDeg
 from brushloop.collect.rig.config_file import Config
 from brushloop.collect.rig.paper import Layout
 

@@ -1,4 +1,4 @@
-"""Steps: the units of a protocol and of resume."""
+"""Steps: the units of a protocol and of resume. Each kind is a class with its parameters."""
 
 from __future__ import annotations
 
@@ -6,62 +6,152 @@ import contextlib
 import hashlib
 import json
 from collections.abc import Generator
-from dataclasses import dataclass, field
-from enum import StrEnum
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from brushloop.sessions.events import Press, StepKind, StepResult
 
 Value = float | int | str | bool | None
-Params = dict[str, Value]
-Result = dict[str, Any]
-"""Must be valid JSON: it is written to the journal and read back."""
-
-
-class StepKind(StrEnum):
-    """What a step does."""
-
-    ZERO_TOUCH = "zero_touch"
-    BOARD = "board"
-    DIP = "dip"
-    PRESS = "press"
-    DRAW = "draw"
-    """A figure: all strokes of one character, on one patch. If it is interrupted, all of it is done again."""
-    TOUCH = "touch"
-    """Bring the tip down on a given point of the sheet and measure its height."""
-    CAPTURE = "capture"
-    REVIEW = "review"
-    """Read which captures a person has marked bad; nothing moves."""
-    SELF_CHECK = "self_check"
-    """Press an uneven triangle of marks, which a mirrored, turned or stretched rig does not reproduce."""
-
-
-MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
-"""Steps that leave ink on a paper patch of their own."""
-RUN_SCOPED = frozenset({StepKind.ZERO_TOUCH, StepKind.BOARD})
-"""Steps whose first one every process does again: it finds the paper, and sees whether camera or board moved."""
+InCellMm = Annotated[float, Field(ge=0.0, le=500.0)]
+PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]
+TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]
+HeadingDeg = Annotated[float, Field(ge=-720.0, le=720.0)]
+TrajectoryPoint = tuple[InCellMm, InCellMm, PathDepthMm, TiltDeg, HeadingDeg]
+"""x, y in the figure's patch; depth below the touch height, negative above the paper; tilt; direction in which the
+ferrule leans, counter-clockwise from the sheet's x."""
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """One step. `index` distinguishes equal steps of one protocol."""
+class Drawn:
+    """The strokes that a DRAW step draws on one patch."""
 
-    kind: StepKind
+    strokes: list[list[TrajectoryPoint]]
+    cell_mm: tuple[float, float]
+    """Size of the figure's patch."""
+    speed_mm_s: float
+    blend_mm: float
+    dip_every_strokes: int
+
+    def dips_before(self, stroke: int) -> bool:
+        """Whether the brush dips again before that stroke, counted from 0; the DIP step already served stroke 0."""
+        return stroke > 0 and self.dip_every_strokes > 0 and stroke % self.dip_every_strokes == 0
+
+
+@dataclass(frozen=True, slots=True)
+class StepBase:
+    """Base of every kind of step. `index` distinguishes equal steps of one protocol."""
+
+    kind: ClassVar[StepKind]
     index: int
-    params: Params = field(default_factory=dict[str, Value])
+
+    @property
+    def params(self) -> dict[str, Value]:
+        """The parameters by name, as the recording holds them: those that are set, each a plain value."""
+        return _plain({f.name: getattr(self, f.name) for f in fields(self) if f.name != "index"})
 
     @property
     def key(self) -> str:
-        """Stable across processes: sha256 of kind, params and index."""
+        """Stable across processes: sha256 of kind, parameters and index."""
         text = json.dumps([self.kind, self.params, self.index], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
     @property
     def run_scoped(self) -> bool:
-        """Whether every process must do the step again, even if a stored result exists."""
-        return self.kind in RUN_SCOPED and self.index == 0
+        """Whether every process must do the step again, even if a stored result exists: the first one finds the paper,
+        and sees whether camera or board moved."""
+        return self.kind in (StepKind.ZERO_TOUCH, StepKind.BOARD) and self.index == 0
 
 
-Protocol = Generator[Step, Result, None]
-"""Yields steps and is sent their results, so that later steps can depend on earlier ones."""
+@dataclass(frozen=True, slots=True)
+class ZeroTouchStep(StepBase):
+    """Find the paper."""
+
+    kind: ClassVar[StepKind] = StepKind.ZERO_TOUCH
+    method: str | None = None
+    """`jog`, `force`, or `kept` for the height known before; None for the rig's method."""
+    between_strokes: bool = False
+    """A person asked for it between two strokes, and accepts the new height."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardStep(StepBase):
+    """Photograph the board."""
+
+    kind: ClassVar[StepKind] = StepKind.BOARD
+
+
+@dataclass(frozen=True, slots=True)
+class TouchStep(StepBase):
+    """Bring the tip down on a point of the sheet and measure its height."""
+
+    kind: ClassVar[StepKind] = StepKind.TOUCH
+    x_mm: float
+    y_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class SelfCheckStep(StepBase):
+    """Press an uneven triangle of marks, and find them in a photograph."""
+
+    kind: ClassVar[StepKind] = StepKind.SELF_CHECK
+
+
+@dataclass(frozen=True, slots=True)
+class DipStep(StepBase):
+    """Fill the brush."""
+
+    kind: ClassVar[StepKind] = StepKind.DIP
+    take: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PressStep(StepBase):
+    """Press once, on the next free patch."""
+
+    kind: ClassVar[StepKind] = StepKind.PRESS
+    press: Press
+    dwell_s: float = 0.0
+    """Time at full depth."""
+    again_of: str | None = None
+    """The stroke of another session that this one repeats."""
+
+
+@dataclass(frozen=True, slots=True)
+class DrawStep(StepBase):
+    """Draw a figure on the next free patch."""
+
+    kind: ClassVar[StepKind] = StepKind.DRAW
+    press: Press
+    drawn: Drawn
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureStep(StepBase):
+    """Photograph what was pressed on one patch."""
+
+    kind: ClassVar[StepKind] = StepKind.CAPTURE
+    press: Press
+    """As it was made, with its sheet and patch: a capture of another patch is another step."""
+    again_of: str | None = None
+    drawn: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReviewStep(StepBase):
+    """Read which captures a person has marked bad."""
+
+    kind: ClassVar[StepKind] = StepKind.REVIEW
+
+
+Step = ZeroTouchStep | BoardStep | TouchStep | SelfCheckStep | DipStep | PressStep | DrawStep | CaptureStep | ReviewStep
+MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
+"""Steps that leave ink on a paper patch of their own."""
+
+Protocol = Generator[Step, StepResult | None, None]
+"""Yields steps and is sent their results, so that later steps can depend on earlier ones; None for a step that was only
+planned and has nothing to tell."""
 KNOWING = frozenset({StepKind.ZERO_TOUCH, StepKind.TOUCH, StepKind.BOARD})
 """Steps that come before the self-check, which needs paper and board."""
 
@@ -73,6 +163,31 @@ def with_self_check(protocol: Protocol) -> Protocol:
     with contextlib.suppress(StopIteration):
         while True:
             if not checked and step.kind not in KNOWING:
-                yield Step(StepKind.SELF_CHECK, 0)
+                yield SelfCheckStep(0)
                 checked = True
             step = protocol.send((yield step))
+
+
+def strokes_text(strokes: list[list[TrajectoryPoint]]) -> str:
+    """Trajectories as text for the recording: JSON, [stroke][point][x, y, depth, tilt, heading]."""
+    return json.dumps(strokes, separators=(",", ":"))
+
+
+def _plain(values: dict[str, object]) -> dict[str, Value]:
+    plain: dict[str, Value] = {}
+    for name, value in values.items():
+        match value:
+            case Press():
+                # What was measured does not belong to what was asked for.
+                plain |= {"stroke_id": value.stroke_id, **value.condition.model_dump(exclude_defaults=True)}
+                plain |= value.model_dump(include={"take", "sheet", "patch"}, exclude_defaults=True)
+            case Drawn():
+                plain |= {"strokes": strokes_text(value.strokes)}
+                plain |= {"cell_w_mm": value.cell_mm[0], "cell_h_mm": value.cell_mm[1]}
+                plain |= {name: getattr(value, name) for name in ("speed_mm_s", "blend_mm", "dip_every_strokes")}
+            case float() | int() | str():
+                if value is not False and (name, value) != ("take", 1):
+                    plain[name] = value
+            case _:
+                pass
+    return plain

@@ -16,15 +16,14 @@ from brushloop.collect.protocols.base import (
     check_distinct,
     stroke_id_problem,
 )
-from brushloop.collect.protocols.plan import (
+from brushloop.collect.protocols.plan import Planned, shuffled
+from brushloop.collect.protocols.steps import (
     Drawn,
     HeadingDeg,
     InCellMm,
     PathDepthMm,
-    Planned,
     TiltDeg,
     TrajectoryPoint,
-    shuffled,
 )
 from brushloop.collect.rig.config_file import Config
 from brushloop.collect.rig.paper import Layout

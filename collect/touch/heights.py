@@ -11,6 +11,7 @@ from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.config_touch import Method, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
+from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
 SPAN_SIGMAS = 5.0
 """Three touches at one height span more than this many of their standard errors only once in a thousand times."""
@@ -106,27 +107,28 @@ class PlaneResult:
     residuals_mm: tuple[float, ...]
     """Point minus plane, in the order of the points; zeros for three points, which a plane always fits."""
 
-    def as_dict(self) -> dict[str, object]:
-        """For the journal: plain numbers, texts and lists."""
-        return {
-            "method": self.method,
-            "touch_z_mm": self.plane.z0_mm,
-            "slope_x": self.plane.slope_x,
-            "slope_y": self.plane.slope_y,
-            "slope_deg": self.plane.slope_deg,
-            "residuals_mm": list(self.residuals_mm),
-            "points": [
-                {
-                    "x_mm": point.mean[0],
-                    "y_mm": point.mean[1],
-                    "z_mm": point.mean[2],
-                    "span_mm": point.span_mm,
-                    "touches_mm": [t.z_mm for t in point.touches],
-                    "sigma_mm": [t.sigma_mm for t in point.touches],
-                }
+    def result(self, moved_mm: float) -> ZeroTouchResult:
+        """The result of a zero touch; `moved_mm` is how far the paper lies above where it was before."""
+        return ZeroTouchResult(
+            method=self.method,
+            touch_z_mm=self.plane.z0_mm,
+            slope_x=self.plane.slope_x,
+            slope_y=self.plane.slope_y,
+            slope_deg=self.plane.slope_deg,
+            residuals_mm=self.residuals_mm,
+            points=tuple(
+                TouchedPoint(
+                    x_mm=point.mean[0],
+                    y_mm=point.mean[1],
+                    z_mm=point.mean[2],
+                    span_mm=point.span_mm,
+                    touches_mm=tuple(touch.z_mm for touch in point.touches),
+                    sigma_mm=tuple(touch.sigma_mm for touch in point.touches),
+                )
                 for point in self.points
-            ],
-        }
+            ),
+            moved_mm=moved_mm,
+        )
 
 
 def at_one_point(touches: list[Touch], config: TouchConfig, guide: PaperPlane | None = None) -> PointTouches:

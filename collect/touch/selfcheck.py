@@ -22,6 +22,7 @@ from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.arm import Effector, TouchArm
 from brushloop.drivers.samples import Frame
+from brushloop.sessions.events import SelfCheckResult
 
 Floats = NDArray[np.float64]
 Triangle = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -58,16 +59,18 @@ class SelfCheck:
     residuals_mm: tuple[float, float, float]
     """Distance that remains at each mark once offset and turn are taken out."""
 
-    def as_dict(self) -> dict[str, object]:
-        """For the journal: plain numbers and lists."""
-        return {
-            "commanded_mm": self.commanded_mm.tolist(),
-            "found_mm": self.found_mm.tolist(),
-            "offset_mm": list(self.offset_mm),
-            "turn_deg": self.turn_deg,
-            "scale": list(self.scale),
-            "residuals_mm": list(self.residuals_mm),
-        }
+    def result(self, sheet: int, patches: tuple[int, ...]) -> SelfCheckResult:
+        """The result of a self-check on these patches."""
+        return SelfCheckResult(
+            sheet=sheet,
+            patches=patches,
+            commanded_mm=self.commanded_mm.tolist(),
+            found_mm=self.found_mm.tolist(),
+            offset_mm=self.offset_mm,
+            turn_deg=self.turn_deg,
+            scale=self.scale,
+            residuals_mm=self.residuals_mm,
+        )
 
 
 def triangle_in(patch: Patch, config: SelfCheckConfig) -> Triangle:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import statistics
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,14 +22,14 @@ from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
 from brushloop.sessions.errors import InputError, SessionDamaged
-from brushloop.sessions.history import unlike, waits_of
-from brushloop.sessions.journal import JOURNAL_NAME, Line
-from brushloop.sessions.journal.journal import is_open, replay
+from brushloop.sessions.events import CaptureResult
+from brushloop.sessions.history import Remark, remarks_of, unlike, waits_of
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.names import check_folder
 from brushloop.sessions.records import Check, Quality, Stroke, Topic
-from brushloop.sessions.remarks import Remark, remarks_of
+from brushloop.sessions.run_state import replay
 
 if TYPE_CHECKING:
     import numpy as np
@@ -106,14 +106,24 @@ class Review:
     def read(self) -> None:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
-        self.open = is_open(state)
-        waits = waits_of(state.segments)
-        odd = unlike(waits)
-        try:
-            captures = [_capture_of(line, remarks) for line in state.segments if line["kind"] == "capture"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise SessionDamaged(self.folder / JOURNAL_NAME, f"a capture's {error} is missing or not valid") from None
-        self.captures = tuple(replace(c, waited_s=waits.get(c.still), unlike=odd.get(c.still, "")) for c in captures)
+        self.open = state.is_open
+        odd = unlike(waits_of(state))
+        self.captures = tuple(
+            ReviewCapture(
+                result.press.stroke_id,
+                result.press.condition.depth_mm,
+                result.press.condition.tilt_deg,
+                result.still,
+                result.kept,
+                result.verdict,
+                step.file,
+                remarks.get(result.still),
+                result.press.dip_to_touch_s,
+                odd.get(result.still, ""),
+            )
+            for step in state.segments
+            if isinstance(result := step.result, CaptureResult)
+        )
 
     def pictures(self, capture: ReviewCapture) -> CapturePictures:
         """The pictures of one capture, made once. Takes a tenth of a second: call it off a screen's loop.
@@ -192,18 +202,3 @@ class Review:
         if stroke is None or stroke.cell_mm is None:
             return None
         return Patch(0, *stroke.cell_mm)
-
-
-def _capture_of(line: Line, remarks: dict[int, Remark]) -> ReviewCapture:
-    result = line["result"]
-    still = int(result["still"])
-    return ReviewCapture(
-        str(result["stroke_id"]),
-        float(result["depth_mm"]),
-        float(result["tilt_deg"]),
-        still,
-        bool(result.get("kept", True)),
-        str(result.get("verdict", "")),
-        str(line["file"]),
-        remarks.get(still),
-    )

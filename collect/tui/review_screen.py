@@ -24,7 +24,7 @@ from brushloop.collect.tui.pictures import Pictures, binary_picture
 from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain
 from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.remarks import Remark, add_remark
+from brushloop.sessions.history import Remark, add_remark
 
 KEYS = (
     ("escape", "back"),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.board.lens import LensUsed
 from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, StepResult
 from brushloop.sessions.messages import encode_png, image_message
 from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
 from brushloop.sessions.step_file import Outgoing
@@ -63,29 +64,32 @@ def _photographed(
     header = Header(session_id=folder.name, source=Source.LOOPBACK, software="brushloop test")
     store = SessionStore.create(folder, header, snapshots, functools.partial(next, itertools.count(T0_NS, 1_000_000)))
     for number, image in enumerate(boards):
-        _take(store, "board", number, [_still(T0_NS + number * MINUTE_NS, number, image)])
+        height_px, width_px = image.shape
+        board = BoardResult(
+            still=number, corners=54, mm_per_px=0.05, rms_px=0.1, size_px=(width_px, height_px), sheet_px=()
+        )
+        _take(store, number, [_still(T0_NS + number * MINUTE_NS, number, image)], board)
     for number, (stroke, image) in enumerate(presses, start=len(boards)):
         t_ns = T0_NS + number * MINUTE_NS
         marked = Outgoing(Topic.STROKE, t_ns, t_ns, number, stroke.model_copy(update={"still": number}))
-        pressed = {"stroke_id": stroke.stroke_id, "depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
-        _take(store, "capture", number, [_still(t_ns, number, image), marked], pressed | {"still": number})
+        condition = Condition(depth_mm=stroke.depth_mm or 0.0, tilt_deg=stroke.tilt_deg or 0.0)
+        captured = CaptureResult(press=Press(stroke_id=stroke.stroke_id, condition=condition), still=number)
+        _take(store, number, [_still(t_ns, number, image), marked], captured)
     store.close()
     store.release()
     return folder
 
 
-def _take(
-    store: SessionStore, kind: str, number: int, messages: list[Outgoing], result: dict[str, Any] | None = None
-) -> None:
-    attempt = store.begin(f"{kind} {number}", kind, patch=None, notes={"params": {}})
-    event: dict[str, Any] = {"key": "k", "kind": kind, "index": number, "attempt": 1, "params": {}}
+def _take(store: SessionStore, number: int, messages: list[Outgoing], result: StepResult) -> None:
+    attempt = store.begin(f"{result.kind} {number}", result.kind)
+    event: dict[str, Any] = {"key": "k", "kind": result.kind, "index": number, "attempt": 1, "params": {}}
     begin, end = (
         Outgoing(Topic.STEP, message.log_ns, message.log_ns, number, StepEvent(**event, phase=phase))
         for message, phase in ((messages[0], "begin"), (messages[-1], "end"))
     )
     for message in (begin, *messages, end):
         attempt.writer.write(message)
-    store.done(attempt, result or {})
+    store.done(attempt, result)
 
 
 def _still(t_ns: int, number: int, image: Gray) -> Outgoing:

@@ -22,10 +22,11 @@ import pytest
 
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.sessions.disk import file_sha256
+from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import JOURNAL_NAME, read_lines
-from brushloop.sessions.journal.journal import is_open, replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
+from brushloop.sessions.run_state import replay
 from brushloop.sessions.verify import verify_session
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ def strokes_left(lab: Lab) -> int:
 
 
 def captures_done(path: Path) -> list[str]:
-    return sorted(str(s["result"]["stroke_id"]) for s in replay(path).segments if s["kind"] == "capture")
+    return sorted(capture.press.stroke_id for capture in replay(path).results(CaptureResult))
 
 
 def phase(before: list[str], after: list[str], lab: Lab) -> str:
@@ -191,7 +192,7 @@ def check_nothing_was_taken_back(lab: Lab, finished: dict[str, str]) -> None:
     if path is None:
         assert not finished
         return
-    now = {str(line["file"]): str(line["sha256"]) for line in replay(path).segments}
+    now = {step.file: step.sha256 for step in replay(path).segments}
     assert finished.items() <= now.items()
     assert {name: file_sha256(path.parent / name) for name in now} == now
     finished.update(now)
@@ -202,10 +203,10 @@ def check(lab: Lab, toll: Toll, presses_before: int) -> None:
     path = journal(lab)
     assert path is not None
     state = replay(path)
-    assert not is_open(state)
+    assert not state.is_open
     wanted = stroke_ids(lab)
     assert captures_done(path) == wanted
-    begun = [line for line in read_lines(path) if line["event"] == "begin" and line["patch"] is not None]
+    begun = [line for line in read_lines(path) if line["event"] == "begin" and "patch" in line]
     patches = [(line["sheet"], line["patch"]) for line in begun]
     assert len(patches) == len(set(patches)), "a patch was used twice"
 

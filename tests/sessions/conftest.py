@@ -17,12 +17,15 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, PressResult, StepKind, StepResult
 from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.journal import JOURNAL_NAME, encode_line, read_lines
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
 from brushloop.sessions.step_file import Outgoing, SegmentWriter
 from brushloop.sessions.store import SessionStore
+
+BOARD = BoardResult(still=1000, corners=54, mm_per_px=0.05, rms_px=0.1, size_px=(24, 24), sheet_px=())
 
 
 class Make:
@@ -76,38 +79,39 @@ class Make:
         header = self.header.model_copy(update=fields)
         return SessionStore.create(folder, header, self.snapshots, self.clock())
 
+    def press(self, stroke_id: str = "H13-a05-r00", depth_mm: float = 13.0, **known: Any) -> Press:
+        return Press(stroke_id=stroke_id, condition=Condition(depth_mm=depth_mm, tilt_deg=5.0), **known)
+
+    def captured(self, stroke_id: str, still: int, **known: Any) -> CaptureResult:
+        return CaptureResult(press=self.press(stroke_id), still=still, **known)
+
     def perform(self, store: SessionStore, key: str, patch: int | None = None) -> None:
         """One step from begin to done, with a still and a stroke in it."""
-        attempt = store.begin(key, "capture", patch=patch, notes={})
+        attempt = store.begin(key, StepKind.CAPTURE, patch=patch)
         attempt.writer.write(self.still(attempt.serial))
         attempt.writer.write(self.stroke(attempt.serial, stroke_id=key))
-        store.done(attempt, {"serial": attempt.serial})
+        store.done(attempt, self.captured(key, attempt.serial))
 
     def collect(self, store: SessionStore, strokes: int = 2) -> None:
         """A small grid as the engine collects it: a board, presses with poses, captures, and one press that was cut."""
-        self.take(store, "board", "board", [self.still(1000)], {})
-        store.void(store.begin("H13-a05-r00 press", "press", patch=0, notes={"params": {}}), "stopped by the operator")
+        self.take(store, "board", [self.still(1000)], BOARD)
+        store.void(store.begin("H13-a05-r00 press", StepKind.PRESS, patch=0), "stopped by the operator")
         for number in range(strokes):
             stroke, sheet, patch = f"H13-a05-r{number:02d}", store.state.sheet, number + 1
             poses = [self.pose(100 * number + at) for at in range(5)]
-            pressed = {"stroke_id": stroke, "sheet": sheet, "patch": patch, "depth_mm": 13.0}
-            self.take(store, f"{stroke} press", "press", poses, pressed, patch)
-            captured = {"stroke_id": stroke, "still": number}
-            self.take(store, f"{stroke} capture", "capture", [self.still(number), self.stroke(number)], captured)
+            pressed = PressResult(press=self.press(stroke, sheet=sheet, patch=patch, reached_mm=13.0))
+            self.take(store, f"{stroke} press", poses, pressed, patch)
+            captured = self.captured(stroke, number)
+            self.take(store, f"{stroke} capture", [self.still(number), self.stroke(number)], captured)
 
     def take(
-        self,
-        store: SessionStore,
-        key: str,
-        kind: str,
-        messages: list[Outgoing],
-        result: dict[str, Any],
-        patch: int | None = None,
+        self, store: SessionStore, key: str, messages: list[Outgoing], result: StepResult, patch: int | None = None
     ) -> None:
         """One step from begin to done, with its step events around the messages."""
-        params = {"stroke_id": result.get("stroke_id", "")}
-        attempt = store.begin(key, kind, patch=patch, notes={"params": params})
-        event = {"key": key, "kind": kind, "index": 0, "attempt": attempt.attempt, "params": params}
+        press = result.press if isinstance(result, PressResult | CaptureResult) else None
+        attempt = store.begin(key, result.kind, patch=patch, press=press)
+        params = {} if press is None else {"stroke_id": press.stroke_id}
+        event = {"key": key, "kind": result.kind, "index": 0, "attempt": attempt.begin.attempt, "params": params}
         times = (messages[0].log_ns - 1, messages[-1].log_ns + 1)
         begin, end = (
             Outgoing(Topic.STEP, t_ns, t_ns, attempt.serial, StepEvent.model_validate({**event, "phase": phase}))

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.sessions.errors import InputError, SessionError
+from brushloop.sessions.events import PressResult
 from brushloop.sessions.export import export
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
@@ -42,13 +43,17 @@ def few(make, tmp_path):
 def felt(make, tmp_path):
     """A recording of a judged press with two samples of force."""
     store = make.store(tmp_path / "felt")
-    still = {"fx_n": 0.1, "fy_n": 0.0, "mx_nm": 0.0, "my_nm": 0.0, "mz_nm": 0.0}
-    pushes = [Outgoing(Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fz_n=-float(n), **still)) for n in range(2)]
-    make.take(store, "a press", "press", [*pushes, make.pose(0)], {"stroke_id": "H13-a05-r00"}, 0)
+    pushes = [
+        Outgoing(
+            Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fx_n=0.1, fy_n=0.0, fz_n=-float(n), mx_nm=0.0, my_nm=0.0, mz_nm=0.0)
+        )
+        for n in range(2)
+    ]
+    make.take(store, "a press", [*pushes, make.pose(0)], PressResult(press=make.press()), 0)
     checks = (Check(name="dry", passed=False, reason="is dry"), Check(name="faint", passed=True))
     judged = Outgoing(Topic.QUALITY, 30, 30, 0, Quality(stroke_id="H13-a05-r00", checks=checks))
     taken = [make.still(0), judged, make.stroke(0)]
-    make.take(store, "a capture", "capture", taken, {"stroke_id": "H13-a05-r00", "still": 0})
+    make.take(store, "a capture", taken, make.captured("H13-a05-r00", 0))
     store.close()
     store.release()
     return store.folder

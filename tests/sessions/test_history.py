@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import pytest
 
-from brushloop.sessions.history import ZeroTouch, history_of
+from brushloop.sessions.events import DipResult, StepResult, ZeroTouchResult
+from brushloop.sessions.history import history_of
 
 
-def did(store, key: str, kind: str, result: dict[str, object]) -> None:
-    store.done(store.begin(key, kind, patch=None, notes={}), result)
+def did(store, *results: StepResult) -> None:
+    for number, result in enumerate(results):
+        store.done(store.begin(f"k{number}", result.kind), result)
 
 
-def test_takes_that_did_not_count_are_distinguished_from_strokes_that_were_given_up(store) -> None:
-    did(store, "z1", "zero_touch", {"method": "taught", "touch_z_mm": 120.0})
-    did(store, "c1", "capture", {"stroke_id": "a", "kept": False, "retake": True})
-    did(store, "c2", "capture", {"stroke_id": "a", "kept": True, "retake": False})
-    did(store, "c3", "capture", {"stroke_id": "b", "kept": False, "retake": False})
-    did(store, "d4", "dip", {"stroke_id": "c", "skipped": True})
-    did(store, "d5", "dip", {})
-    did(store, "z2", "zero_touch", {"method": "jog", "touch_z_mm": 122.0})
+def test_takes_that_did_not_count_are_distinguished_from_strokes_that_were_given_up(make, store) -> None:
+    touches = ZeroTouchResult(method="taught", touch_z_mm=120.0), ZeroTouchResult(method="jog", touch_z_mm=122.0)
+    did(
+        store,
+        touches[0],
+        make.captured("a", 1, kept=False, retake=True),
+        make.captured("a", 2),
+        make.captured("b", 3, kept=False),
+        DipResult(skipped=make.press("c")),
+        DipResult(),
+        touches[1],
+    )
     history = history_of(store.folder)
     assert history is not None
     assert (history.photographed, history.pressed_again, history.left_out) == (3, ("a",), ("b", "c"))
-    assert history.found == (ZeroTouch("taught", 120.0), ZeroTouch("jog", 122.0))
+    assert history.touches == touches
     assert history.moved_mm == pytest.approx(2.0)
 
 

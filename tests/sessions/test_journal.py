@@ -7,19 +7,19 @@ import os
 import pytest
 
 from brushloop.sessions.errors import SessionDamaged, SessionError
+from brushloop.sessions.events import Condition
 from brushloop.sessions.journal import Journal, encode_line, read, read_lines
-from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.run_state import replay
 
 BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "patch": 4, "file": "0000-k1.mcap"}
 DONE = {
     "event": "done",
     "key": "k1",
-    "kind": "press",
     "attempt": 1,
     "file": "0000-k1.mcap",
     "sha256": "00",
     "counts": {"/step": 2},
-    "result": {"depth_mm": 13.0},
+    "result": {"kind": "press", "press": {"stroke_id": "a", "condition": {"depth_mm": 13.0, "tilt_deg": 5.0}}},
 }
 
 
@@ -155,7 +155,7 @@ def test_what_happened_to_lines_is_named(path, change, expected):
 def test_an_event_without_a_field_is_damage_in_one_line(path, event):
     written(path, event)
     with pytest.raises(
-        SessionDamaged, match=f"line 1 makes no sense: '[a-z0-9]+' of event '{event['event']}' "
+        SessionDamaged, match=f"line 1 makes no sense: '[a-z0-9._/]+' of event '{event['event']}' is "
     ) as caught:
         replay(path)
     assert "\n" not in str(caught.value)
@@ -171,8 +171,8 @@ def test_replay_folds_begin_done_void_and_sheet(path):
     void = {"event": "void", "key": "k2", "attempt": 1, "why": "stopped"}
     again = {**other, "attempt": 2, "sheet": 1, "patch": 0}
     state = replay(written(path, BEGIN, DONE, other, void, {"event": "sheet", "sheet": 1}, again))
-    assert state.done["k1"]["result"] == {"depth_mm": 13.0}
-    assert [line["file"] for line in state.segments] == ["0000-k1.mcap"]
+    assert state.done["k1"].result.press.condition == Condition(depth_mm=13.0, tilt_deg=5.0)
+    assert list(state.files) == ["0000-k1.mcap"]
     assert state.attempts == {"k1": 1, "k2": 2}
     assert (state.begun, state.voids, state.sheet) == (3, 2, 1)
 

@@ -18,6 +18,7 @@ KILLS = 10
 COLLECT = """
 import random, sys, time
 from pathlib import Path
+from brushloop.sessions.events import Condition, Press, PressResult, StepKind
 from brushloop.sessions.messages import image_message
 from brushloop.sessions.records import Header, Stroke, Topic
 from brushloop.sessions.store import SessionStore
@@ -34,7 +35,7 @@ for key in keys:
     if key in store.state.done:
         continue
     patch = max((patch for _, patch in store.state.used_patches), default=-1) + 1
-    attempt = store.begin(key, "press", patch=patch, notes={})
+    attempt = store.begin(key, StepKind.PRESS, patch=patch)
     for number in range(4):
         t_ns = time.time_ns()
         still = image_message(t_ns, random.randbytes(20_000))
@@ -42,7 +43,8 @@ for key in keys:
         time.sleep(random.uniform(0, 0.01))
     stroke = Stroke(stroke_id=key, kind="press", still=3)
     attempt.writer.write(Outgoing(Topic.STROKE, t_ns, t_ns, 3, stroke))
-    store.done(attempt, {"patch": patch})
+    press = Press(stroke_id=key, condition=Condition(depth_mm=13.0, tilt_deg=5.0), patch=patch)
+    store.done(attempt, PressResult(press=press))
 store.close()
 """
 

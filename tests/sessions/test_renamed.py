@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
+from brushloop.sessions.events import StepKind
 from brushloop.sessions.export import export
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
@@ -97,7 +98,7 @@ LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, l
 
 @pytest.mark.parametrize("look", LOOKS)
 def test_an_unfinished_file_is_named_as_one(make, store, look):
-    store.begin("k", "press", patch=0, notes={"params": {}}).writer.abandon()
+    store.begin("k", StepKind.PRESS, patch=0).writer.abandon()
     (part,) = store.folder.glob("*.part")
     before = make.tree(store.folder)
     with pytest.raises(InputError) as refused:

@@ -7,11 +7,10 @@ from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.remarks import mark_bad_or_good
-from brushloop.sessions.show import GridCell, Sheet, details
-from brushloop.sessions.show_text import ranges
+from brushloop.sessions.events import CaptureResult, PressResult, StepKind
+from brushloop.sessions.history import mark_bad_or_good
+from brushloop.sessions.show import GridCell, Sheet, details, ranges
 from brushloop.sessions.store import SessionStore
-from brushloop.sessions.verify import verify_session
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
 
@@ -24,24 +23,23 @@ def store(make, tmp_path):
     made.release()
 
 
-def press(make, store, stroke_id, depth_mm, cell):
-    params = {"stroke_id": stroke_id, "depth_mm": depth_mm, "tilt_deg": 5.0}
-    attempt = store.begin(f"press {stroke_id}", "press", patch=cell, notes={"params": params})
-    store.done(attempt, {"stroke_id": stroke_id, "sheet": store.state.sheet, "patch": cell})
-    attempt = store.begin(f"capture {stroke_id}", "capture", patch=None, notes={"params": params})
+def press(make, store, stroke_id, depth_mm, patch):
+    made = make.press(stroke_id, depth_mm, sheet=store.state.sheet, patch=patch)
+    store.done(store.begin(f"press {stroke_id}", StepKind.PRESS, patch=patch, press=made), PressResult(press=made))
+    attempt = store.begin(f"capture {stroke_id}", StepKind.CAPTURE, press=made)
     attempt.writer.write(make.still(attempt.serial))
     attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, depth_mm=depth_mm, tilt_deg=5.0))
-    store.done(attempt, {"stroke_id": stroke_id, "depth_mm": depth_mm, "tilt_deg": 5.0, "still": attempt.serial})
+    store.done(attempt, CaptureResult(press=made, still=attempt.serial))
 
 
 @pytest.fixture
 def collected(make, store):
     """Two strokes of four, one press that was stopped, one that the process did not survive."""
     press(make, store, "H13-a5-r01", 13.0, 0)
-    store.void(store.begin("v", "press", patch=1, notes={"params": {"stroke_id": "H15-a5-r01"}}), "stopped")
+    store.void(store.begin("v", StepKind.PRESS, patch=1, press=make.press("H15-a5-r01")), "stopped")
     press(make, store, "H15-a5-r01", 15.0, 2)
     store.fresh_sheet()
-    store.begin("k", "press", patch=0, notes={"params": {"stroke_id": "H13-a5-r02"}}).writer.abandon()
+    store.begin("k", StepKind.PRESS, patch=0, press=make.press("H13-a5-r02")).writer.abandon()
     return store
 
 
@@ -61,7 +59,7 @@ def test_an_open_session_shows_what_is_done_cut_and_next(collected):
 
 
 def test_what_is_marked_bad_is_distinguished_from_what_counts(collected):
-    [first, _] = [line["result"]["still"] for line in collected.state.segments if line["kind"] == "capture"]
+    [first, _] = [capture.still for capture in collected.state.results(CaptureResult)]
     assert mark_bad_or_good(collected.folder, first, "H13-a5-r01", 1)
     shown = details(collected.folder)
     assert (shown.strokes, shown.marked_bad) == (1, 1)
@@ -87,7 +85,7 @@ def test_cells_that_follow_each_other_are_put_together():
 def test_the_command_prints_it_and_json_holds_all_of_it(collected):
     ran = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["show", str(collected.folder)])
     assert ran.exit_code == 0
-    for word in ("2 of 4 planned", "3 cells used: 0-2", "13 mm", "1/2", "press H13-a5-r02 (under way", "goat"):
+    for word in ("2 of 4 planned", "3 patches used: 0-2", "13 mm", "1/2", "press H13-a5-r02 (under way", "goat"):
         assert word in ran.output
     as_json = json.loads(CliRunner().invoke(app, ["show", str(collected.folder), "--json"]).output)
     assert as_json["segments"][1]["messages"] == {"/camera/still": 1, "/stroke": 1}
@@ -108,17 +106,3 @@ def test_files_are_counted_and_listed_only_where_that_is_asked_for(collected):
 def test_what_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such session"):
         details(tmp_path / "gone")
-
-
-def test_a_recording_of_the_earlier_protocol_adaptive_is_shown_closed_and_verified(make, tmp_path):
-    protocol = '{"kind":"adaptive","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":10,"enough_points":1.0}'
-    header = make.header.model_copy(update={"protocol": protocol})
-    store = SessionStore.create(tmp_path / header.session_id, header, make.snapshots, make.clock())
-    chosen = {"number": 0, "points": 9.0, "ink_sha256": "0" * 64, "stop": False, "depth_mm": 13.0, "tilt_deg": 5.0}
-    store.done(store.begin("choose 0", "choose", patch=None, notes={"params": {}}), chosen)
-    press(make, store, "001-H13-a5", 13.0, 0)
-    shown = details(store.folder)
-    assert (shown.strokes, shown.planned, shown.finished["choose"]) == (1, None, 1)
-    final = store.close()
-    assert details(final).grid == [GridCell(13.0, 5.0, 1, None)]
-    assert verify_session(store.folder).sound

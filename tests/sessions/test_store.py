@@ -10,6 +10,7 @@ import pytest
 from mcap.reader import make_reader
 
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
+from brushloop.sessions.events import PressResult, StepKind
 from brushloop.sessions.folders import next_session_id, open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME, Journal
 from brushloop.sessions.mcap_file import McapFile
@@ -78,13 +79,13 @@ def test_a_lock_is_given_back_from_any_thread(make, store, resume):
 
 def test_attempts_cells_and_results_are_kept_across_processes(make, store, resume):
     make.perform(store, "H13-a05", patch=0)
-    store.void(store.begin("H15-a05", "press", patch=1, notes={}), "stopped by the operator")
+    store.void(store.begin("H15-a05", StepKind.PRESS, patch=1), "stopped by the operator")
     second = resume(store)
-    assert second.state.done["H13-a05"]["result"] == {"serial": 0}
+    assert second.state.done["H13-a05"].result == make.captured("H13-a05", 0)
     assert second.state.used_patches == {(0, 0), (0, 1)}
-    attempt = second.begin("H15-a05", "press", patch=2, notes={})
-    assert (attempt.attempt, attempt.serial) == (2, 2)
-    second.done(attempt, {})
+    attempt = second.begin("H15-a05", StepKind.PRESS, patch=2)
+    assert (attempt.begin.attempt, attempt.serial) == (2, 2)
+    second.done(attempt, PressResult(press=make.press()))
     assert [line["why"] for line in make.events(store.folder, "void")] == ["stopped by the operator"]
     assert resume(second).state.attempts == {"H13-a05": 1, "H15-a05": 2}
 
@@ -98,7 +99,7 @@ def test_a_fresh_sheet_frees_its_cells_and_stays_fresh(make, store, resume):
 
 
 def test_a_process_that_dies_after_begin_has_burnt_the_cell(make, store, resume):
-    store.begin("H13-a05", "press", patch=3, notes={}).writer.abandon()
+    store.begin("H13-a05", StepKind.PRESS, patch=3).writer.abandon()
     second = resume(store)
     assert second.state.used_patches == {(0, 3)}
     make.perform(second, "H13-a05", patch=4)
@@ -106,7 +107,7 @@ def test_a_process_that_dies_after_begin_has_burnt_the_cell(make, store, resume)
 
 
 def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, store, resume):
-    attempt = store.begin("H13-a05", "press", patch=3, notes={})
+    attempt = store.begin("H13-a05", StepKind.PRESS, patch=3)
     attempt.writer.write(make.stroke(0, stroke_id="never journalled"))
     attempt.writer.finish()
     second = resume(store)
@@ -234,6 +235,6 @@ def test_session_ids_count_up_until_the_day_is_full(tmp_path):
 
 
 def test_an_attempt_that_marks_several_cells_burns_them_all(make, store, resume):
-    store.begin("check", "self_check", patch=0, notes={"more_patches": [5, 36]}).writer.abandon()
+    store.begin("check", StepKind.SELF_CHECK, patch=0, more_patches=(5, 36)).writer.abandon()
     assert store.state.used_patches == {(0, 0), (0, 5), (0, 36)}
     assert resume(store).state.used_patches == store.state.used_patches

@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.decoder import DecoderFactory
 
+from brushloop.sessions.events import PressResult
 from brushloop.sessions.messages import (
     Transform,
     calibration_message,
@@ -57,7 +58,7 @@ def each(make):
 
 
 def test_the_merged_file_carries_every_topic_under_a_name_that_viewers_know(make, store, each):
-    make.take(store, "all", "press", each, {})
+    make.take(store, "all", each, PressResult(press=make.press()))
     with store.close().open("rb") as file:
         found = {channel.topic: (schema, channel) for schema, channel, _ in make_reader(file).iter_messages()}
     assert set(found) == {str(topic) for topic in Topic}
@@ -119,7 +120,7 @@ LAYOUT = Path(__file__).parents[2] / "docs" / "foxglove-layout.json"
 
 
 def test_the_foxglove_layout_asks_for_topics_and_fields_that_there_are(make, store, each):
-    make.take(store, "all", "press", each, {})
+    make.take(store, "all", each, PressResult(press=make.press()))
     with store.close().open("rb") as file:
         fields = {}
         for schema, channel, _ in make_reader(file).iter_messages():

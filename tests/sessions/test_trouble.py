@@ -15,6 +15,7 @@ import pytest
 
 from brushloop.sessions import disk
 from brushloop.sessions.errors import DiskFull, SessionError
+from brushloop.sessions.events import PressResult, StepKind
 from brushloop.sessions.journal import JOURNAL_NAME, read_lines
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import STEP_BYTES, SessionStore
@@ -48,7 +49,7 @@ def test_a_step_is_not_begun_where_its_files_might_not_fit(make, store, monkeypa
     free(monkeypatch, 1_000_000)
     assert store.free_bytes() == 1_000_000
     with pytest.raises(DiskFull, match="the disk has 1 MB left, 84 MB are needed; make room") as caught:
-        store.begin("b", "press", patch=0, notes={})
+        store.begin("b", StepKind.PRESS, patch=0)
     assert (caught.value.exit_code, caught.value.free_bytes) == (4, 1_000_000)
     assert make.tree(store.folder) == before
     assert store.state.used_patches == set(), "no patch is burnt"
@@ -89,12 +90,12 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
         return io.BufferedWriter(Full(path, mode)) if mode == "xb" else open_(path, mode, **options)
 
     monkeypatch.setattr(Path, "open", open_on_it)
-    attempt = store.begin("b", "press", patch=1, notes={})
+    attempt = store.begin("b", StepKind.PRESS, patch=1)
     monkeypatch.setattr(os, "write", no_room)
 
     def finish():
         attempt.writer.write(make.still(0, np.random.default_rng(0).bytes(500_000)))
-        store.done(attempt, {})
+        store.done(attempt, PressResult(press=make.press()))
 
     with pytest.raises(DiskFull, match="No space left on device"):
         finish()
@@ -138,7 +139,7 @@ def test_a_clock_that_is_set_back_is_noted_and_reorders_nothing(make, tmp_path):
         messages[1] = make.stroke(number, stroke_id=f"stroke {number}")
         early = messages[0].log_ns - 500
         messages[1] = type(messages[1])(messages[1].topic, early, early, number, messages[1].message)
-        make.take(store, f"key {number}", "capture", messages, {})
+        make.take(store, f"key {number}", messages, make.captured(f"stroke {number}", number))
     final = store.close()
     store.release()
     captures = list(Recording(final).captures())

@@ -68,7 +68,7 @@ def test_a_damaged_journal_line_is_reported_and_whether_the_files_make_up_for_it
 
 
 def test_an_image_that_does_not_decode_is_damage_though_every_crc_holds(make, store):
-    make.take(store, "a", "capture", [make.still(0, b"no image"), make.stroke(0)], {})
+    make.take(store, "a", [make.still(0, b"no image"), make.stroke(0)], make.captured("", 0))
     [finding] = words(store.folder)
     assert finding.endswith("(capture) the image 0 on /camera/still is not a complete PNG or JPEG image")
 

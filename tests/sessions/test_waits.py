@@ -6,27 +6,16 @@ import csv
 
 import pytest
 
+from brushloop.sessions.events import CaptureResult, StepKind
 from brushloop.sessions.export import export
 from brushloop.sessions.history import unlike, waits_of
 
 
-def step(kind: str, stroke_id: str, **result: object) -> dict[str, object]:
-    return {"kind": kind, "result": {"stroke_id": stroke_id, **result}}
-
-
-def test_a_wait_belongs_to_the_take_that_the_photograph_shows():
-    lines = [
-        {"kind": "zero_touch", "result": {}},
-        step("press", "a", dip_to_touch_s=1.1),
-        step("capture", "a", still=3),
-        step("press", "a", dip_to_touch_s=7),  # pressed again
-        step("capture", "a", still=6),
-        step("press", "b"),  # from before waits were recorded
-        step("capture", "b", still=9),
-        step("draw", "c", dip_to_touch_s=2.5),
-        step("capture", "c", still=12),
-    ]
-    assert waits_of(lines) == {3: 1.1, 6: 7.0, 12: 2.5}
+def test_a_wait_belongs_to_the_take_that_the_photograph_shows(make, store):
+    for still, wait_s in ((3, 1.1), (6, 7.0), (9, None)):
+        captured = CaptureResult(press=make.press("a", dip_to_touch_s=wait_s), still=still)
+        store.done(store.begin(f"k{still}", StepKind.CAPTURE), captured)
+    assert waits_of(store.state) == {3: 1.1, 6: 7.0}
 
 
 def test_the_first_press_of_a_session_that_looked_after_its_dip_is_named():

@@ -261,7 +261,7 @@ def _collected(one: LoadedSession) -> Collected | None:
         photographed=history.photographed,
         pressed_again=history.pressed_again,
         left_out=history.left_out,
-        touches=tuple(f"{found.method} {found.touch_z_mm:.2f} mm" for found in history.found),
+        touches=tuple(f"{found.method} {found.touch_z_mm:.2f} mm" for found in history.touches),
         moved_mm=_round(history.moved_mm),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,37 +16,38 @@ from brushloop.collect.engine.last_capture import LastCapture, pictures_of, publ
 from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.engine.steps.retake import decide
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
-from brushloop.collect.protocols.steps import MARKING, Result, StepKind
+from brushloop.collect.protocols.steps import MARKING, CaptureStep
 from brushloop.collect.quality.checks import check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.quality.verdict import Check, Family, Verdict
 from brushloop.collect.rig.optics import undistorted
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.samples import Frame
 from brushloop.sessions import records
+from brushloop.sessions.events import BoardResult, CaptureResult, Press
 from brushloop.sessions.history import limit_s, unlike, waits_of
 
 MOVED_MM = 1.0
 """Distance by which the sheet may seem to have moved in the picture since the first mark of the session."""
 
 
-async def board(context: StepContext) -> Result:
+async def board(context: StepContext) -> BoardResult:
     """The BOARD step. Raises `StepError` where the board is not seen: nothing that follows could be measured; and
     `NeedsOperator` where photographs have another size, or the board another place, than before the first mark."""
     image = await photograph(context)
     with context.recorder.sections.timed("see the board"):
         plane, checks = await uninterrupted(_board, context.run, image)
-    return {
-        "still": context.attempt.serial,
-        "corners": plane.corners,
-        "mm_per_px": plane.mm_per_px,
-        "rms_px": plane.rms_px,
-        "size_px": [image.shape[1], image.shape[0]],
-        "sheet_px": plane.to_image(_sheet_corners_mm(context.run.rig.config.paper.size_mm)).tolist(),
-        **_camera_delay(context),
-        "checks": [
-            {"name": str(c.name), "score": c.score, "threshold": c.threshold, "passed": c.passed} for c in checks
-        ],
-    }
+    delay_ms, jitter_ms = _camera_delay(context)
+    return BoardResult(
+        still=context.attempt.serial,
+        corners=plane.corners,
+        mm_per_px=plane.mm_per_px,
+        rms_px=plane.rms_px,
+        size_px=(image.shape[1], image.shape[0]),
+        sheet_px=plane.to_image(_sheet_corners_mm(context.run.rig.config.paper.size_mm)).tolist(),
+        camera_delay_ms=delay_ms,
+        camera_jitter_ms=jitter_ms,
+        checks=_recorded_checks(checks),
+    )
 
 
 def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
@@ -63,26 +65,26 @@ def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
     return plane, frame.checks
 
 
-def _before_first_mark(run: RunContext) -> Result | None:
+def _before_first_mark(run: RunContext) -> BoardResult | None:
     """The board as it was last seen before the session's first mark; None as long as there is no mark."""
     before = None
-    for line in run.store.state.segments:
-        if line["kind"] in MARKING:
+    for step in run.store.state.files.values():
+        if step.kind in MARKING:
             return before
-        if line["kind"] == StepKind.BOARD:
-            before = line["result"]
+        if isinstance(step.result, BoardResult):
+            before = step.result
     return None
 
 
-def _check_view(before: Result, image: Gray, plane: Plane, sheet_mm: tuple[float, float]) -> None:
+def _check_view(before: BoardResult, image: Gray, plane: Plane, sheet_mm: tuple[float, float]) -> None:
     """Raise `NeedsOperator` unless frame size and place of the board are those of the session's other strokes."""
     height_px, width_px = image.shape
-    if (size_px := tuple(before["size_px"])) != (width_px, height_px):
+    if (size_px := before.size_px) != (width_px, height_px):
         raise NeedsOperator(
             f"the camera gives {width_px} x {height_px} px, and gave {size_px[0]} x {size_px[1]} px when the session "
             "began: set it back (camera.locked in rig.toml), or start a new session with --new."
         )
-    seen_mm = plane.to_paper(np.array(before["sheet_px"]))
+    seen_mm = plane.to_paper(np.array(before.sheet_px))
     moved_mm = float(np.linalg.norm(seen_mm - _sheet_corners_mm(sheet_mm), axis=1).max())
     if moved_mm > MOVED_MM:
         raise NeedsOperator(
@@ -151,88 +153,85 @@ async def _recorded(context: StepContext, frame: Frame) -> Gray:
     return await uninterrupted(undistorted, context.run.rig.config.camera, frame.image)
 
 
-def _camera_delay(context: StepContext) -> Result:
+def _camera_delay(context: StepContext) -> tuple[float, float] | tuple[None, None]:
+    """(delay of the camera, its variation), ms; None where they were not measured."""
     delay = context.run.procedures.photographer.delay
-    if delay is None:
-        return {}
-    return {"camera_delay_ms": round(1e3 * delay.delay_s, 1), "camera_jitter_ms": round(1e3 * delay.spread_s, 1)}
+    return (None, None) if delay is None else (round(1e3 * delay.delay_s, 1), round(1e3 * delay.spread_s, 1))
 
 
-async def capture(context: StepContext) -> Result:
+async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
     """The CAPTURE step: `kept` if the stroke counts, `retake` if it must be pressed again on another patch.
 
     Once the frame is there, the arm goes where the next dip begins, if another stroke is planned, while the frame is
     recorded and judged. The brush is empty and stays so until the decision is in the journal: only the next step may
     dip it. Raises `BadPicture` if the photograph, not the stroke, is at fault.
     """
-    run, stroke_id = context.run, str(context.step.params["stroke_id"])
-    if int(context.number("sheet")) != run.store.state.sheet:
-        raise StepError(f"{stroke_id} is not on the sheet that is in")
-    patch = run.sheet.patch(int(context.number("patch")))
+    run, press = context.run, step.press
+    if press.patch is None or press.sheet != run.store.state.sheet:
+        raise StepError(f"{press.stroke_id} is not on the sheet that is in")
+    patch = run.sheet.patch(press.patch)
     frame = await _fresh_frame(context)
-    waited = _wait_check(context)
-    looking = _looked_at(context, frame, patch, waited)
-    if run.progress.more_than(stroke_id):
+    waited = _wait_check(context, press)
+    looking = _looked_at(context, step, frame, patch, waited)
+    if run.progress.more_than(press.stroke_id):
         image, verdict = await meanwhile(context.guard.guarded(run.procedures.set_out()), looking)
     else:
         image, verdict = await looking  # a dip for a retake goes to the well by itself
-    kept, retake = await decide(context, verdict, image, patch)
+    kept, retake = await decide(run, press, verdict, image, patch)
     if not kept:
         run.progress.not_kept()
     if kept:
-        context.recorder.stroke(_stroke(context, patch, None if waited is None else waited.score))
-    return {
-        "stroke_id": stroke_id,
-        "still": context.attempt.serial,
-        "depth_mm": context.number("depth_mm"),
-        "tilt_deg": context.number("tilt_deg"),
-        "kept": kept,
-        "retake": retake,
-        **_camera_delay(context),
-        "verdict": "" if verdict is None or verdict.cause is None else str(verdict.cause.name),
-    }
+        context.recorder.stroke(_stroke(step, patch, context.attempt.serial))
+    delay_ms, jitter_ms = _camera_delay(context)
+    return CaptureResult(
+        press=press,
+        still=context.attempt.serial,
+        kept=kept,
+        retake=retake,
+        verdict="" if verdict is None or verdict.cause is None else str(verdict.cause.name),
+        camera_delay_ms=delay_ms,
+        camera_jitter_ms=jitter_ms,
+    )
 
 
 async def _looked_at(
-    context: StepContext, frame: Frame, patch: Patch, waited: records.Check | None
+    context: StepContext, step: CaptureStep, frame: Frame, patch: Patch, waited: records.Check | None
 ) -> tuple[Gray, Verdict | None]:
     """Record the frame, judge the stroke in it, and show both; nothing moves here."""
     image = await _recorded(context, frame)
-    verdict = await _judged(context, image, patch, waited)
+    verdict = await _judged(context, step, image, patch, waited)
     context.run.memory.sound_frame = image
     if context.run.asker.watched:
-        await uninterrupted(_show, context, verdict, image, patch)
+        await uninterrupted(_show, context, step, verdict, image, patch)
     return image, verdict
 
 
-def _wait_check(context: StepContext) -> records.Check | None:
+def _wait_check(context: StepContext, press: Press) -> records.Check | None:
     """Compare this stroke's time from dip to touch with those of earlier strokes; None if it was not recorded.
 
     The check is recorded as a remark and decides nothing: the ink is judged from the photograph.
     """
-    still, stroke_id = context.attempt.serial, context.step.params["stroke_id"]
-    this = {"kind": "capture", "result": {"stroke_id": stroke_id, "still": still}}
-    waits = waits_of([*context.run.store.state.segments, this])
-    if still not in waits:
+    still, wait_s = context.attempt.serial, press.dip_to_touch_s
+    if wait_s is None:
         return None
+    waits = {**waits_of(context.run.store.state), still: wait_s}
     reason, found = unlike(waits).get(still, ""), limit_s(waits.values())
     threshold = None if found is None else sum(found)
-    return records.Check(name="dip_to_touch", score=waits[still], threshold=threshold, passed=not reason, reason=reason)
+    return records.Check(name="dip_to_touch", score=wait_s, threshold=threshold, passed=not reason, reason=reason)
 
 
-async def _judged(context: StepContext, image: Gray, patch: Patch, waited: records.Check | None) -> Verdict | None:
+async def _judged(
+    context: StepContext, step: CaptureStep, image: Gray, patch: Patch, waited: records.Check | None
+) -> Verdict | None:
     """Judge the capture and record the checks; None where captures are not judged."""
-    run, stroke_id = context.run, str(context.step.params["stroke_id"])
+    run, stroke_id = context.run, step.press.stroke_id
     if waited is not None and not waited.passed:
         run.progress.log(f"{stroke_id}: {waited.reason}", warning=True)
     if not run.rig.config.quality.enabled:
         return None
     with context.recorder.sections.timed("judge the capture"):
-        verdict = await uninterrupted(_judge, context, image, patch)
-    checks = tuple(
-        records.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
-        for c in verdict.checks
-    )
+        verdict = await uninterrupted(_judge, context.run, step, image, patch)
+    checks = _recorded_checks(verdict.checks)
     remarks = () if waited is None else (waited,)
     context.recorder.quality(records.Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
     if verdict.cause is not None:
@@ -242,14 +241,17 @@ async def _judged(context: StepContext, image: Gray, patch: Patch, waited: recor
     return verdict
 
 
-def _drawn(context: StepContext) -> bool:
-    return bool(context.step.params.get("drawn"))
+def _recorded_checks(checks: Iterable[Check]) -> tuple[records.Check, ...]:
+    return tuple(
+        records.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
+        for c in checks
+    )
 
 
-def _judge(context: StepContext, image: Gray, patch: Patch) -> Verdict:
-    run, depth_mm = context.run, context.number("depth_mm")
+def _judge(run: RunContext, step: CaptureStep, image: Gray, patch: Patch) -> Verdict:
+    depth_mm = step.press.condition.depth_mm
     config, previous, plane = run.rig.config, run.memory.sound_frame, run.image_plane(image)
-    if _drawn(context):
+    if step.drawn:
         return check_drawing(image, plane, patch, depth_mm=depth_mm, limits=config.quality, previous=previous)
     return check_capture(
         image,
@@ -262,28 +264,30 @@ def _judge(context: StepContext, image: Gray, patch: Patch) -> Verdict:
     )
 
 
-def _show(context: StepContext, verdict: Verdict | None, image: Gray, patch: Patch) -> None:
+def _show(context: StepContext, step: CaptureStep, verdict: Verdict | None, image: Gray, patch: Patch) -> None:
     photo = binary = None
     with contextlib.suppress(BadPicture):
         photo, binary = pictures_of(image, context.run.image_plane(image), patch)
-    stroke_id, still = str(context.step.params["stroke_id"]), context.attempt.serial
-    depth_mm, tilt_deg = context.number("depth_mm"), context.number("tilt_deg")
+    stroke_id, still = step.press.stroke_id, context.attempt.serial
+    depth_mm, tilt_deg = step.press.condition.depth_mm, step.press.condition.tilt_deg
     brush = context.run.rig.config.brush
     sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
-    model = None if _drawn(context) else published_mark(depth_mm, tilt_deg, **sizes)
+    model = None if step.drawn else published_mark(depth_mm, tilt_deg, **sizes)
     context.run.progress.show(LastCapture(stroke_id, depth_mm, tilt_deg, still, True, verdict, photo, binary, model))
 
 
-def _stroke(context: StepContext, patch: Patch, dip_to_touch_s: float | None) -> records.Stroke:
-    again_of = context.step.params.get("again_of")
+def _stroke(step: CaptureStep, patch: Patch, still: int) -> records.Stroke:
+    press = step.press
     return records.Stroke(
-        stroke_id=str(context.step.params["stroke_id"]),
-        kind="drag" if _drawn(context) else "press",
-        still=context.attempt.serial,
-        depth_mm=context.number("depth_mm"),
-        tilt_deg=context.number("tilt_deg"),
+        stroke_id=press.stroke_id,
+        kind="drag" if step.drawn else "press",
+        still=still,
+        depth_mm=press.condition.depth_mm,
+        tilt_deg=press.condition.tilt_deg,
+        heading_deg=press.condition.heading_deg,
+        reached_mm=press.reached_mm,
         cell_mm=patch.rect_mm,
         anchor_mm=patch.anchor_mm,
-        again_of=None if again_of is None else str(again_of),
-        dip_to_touch_s=dip_to_touch_s,
+        again_of=step.again_of,
+        dip_to_touch_s=press.dip_to_touch_s,
     )

@@ -17,7 +17,6 @@ from brushloop.collect.errors import BadPicture
 from brushloop.collect.motion.procedures import Procedures
 from brushloop.collect.operator import Asker, OperatorRequests
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.steps import Step
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.places import used_patches as touched_patches
@@ -98,7 +97,6 @@ class RunContext:
         self.store.fresh_sheet()
         self.memory.sound_frame = None
         self.forget_camera()
-        self.progress.sheet_in(self.store.state.sheet)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +104,6 @@ class StepContext:
     """One attempt at one step."""
 
     run: RunContext
-    step: Step
     patch: Patch | None
     """Patch to press."""
     more_patches: tuple[Patch, ...]
@@ -114,12 +111,6 @@ class StepContext:
     attempt: Attempt
     recorder: Recorder
     guard: ForceGuard
-
-    def number(self, name: str) -> float:
-        """A parameter that is a number."""
-        value = self.step.params[name]
-        assert isinstance(value, float | int)
-        return float(value)
 
 
 async def meanwhile(moving: Coroutine[Any, Any, None], work: Coroutine[Any, Any, _R]) -> _R:

@@ -14,9 +14,9 @@ from brushloop.collect.engine.steps.context import RunContext, StepContext
 from brushloop.collect.errors import NeedsOperator
 from brushloop.collect.motion.moves import Move
 from brushloop.collect.motion.procedures import TOUCH_TOLERANCE_MM
-from brushloop.collect.protocols.steps import Result
 from brushloop.collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
 from brushloop.drivers.samples import PoseSample
+from brushloop.sessions.events import DipResult
 
 LEVEL_RISES = 0.005
 """A dose that raises the level of the well by less than this has not arrived."""
@@ -24,11 +24,11 @@ STALE_INK_S = 5.0
 """After a longer wait (a pause, a question, a photograph) the brush dips again before it presses."""
 
 
-async def dip(context: StepContext) -> Result:
+async def dip(context: StepContext) -> DipResult:
     """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
     level = await fill_brush(context)
-    return {} if level is None else {"ink_level": level, "dosed_ml": context.run.memory.dosed_ml}
+    return DipResult(ink_level=level, dosed_ml=None if level is None else context.run.memory.dosed_ml)
 
 
 async def fill_brush(context: StepContext) -> float | None:

@@ -9,28 +9,28 @@ from brushloop.collect.engine.steps.context import StepContext
 from brushloop.collect.engine.steps.dip import DipToTouch, fill_brush, must_dip
 from brushloop.collect.motion.moves import press_moves, stroke_moves
 from brushloop.collect.motion.procedures import check_drawn, draw_stroke
-from brushloop.collect.protocols.plan import Drawn
-from brushloop.collect.protocols.steps import Result
+from brushloop.collect.protocols.steps import DrawStep, PressStep
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Patch
-from brushloop.sessions.history import WAIT
+from brushloop.sessions.events import DrawResult, Press, PressResult
 
 
-async def press(context: StepContext) -> Result:
+async def press(context: StepContext, step: PressStep) -> PressResult:
     """The PRESS step."""
     patch, procedures = await _ready(context), context.run.procedures
-    depth_mm, tilt_deg = context.number("depth_mm"), context.number("tilt_deg")
+    depth_mm, tilt_deg = step.press.condition.depth_mm, step.press.condition.tilt_deg
     down, _ = press_moves(context.run.rig.config, procedures.plane, patch, depth_mm, tilt_deg)
     with DipToTouch(context).watching() as timing:
         await timing.begin(down[0])
-        pressing = procedures.press(patch, depth_mm, tilt_deg, context.number("dwell_s"))
+        pressing = procedures.press(patch, depth_mm, tilt_deg, step.dwell_s)
         reached_mm = await context.guard.guarded(pressing)
-    return _marked(context, reached_mm, context.guard.peak_n, timing)
+    made = _made(context, step.press, reached_mm, timing)
+    return PressResult(press=made, peak_force_n=_peak_n(context, context.guard.peak_n))
 
 
-async def draw(context: StepContext) -> Result:
+async def draw(context: StepContext, step: DrawStep) -> DrawResult:
     """The DRAW step: every stroke of a figure, with dips in between if the protocol asks for them."""
-    run, drawn = context.run, Drawn.of(context.step)
+    run, drawn = context.run, step.drawn
     patch = await _ready(context)
     plane = run.procedures.plane
     config = run.rig.config
@@ -54,7 +54,8 @@ async def draw(context: StepContext) -> Result:
             )
             depths_mm.append(await context.guard.guarded(stroke))
             peaks_n.append(context.guard.peak_n)
-    return {**_marked(context, max(depths_mm), max(peaks_n), timing), "depths_mm": depths_mm}
+    made = _made(context, step.press, max(depths_mm), timing)
+    return DrawResult(press=made, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm))
 
 
 async def _ready(context: StepContext) -> Patch:
@@ -68,14 +69,13 @@ async def _ready(context: StepContext) -> Patch:
     return context.patch
 
 
-def _marked(context: StepContext, depth_mm: float, peak_n: float, timing: DipToTouch) -> Result:
+def _made(context: StepContext, press: Press, reached_mm: float, timing: DipToTouch) -> Press:
+    """The press with its place, and what was measured of it."""
     assert context.patch is not None
-    result: Result = {
-        "stroke_id": context.step.params["stroke_id"],
-        "sheet": context.run.store.state.sheet,
-        "patch": context.patch.index,
-        "depth_mm": depth_mm,
-    }
-    if timing.longest_s is not None:
-        result[WAIT] = round(timing.longest_s, 3)
-    return result if context.run.rig.force is None else {**result, "peak_force_n": peak_n}
+    wait_s = None if timing.longest_s is None else round(timing.longest_s, 3)
+    place = {"sheet": context.run.store.state.sheet, "patch": context.patch.index}
+    return press.model_copy(update={**place, "reached_mm": reached_mm, "dip_to_touch_s": wait_s})
+
+
+def _peak_n(context: StepContext, peak_n: float) -> float | None:
+    return None if context.run.rig.force is None else peak_n

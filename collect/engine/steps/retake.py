@@ -8,21 +8,23 @@ from __future__ import annotations
 import numpy as np
 
 from brushloop.calibrate.stroke.params import Gray
-from brushloop.collect.engine.steps.context import RunContext, StepContext
+from brushloop.collect.engine.steps.context import RunContext
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.protocols.steps import Result, StepKind
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.collect.rig.paper import Patch
-from brushloop.sessions.remarks import remarks_of
+from brushloop.sessions.events import Again, CaptureResult, Press, ReviewResult
+from brushloop.sessions.history import remarks_of
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
 """Margin around the patch in the picture that goes with a question."""
 
 
-async def decide(context: StepContext, verdict: Verdict | None, image: Gray, patch: Patch) -> tuple[bool, bool]:
-    """Return (kept, retake) of the stroke in `image`, by the operator's request if there is one, else the verdict."""
-    run, stroke_id = context.run, str(context.step.params["stroke_id"])
+async def decide(
+    run: RunContext, press: Press, verdict: Verdict | None, image: Gray, patch: Patch
+) -> tuple[bool, bool]:
+    """Return (kept, retake) of the press in `image`, by the operator's request if there is one, else the verdict."""
+    stroke_id = press.stroke_id
     if run.requests.take(OperatorRequest.RETAKE):
         run.progress.log(f"{stroke_id}: is pressed again, as the operator requested")
         return False, True
@@ -31,23 +33,22 @@ async def decide(context: StepContext, verdict: Verdict | None, image: Gray, pat
         return False, False
     if verdict is None or verdict.passed:
         return True, False
-    return await _after_failure(context, verdict, image, patch)
+    return await _after_failure(run, press, verdict, image, patch)
 
 
-async def _after_failure(context: StepContext, verdict: Verdict, image: Gray, patch: Patch) -> tuple[bool, bool]:
+async def _after_failure(
+    run: RunContext, press: Press, verdict: Verdict, image: Gray, patch: Patch
+) -> tuple[bool, bool]:
     """Retake while takes are left, then let a person decide; without a screen, leave the stroke out.
 
     Raises `NeedsOperator` if the screen went away: the step stays open, and is done and asked about again on resume.
     """
-    run = context.run
-    take = int(context.step.params.get("take") or 1)
-    if take <= run.rig.config.quality.retakes:
+    if press.take <= run.rig.config.quality.retakes:
         return False, True
-    stroke_id = str(context.step.params["stroke_id"])
-    text = f"{stroke_id}, take {take}: {verdict.reason}"
+    text = f"{press.stroke_id}, take {press.take}: {verdict.reason}"
     prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, patch))
     if not run.asker.attended:
-        run.progress.log(f"{stroke_id}: left out", warning=True)
+        run.progress.log(f"{press.stroke_id}: left out", warning=True)
         return False, False
     await run.procedures.park()  # a person may reach under the arm
     answer = await run.asker.ask(prompt)
@@ -73,20 +74,18 @@ def marked_bad(run: RunContext) -> list[str]:
     remarks = remarks_of(run.store.folder)
     if not remarks:
         return []
-    lines = run.store.state.segments
-    given = {str(name) for line in lines if line["kind"] == StepKind.REVIEW for name, _ in line["result"]["again"]}
-    captures = [line["result"] for line in lines if line["kind"] == StepKind.CAPTURE]
+    state = run.store.state
+    listed = {again.stroke_id for review in state.results(ReviewResult) for again in review.again}
     bad = {remark.still for remark in remarks.values() if remark.bad}
-    counted = [str(r["stroke_id"]) for r in captures if r.get("kept", True) and int(r["still"]) in bad]
-    return [name for name in counted if name not in given]
+    counted = [one.press.stroke_id for one in state.results(CaptureResult) if one.kept and one.still in bad]
+    return [name for name in counted if name not in listed]
 
 
-async def review(context: StepContext) -> Result:
-    """The REVIEW step: `again` holds [stroke_id, index of its new steps] of each stroke to press again."""
-    run = context.run
-    lines = [line["result"]["again"] for line in run.store.state.segments if line["kind"] == StepKind.REVIEW]
-    first = run.progress.first_free_index + sum(map(len, lines))
-    again = [[name, first + n] for n, name in enumerate(marked_bad(run))]
-    for name, _ in again:
-        run.progress.log(f"{name} was marked bad in the review and is pressed again")
-    return {"again": again}
+async def review(run: RunContext) -> ReviewResult:
+    """The REVIEW step: the strokes to press again."""
+    reviews = run.store.state.results(ReviewResult)
+    first = run.progress.first_free_index + sum(len(review.again) for review in reviews)
+    again = tuple(Again(stroke_id=name, index=first + n) for n, name in enumerate(marked_bad(run)))
+    for one in again:
+        run.progress.log(f"{one.stroke_id} was marked bad in the review and is pressed again")
+    return ReviewResult(again=again)

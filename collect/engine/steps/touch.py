@@ -13,7 +13,7 @@ from brushloop.collect.motion.moves import visit_moves
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.planning.limit_check import check_poses, check_step
 from brushloop.collect.planning.walk import touch_of
-from brushloop.collect.protocols.steps import Result
+from brushloop.collect.protocols.steps import TouchStep, ZeroTouchStep
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.arm import ForceTap
@@ -21,10 +21,11 @@ from brushloop.collect.touch.heights import PlaneResult, kept
 from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.drivers.samples import Frame
+from brushloop.sessions.events import SelfCheckResult, TouchResult, ZeroTouchResult
 from brushloop.sessions.messages import Transform
 
 
-async def zero_touch(context: StepContext) -> Result:
+async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResult:
     """The ZERO_TOUCH step: set the light, measure the force sensor's bias and the paper's plane, and check that every
     planned pose still lies within the limits."""
     run = context.run
@@ -32,26 +33,26 @@ async def zero_touch(context: StepContext) -> Result:
     await set_light(run)
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
-    if context.step.params.get("method") == "kept":
+    if step.method == "kept":
         found = kept(run.procedures.plane, rig.config.paper.touch_point_mm)
     else:
-        if "method" in context.step.params:
-            await _check(check_step, "", rig.config, run.procedures.plane, context.step)
-        found = await _measured(context, touch_of(rig.config, context.step))
+        if step.method is not None:
+            await _check(check_step, "", rig.config, run.procedures.plane, step)
+        found = await _measured(context, touch_of(rig.config, step))
     await _check(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, found.plane)
     moved_mm = _moved_mm(found, run.procedures.plane)
     if found.method == "kept":
         run.progress.log(f"zero touch was given up: {_height(run)} is kept", warning=True)
     elif found.method != "taught":
         run.progress.log(f"zero touch by {found.method}: {_compared(moved_mm, found.plane, run.procedures.plane)}")
-    if context.step.params.get("between_strokes"):
+    if step.between_strokes:
         await _accepted(context, moved_mm)
     run.procedures.plane = found.plane
     origin_mm, quaternion = found.plane.frame(rig.config.paper)
     context.recorder.frames([Transform("base", "paper", origin_mm, quaternion)])
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
-    return {**found.as_dict(), "moved_mm": moved_mm}
+    return found.result(moved_mm)
 
 
 def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
@@ -74,17 +75,17 @@ async def _accepted(context: StepContext, moved_mm: float) -> None:
         raise StepError("the new height was not accepted.")
 
 
-async def touch(context: StepContext) -> Result:
+async def touch(context: StepContext, step: TouchStep) -> TouchResult:
     """The TOUCH step: measure the height of one point, by the method of the rig."""
     run = context.run
-    config = touch_of(run.rig.config, context.step)
+    config = touch_of(run.rig.config, step)
     if config.method == "taught":
         [point] = config.points_mm
         z_mm = await context.guard.guarded(_visited(run, point))
-        return {"x_mm": point[0], "y_mm": point[1], "z_mm": z_mm, "method": "taught"}
+        return TouchResult(method="taught", x_mm=point[0], y_mm=point[1], z_mm=z_mm)
     found = await _measured(context, config)
     x_mm, y_mm, z_mm = found.points[0].mean
-    return {"x_mm": x_mm, "y_mm": y_mm, "z_mm": z_mm, "span_mm": found.points[0].span_mm, "method": found.method}
+    return TouchResult(method=found.method, x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, span_mm=found.points[0].span_mm)
 
 
 async def _visited(run: RunContext, point: tuple[float, float]) -> float:
@@ -97,15 +98,14 @@ async def _visited(run: RunContext, point: tuple[float, float]) -> float:
     return z_mm
 
 
-async def check_rig(context: StepContext) -> Result:
+async def check_rig(context: StepContext) -> SelfCheckResult:
     """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
     run, patch = context.run, context.patch
     assert patch is not None
     patches = (patch, *context.more_patches)
     places_mm = triangle_on(patches, run.rig.config.self_check)
     checked = await context.guard.guarded(self_check(run.rig, _Effector(context), places_mm, run.procedures.plane))
-    marked = {"sheet": run.store.state.sheet, "patch": patch.index, "patches": [one.index for one in patches]}
-    return {**checked.as_dict(), **marked}
+    return checked.result(run.store.state.sheet, tuple(one.index for one in patches))
 
 
 class _Effector:

@@ -8,7 +8,6 @@ import itertools
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from brushloop.collect.engine.dry_run import DryRunEngine
 from brushloop.collect.engine.engine import Engine
@@ -22,8 +21,9 @@ from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.rig_text import rig_of, rig_text
 from brushloop.collect.teach.store import Notebook, StepName
 from brushloop.drivers.cancellation import finished
+from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.run_state import replay
 
 ABOVE_MM = 30.0
 SLOW_MM_S = 45.0
@@ -191,37 +191,33 @@ class Proven:
 
 def read_proof(session: Path) -> Proven:
     """From the journal of the session. Raises `CannotTeach` unless all presses passed the quality checks."""
-    results: list[dict[str, Any]] = [line["result"] for line in replay(session / JOURNAL_NAME).done.values()]
-
-    def having(name: str) -> dict[str, Any]:
-        """The newest: a press that failed a quality check is repeated."""
-        none: dict[str, Any] = {}
-        return next((result for result in reversed(results) if name in result), none)
-
-    touch, check, capture = having("slope_deg"), having("turn_deg"), having("kept")
-    presses = [result for result in results if "kept" in result and not result["retake"]]
-    passed = [press for press in presses if press["kept"] and not press["verdict"]]
+    state = replay(session / JOURNAL_NAME)
+    captures = state.results(CaptureResult)
+    last = [capture for capture in captures if not capture.retake]
+    passed = [capture for capture in last if capture.kept and not capture.verdict]
     if len(passed) < PRESSES:
-        why = sorted({str(press["verdict"]) or "left out" for press in presses if press not in passed})
+        why = sorted({capture.verdict or "left out" for capture in last if capture not in passed})
         raise CannotTeach(
             f"{len(passed)} of {PRESSES} presses passed the quality checks "
             f"({', '.join(why) or 'the others were not made'}).",
             "Look at their pictures above: ink, light, sheet; then run the proof again.",
         )
-    if not touch or not check:
+    touches, checks = state.results(ZeroTouchResult), state.results(SelfCheckResult)
+    if not touches or not checks:
         raise CannotTeach("the run had no touch or no self-check.", "Report this as a defect.")
-    sigmas = [sigma for point in touch["points"] for sigma in point["sigma_mm"] if sigma is not None]
+    touch, check, capture = touches[-1], checks[-1], captures[-1]
+    sigmas = [sigma for point in touch.points for sigma in point.sigma_mm if sigma is not None]
     return Proven(
-        PaperPlane(float(touch["touch_z_mm"]), float(touch["slope_x"]), float(touch["slope_y"])),
-        str(touch["method"]),
-        max((abs(float(r)) for r in touch["residuals_mm"]), default=0.0),
-        float(max(sigmas, default=0.0)),
-        float(capture["camera_delay_ms"]),
-        float(capture["camera_jitter_ms"]),
-        (float(check["offset_mm"][0]), float(check["offset_mm"][1])),
-        float(check["turn_deg"]),
+        PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y),
+        touch.method,
+        max((abs(residual_mm) for residual_mm in touch.residuals_mm), default=0.0),
+        max(sigmas, default=0.0),
+        capture.camera_delay_ms or 0.0,
+        capture.camera_jitter_ms or 0.0,
+        check.offset_mm,
+        check.turn_deg,
         len(passed),
-        sum(1 for result in results if result.get("retake")),
+        sum(capture.retake for capture in captures),
     )
 
 

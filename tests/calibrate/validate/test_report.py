@@ -24,9 +24,9 @@ from brushloop.calibrate.validate.report.findings import trust
 from brushloop.calibrate.validate.report.outputs import COLUMNS, score_rows
 from brushloop.calibrate.validate.report.page import _of_session
 from brushloop.calibrate.validate.run import Outcome
+from brushloop.sessions.history import Remark, add_remark
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
-from brushloop.sessions.remarks import Remark, add_remark
 from tests.browser import BROWSER, content_widths_px
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")

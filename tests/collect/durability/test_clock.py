@@ -84,7 +84,8 @@ def test_a_clock_that_was_set_back_between_two_processes_is_noted_and_reorders_n
     [noted] = [line for line in lines if line["event"] == "clock"]
     assert noted["back_s"] == pytest.approx(HOUR_S, abs=60.0)
     assert lines[lines.index(noted) + 1]["event"] == "process"
-    captured = [line["result"]["stroke_id"] for line in lines if line["event"] == "done" and line["kind"] == "capture"]
+    results = [line["result"] for line in lines if line["event"] == "done"]
+    captured = [result["press"]["stroke_id"] for result in results if result["kind"] == "capture"]
     assert [capture.stroke.stroke_id for capture in Recording(folder).captures()] == captured
     assert len(set(captured)) == 3
     assert verify_session(folder).sound

@@ -50,7 +50,7 @@ def run(lab: Lab, protocol: str = "") -> Path:
 
 def results(folder: Path, kind: str) -> list[dict[str, Any]]:
     done = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "done"]
-    return [line["result"] for line in done if line["kind"] == kind]
+    return [line["result"] for line in done if line["result"]["kind"] == kind]
 
 
 @pytest.fixture

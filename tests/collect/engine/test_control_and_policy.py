@@ -9,8 +9,9 @@ import pytest
 from brushloop.collect.engine.control import FINAL, TRANSITIONS, IllegalTransition, RunControl, State, check_transition
 from brushloop.collect.engine.policy import MAX_FAILURES, Action, decide
 from brushloop.collect.errors import ForceTooHigh, SheetFull, StepVoid, arm_at_fault
-from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import CaptureStep, PressStep, Step
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, MotionFailed, RobotNotSafe, Stuck
+from brushloop.sessions.events import Condition, Press
 
 
 def test_stop_is_possible_from_every_state_that_is_not_over() -> None:
@@ -61,7 +62,8 @@ def test_a_pause_that_comes_as_the_run_goes_on_is_not_lost() -> None:
     assert control.state is State.PAUSING
 
 
-PRESS, CAPTURE = Step(StepKind.PRESS, 0), Step(StepKind.CAPTURE, 0)
+MADE = Press(stroke_id="first", condition=Condition(depth_mm=13.0, tilt_deg=5.0))
+PRESS, CAPTURE = PressStep(0, MADE), CaptureStep(0, MADE)
 LATE_CAMERA = DeviceTimeout("camera", "fresh", "no new frame")
 
 

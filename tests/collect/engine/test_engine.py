@@ -16,8 +16,8 @@ from brushloop.drivers.arcs.codes import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
 from brushloop.drivers.samples import Identity
 from brushloop.sessions.journal import read_lines
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.run_state import replay
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:

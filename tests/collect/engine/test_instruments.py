@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
@@ -14,8 +14,9 @@ from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.errors import ConnectionLost, Stuck
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.sim.faults.kinds import Device, Fault
-from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.records import Topic
+from brushloop.sessions.run_state import RunState, replay
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:
@@ -36,8 +37,8 @@ def only_session(lab: Lab) -> Path:
     return folder
 
 
-def done(lab: Lab, kind: str) -> list[dict[str, Any]]:
-    return [line for line in replay(only_session(lab) / "journal.jsonl").done.values() if line["kind"] == kind]
+def state_of(lab: Lab) -> RunState:
+    return replay(only_session(lab) / "journal.jsonl")
 
 
 def slowly(lab: Lab) -> None:
@@ -61,7 +62,7 @@ def test_force_ink_and_their_cadence_are_recorded_beside_the_poses(collected: Co
         seen = Counter(channel.topic for _, channel, _ in make_reader(file, validate_crcs=True).iter_messages())
     assert min(seen[topic] for topic in (Topic.TCP, Topic.JOINTS, Topic.WRENCH, Topic.CADENCE)) > 10
     assert seen[Topic.INK] == 4
-    peaks_n = [line["result"]["peak_force_n"] for line in done(collected.lab, "press")]
+    peaks_n = [press.peak_force_n or 0.0 for press in state_of(collected.lab).results(PressResult)]
     assert len(peaks_n) == 4
     assert all(0.02 < peak_n < 0.5 for peak_n in peaks_n)
 
@@ -152,9 +153,9 @@ def test_a_low_well_is_filled_before_the_brush_dips(lab: Lab) -> None:
     well.ml = 0.4 * well.capacity_ml
     run(lab.engine())
     assert well.share > 0.45
-    dips = [line["result"] for line in done(lab, "dip")]
-    assert all(dip["ink_level"] >= 0.5 for dip in dips)
-    assert max(dip["dosed_ml"] for dip in dips) >= 1.0
+    dips = state_of(lab).results(DipResult)
+    assert all(dip.ink_level is not None and dip.ink_level >= 0.5 for dip in dips)
+    assert max(dip.dosed_ml or 0.0 for dip in dips) >= 1.0
 
 
 def test_an_empty_reservoir_ends_the_run_before_a_dry_press(lab: Lab) -> None:
@@ -183,4 +184,4 @@ def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkey
     assert caught.value.lag_ms == 412.0
     state = replay(only_session(lab) / "journal.jsonl")
     assert state.voids == 1
-    assert not [line for line in state.done.values() if line["kind"] == "press"]
+    assert not state.results(PressResult)

@@ -14,9 +14,10 @@ from brushloop.collect.errors import CollectAborted, NeedsOperator, Parked
 from brushloop.collect.quality.checks import check_drawing
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.sessions.events import DrawResult
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.run_state import replay
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until
 
@@ -159,8 +160,8 @@ def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab
     (sharp_lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
     run(sharp_lab.engine())
     [folder] = sharp_lab.sessions.iterdir()
-    [drawn] = [line["result"] for line in replay(folder / JOURNAL_NAME).segments if line["kind"] == "draw"]
-    assert drawn["peak_force_n"] > 0.02, "the shallow stroke comes last and reaches 0.007 N"
+    [drawn] = replay(folder / JOURNAL_NAME).results(DrawResult)
+    assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
 
 
 def test_a_figure_without_ink_is_drawn_again(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,10 +17,10 @@ from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.journal import read_lines
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
+from brushloop.sessions.run_state import replay
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
 
     # The self-check spent three patches far apart, and the press lies on a fourth.
     lines = read_lines(folder / "journal.jsonl")
-    [check] = [line for line in lines if line["event"] == "done" and line["kind"] == "self_check"]
+    [check] = [line for line in lines if line["event"] == "done" and line["result"]["kind"] == "self_check"]
     assert check["result"]["patches"] == [0, 5, 36]
     assert max(abs(scale - 1.0) for scale in check["result"]["scale"]) < 0.005
     state = replay(folder / "journal.jsonl")

@@ -20,7 +20,9 @@ from brushloop.drivers.clock import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from brushloop.sessions.difference import Difference
+from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
 from brushloop.sessions.records import Header, Source
+from brushloop.sessions.run_state import RunState
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
 
@@ -206,11 +208,13 @@ def test_a_session_goes_on_with_or_without_its_check_as_it_was_begun(lab: Path, 
     assert "self_check.enabled" in "".join(refused())
 
 
-@pytest.mark.parametrize("kind", [StepKind.PRESS, StepKind.DRAW])
-def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed(kind: StepKind) -> None:
-    segments = [{"kind": kind, "result": {"stroke_id": "first"}}]
-    store: Any = SimpleNamespace(state=SimpleNamespace(sheet=0, segments=segments), fresh_sheet=lambda: None)
+def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:
+    press = Press(stroke_id="first", condition=Condition(depth_mm=13.0, tilt_deg=5.0))
+    state = RunState()
+    store: Any = SimpleNamespace(state=state, fresh_sheet=lambda: None)
+    done: dict[str, Any] = {"t_ns": 1, "attempt": 1, "sha256": "", "counts": {}}
+    state.apply(Done(key="a", file="0000-press-a.mcap", result=PressResult(press=press), **done))
     with pytest.raises(ConfigError, match="first is pressed on sheet 1 but not photographed"):
         put_in_sheet(store, 2)
-    segments.append({"kind": StepKind.CAPTURE, "result": {"stroke_id": "first"}})
+    state.apply(Done(key="b", file="0001-capture-b.mcap", result=CaptureResult(press=press, still=1), **done))
     put_in_sheet(store, 2)

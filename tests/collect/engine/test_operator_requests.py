@@ -13,11 +13,12 @@ from brushloop.collect.engine.perform import Performer
 from brushloop.collect.engine.snapshot import Mark
 from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from brushloop.collect.protocols.steps import Result, Step, StepKind
+from brushloop.collect.protocols.steps import Step, StepKind, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
+from brushloop.sessions.events import StepResult
+from brushloop.sessions.history import mark_bad_or_good
 from brushloop.sessions.journal import read_lines
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.remarks import mark_bad_or_good
 from tests.collect.conftest import Lab
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until
@@ -174,7 +175,7 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
     assert any("the paper lies +1." in line for line in engine.snapshot().messages)
-    methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
+    methods = [line["result"]["method"] for line in lines(lab, "done") if line["result"]["kind"] == "zero_touch"]  # type: ignore[index]
     assert methods == ["taught", "jog"]
 
 
@@ -182,8 +183,8 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """Zero touch between strokes ends with this error."""
     perform = Performer.perform
 
-    async def performed(self: Performer, step: Step) -> Result:
-        if step.params.get("between_strokes"):
+    async def performed(self: Performer, step: Step) -> StepResult:
+        if isinstance(step, ZeroTouchStep) and step.between_strokes:
             raise error
         return await perform(self, step)
 
@@ -228,7 +229,7 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
     wait_for_end(engine)
     now = engine.snapshot()
     assert now.strokes_done == 2
-    methods = [line["result"]["method"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]  # type: ignore[index]
+    methods = [line["result"]["method"] for line in lines(lab, "done") if line["result"]["kind"] == "zero_touch"]  # type: ignore[index]
     assert methods == ["taught"]
     assert [str(line["why"]) for line in lines(lab, "void") if "void" in line["event"]][-2:] == [
         "the new height was not accepted.",
@@ -257,7 +258,7 @@ def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
     assert any("given up: the taught height, 120.03 mm, is kept" in line for line in engine.snapshot().messages)
-    [result] = [line["result"] for line in lines(lab, "done") if line["kind"] == "zero_touch"]
+    [result] = [line["result"] for line in lines(lab, "done") if line["result"]["kind"] == "zero_touch"]
     assert (result["method"], result["touch_z_mm"], result["moved_mm"]) == ("kept", pytest.approx(120.03), 0.0)  # type: ignore[index]
 
 
@@ -311,7 +312,7 @@ def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: L
     answer(engine, "Zero touch and plane", "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 2
-    assert sum(line["kind"] == "board" for line in lines(lab, "done")) == 2
+    assert sum(line["result"]["kind"] == "board" for line in lines(lab, "done")) == 2
 
 
 def test_a_guided_calibration_lists_only_what_comes(lab: Lab) -> None:
@@ -346,7 +347,7 @@ def test_a_guided_set_up_measures_again_when_it_is_asked_to_and_shows_the_camera
     wait_for_end(engine)
     now = engine.snapshot()
     assert (now.state, now.strokes_done) == (State.DONE, 1)
-    assert sum(line["kind"] == "board" for line in lines(lab, "done")) == 2
+    assert sum(line["result"]["kind"] == "board" for line in lines(lab, "done")) == 2
     assert now.last is not None
     assert now.last.binary is not None
     assert now.last.binary.shape == (128, 128)

@@ -32,7 +32,7 @@ from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.faults.kinds import ALWAYS, Fault
 from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.journal import read_lines
-from brushloop.sessions.journal.journal import replay
+from brushloop.sessions.run_state import replay
 from brushloop.sessions.store import SessionStore
 from tests.collect.faults.conftest import CAMERA_TIMEOUT_S
 from tests.collect.until import wait_for_end
@@ -302,7 +302,7 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
         return
     [folder] = folders
     lines, state = list(read_lines(folder / "journal.jsonl")), replay(folder / "journal.jsonl")
-    done = [line["kind"] for line in lines if line["event"] == "done"]
+    done = [line["result"]["kind"] for line in lines if line["event"] == "done"]
     begun = {(line["key"], line["attempt"]): line for line in lines if line["event"] == "begin"}
     voids = [begun[line["key"], line["attempt"]] for line in lines if line["event"] == "void"]
     if outcome is DONE:
@@ -318,8 +318,8 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
         assert done == kept
         assert [line["kind"] for line in voids] == ([] if cut is None else [cut])
     for line in voids:
-        assert (line["patch"] is not None) is (line["kind"] == "press")
-        assert line["patch"] is None or (line["sheet"], line["patch"]) in state.used_patches, "burnt"
+        assert ("patch" in line) is (line["kind"] == "press")
+        assert "patch" not in line or (line["sheet"], line["patch"]) in state.used_patches, "burnt"
         assert (folder / f"{line['file']}.part").is_file(), "its evidence is kept"
     store = SessionStore(folder, None, time.time_ns)
     store.verify()

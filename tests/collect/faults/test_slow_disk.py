@@ -18,8 +18,8 @@ from brushloop.collect.engine.control import State
 from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import read_lines
-from brushloop.sessions.journal.journal import replay
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.run_state import replay
 from brushloop.sessions.step_file import ChannelTable
 from tests.collect.until import wait_for_end
 
@@ -73,7 +73,7 @@ def test_a_slow_disk_is_waited_for_and_loses_nothing(stage: Stage, disk: Disk) -
     disk.message_s, disk.sync_s = 0.012, 0.05  # a pose comes every 0.010 s
     assert run(stage) == (None, State.DONE)
     [folder] = stage.sessions.iterdir()
-    recorded = sum(sum(line["counts"].values()) for line in replay(folder / "journal.jsonl").segments)
+    recorded = sum(replay(folder / "journal.jsonl").counts().values())
     assert recorded == disk.written
     assert len(list(Recording(folder).captures())) == 1
 

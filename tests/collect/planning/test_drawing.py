@@ -12,8 +12,7 @@ from brushloop.collect.motion.moves import stroke_moves
 from brushloop.collect.motion.procedures import check_drawn, draw_stroke
 from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.plan import Drawn
-from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.protocols.steps import Drawn, DrawStep
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import limits_of, make_robot
 from brushloop.collect.rig.paper import PaperPlane
@@ -57,7 +56,7 @@ async def desk(config: RigConfig) -> AsyncIterator[Desk]:
 
 
 def first_drawn(config: RigConfig) -> Drawn:
-    return Drawn.of(next(w.step for w in walk(config, load_protocol(WRITE)) if w.step.kind == StepKind.DRAW))
+    return next(w.step.drawn for w in walk(config, load_protocol(WRITE)) if isinstance(w.step, DrawStep))
 
 
 async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None:

@@ -15,8 +15,7 @@ from brushloop.collect.planning.limit_check import all_poses, check_poses, check
 from brushloop.collect.planning.summary import Plan, make_plan
 from brushloop.collect.planning.walk import moves_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.plan import Drawn
-from brushloop.collect.protocols.steps import MARKING, StepKind
+from brushloop.collect.protocols.steps import MARKING, DrawStep, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane
@@ -201,7 +200,8 @@ def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) ->
     config, wanted = rig(tmp_path), example("protocol-write.toml")
     [draw, *_] = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
     ways = [part for part in draw.moves.parts if isinstance(part, Way)]
-    drawn = Drawn.of(draw.step)
+    assert isinstance(draw.step, DrawStep)
+    drawn = draw.step.drawn
     assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
     patch = sheet_of(config, wanted).patch(0)
     # paper x is base y, paper y is base -x

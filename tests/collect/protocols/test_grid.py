@@ -9,10 +9,12 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
+from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.presses import GridConfig
-from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import CaptureStep, PressStep
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Sheet, to_base
+from brushloop.sessions.events import Condition, Press
 
 heights = st.lists(st.integers(1, 30).map(float), min_size=1, max_size=5, unique=True)
 tilts = st.lists(st.integers(0, 15).map(float), min_size=1, max_size=4, unique=True)
@@ -41,25 +43,29 @@ def test_steps_of_a_stroke_follow_each_other_and_a_capture_belongs_to_the_cell_t
     try:
         while True:
             kinds.append(step.kind)
-            result = {"sheet": 0, "patch": 7} if step.kind == StepKind.PRESS else {}
-            step = protocol.send(result)
-            if step.kind == StepKind.CAPTURE:
-                assert step.params["patch"] == 7
+            step = protocol.send(as_planned(step, 0, 7))
+            if isinstance(step, CaptureStep):
+                assert step.press.patch == 7
     except StopIteration:
         pass
     assert kinds == ["zero_touch", "board", "dip", "press", "capture"]
 
 
 def test_keys_are_stable_across_processes_and_tell_steps_apart() -> None:
-    step = Step(StepKind.PRESS, 3, {"depth_mm": 11.0, "tilt_deg": 5.0})
+    press = Press(stroke_id="a", condition=Condition(depth_mm=11.0, tilt_deg=5.0))
+    step = PressStep(3, press)
     program = (
-        "from brushloop.collect.protocols.steps import *;"
-        "print(Step(StepKind.PRESS, 3, {'tilt_deg': 5.0, 'depth_mm': 11.0}).key)"
+        "from brushloop.collect.protocols.steps import *; from brushloop.sessions.events import *;"
+        "print(PressStep(3, Press(stroke_id='a', condition=Condition(tilt_deg=5.0, depth_mm=11.0))).key)"
     )
     other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.strip()
     assert other == step.key
-    assert step.key != Step(StepKind.PRESS, 4, step.params).key
-    assert step.key != Step(StepKind.PRESS, 3, {"depth_mm": 11.0, "tilt_deg": 6.0}).key
+    assert step.key != PressStep(4, press).key
+    assert step.key != PressStep(3, press, dwell_s=1.0).key
+    steeper = press.model_copy(update={"condition": Condition(depth_mm=11.0, tilt_deg=6.0)})
+    assert step.key != PressStep(3, steeper).key
+    measured = press.model_copy(update={"reached_mm": 10.9, "dip_to_touch_s": 1.2})
+    assert CaptureStep(3, measured).key == CaptureStep(3, press).key, "what was measured does not change what was asked"
 
 
 def paper(**changes: object) -> PaperConfig:

@@ -8,13 +8,12 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.plan import strokes_of, strokes_text
 from brushloop.collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
 from brushloop.collect.protocols.steps import MARKING, Step, StepKind
 from brushloop.collect.protocols.write import DrawnStroke, Figure, WriteConfig
@@ -79,7 +78,7 @@ def run(config: ProtocolConfig, layout: Layout | None = None, patch: int = 7) ->
         step = next(generator)
         while True:
             found.append(step)
-            step = generator.send({"sheet": 0, "patch": patch} if step.kind in MARKING else {})
+            step = generator.send(as_planned(step, 0, patch))
     except StopIteration:
         return found
 
@@ -159,24 +158,11 @@ def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
     assert isinstance(config, WriteConfig)
     drawn = [step for step in run(config) if step.kind == StepKind.DRAW]
     assert [step.params["stroke_id"] for step in drawn] == ["shi-r01", "shi-r02"]
-    strokes = strokes_of(str(drawn[0].params["strokes"]))
+    strokes = json.loads(str(drawn[0].params["strokes"]))
     assert [len(stroke) for stroke in strokes] == [6, 6]
-    assert tuple(strokes[0]) == config.figures[0].strokes[0].points
+    assert tuple(map(tuple, strokes[0])) == config.figures[0].strokes[0].points
     assert config.own_patch_mm == (80.0, 80.0)
     assert config.planned()[0].depth_mm == 9.0
-
-
-@pytest.mark.parametrize("text", ["", "{}x", "[[1]]", "[[[1,2,3]]]", '[[[1,2,3,4,"x"]]]', "3"])
-def test_trajectories_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"."):
-        strokes_of(text)
-
-
-@given(st.lists(points, max_size=3))
-def test_trajectories_survive_being_a_parameter(
-    strokes: list[tuple[tuple[float, float, float, float, float], ...]],
-) -> None:
-    assert strokes_of(strokes_text(strokes)) == [list(stroke) for stroke in strokes]
 
 
 def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:

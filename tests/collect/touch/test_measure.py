@@ -80,7 +80,7 @@ async def test_the_result_goes_into_a_journal_with_its_residuals(make_bench: Mak
     bench = make_bench((0.5, 0.5))
     four = [*THREE["points_mm"], (104.0, 76.0)]
     result = await measured(bench, method="force", touches=2, points_mm=four, force={"sigma_mm": 0.03})
-    document = json.loads(json.dumps(result.as_dict()))
+    document = json.loads(result.result(0.0).model_dump_json())
     assert document["method"] == "force"
     assert len(document["residuals_mm"]) == 4
     assert 0.0 < max(map(abs, document["residuals_mm"])) < 0.1

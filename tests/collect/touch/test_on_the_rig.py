@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.motion.procedures import Procedures
 from brushloop.collect.planning.walk import moves_of
-from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import ZeroTouchStep
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.devices import connected
@@ -47,7 +47,7 @@ async def test_a_sheet_that_lies_lower_than_taught_is_found_and_the_brush_is_lif
             at_mm = (await rig.robot.where()).position_mm
 
     asked = config.model_copy(update={"touch": touch})
-    planned = moves_of(asked, PaperPlane(config.paper.touch_z_mm), Step(StepKind.ZERO_TOUCH, 0), None)
+    planned = moves_of(asked, PaperPlane(config.paper.touch_z_mm), ZeroTouchStep(0), None)
     assert len(sent) > 10
     assert not not_checked(config, sent, planned.parts)
     [point] = result.points

@@ -11,7 +11,7 @@ import pytest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.planning.limit_check import check_step
 from brushloop.collect.planning.walk import moves_of
-from brushloop.collect.protocols.steps import Step, StepKind
+from brushloop.collect.protocols.steps import SelfCheckStep, ZeroTouchStep
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
@@ -23,7 +23,7 @@ from tests.collect.sent import lowest_mm, not_checked, not_sent
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench
 
-TOUCH, CHECK = Step(StepKind.ZERO_TOUCH, 0), Step(StepKind.SELF_CHECK, 0)
+TOUCH, CHECK = ZeroTouchStep(0), SelfCheckStep(0)
 POINTS: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], "touches": 1}
 
 

@@ -13,7 +13,7 @@ from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.sessions.remarks import Remark
+from brushloop.sessions.history import Remark
 from brushloop.sessions.show import Details, Sheet, Summary
 from tests.collect.tui.fake import blot
 

@@ -1,0 +1,425 @@
+"""Values of a session: a press and its condition, the results of steps, and the events of the journal.
+
+A journal is one event a line. `parse_event` and `line_of` turn lines into events and back, and nothing else does.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from brushloop.sessions.names import bare_name
+from brushloop.sessions.records import Check, Header
+
+MAX_NUMBER = 10**9
+_SERIAL = re.compile(r"\d{1,9}(?=-)")
+
+
+class StepKind(StrEnum):
+    """What a step does."""
+
+    ZERO_TOUCH = "zero_touch"
+    BOARD = "board"
+    DIP = "dip"
+    PRESS = "press"
+    DRAW = "draw"
+    """A figure: all strokes of one character, on one patch. If it is interrupted, all of it is done again."""
+    TOUCH = "touch"
+    """Bring the tip down on a given point of the sheet and measure its height."""
+    CAPTURE = "capture"
+    REVIEW = "review"
+    """Read which captures a person has marked bad; nothing moves."""
+    SELF_CHECK = "self_check"
+    """Press an uneven triangle of marks, which a mirrored, turned or stretched rig does not reproduce."""
+
+
+def _step_file(name: str) -> str:
+    if not bare_name(name).endswith(".mcap"):
+        raise ValueError("does not end in .mcap")
+    return name
+
+
+def _snapshot_file(name: str) -> str:
+    if not bare_name(name).endswith((".toml", ".json")):
+        raise ValueError("is no configuration")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(bare_name)]
+StepFile = Annotated[str, AfterValidator(_step_file)]
+SnapshotFile = Annotated[str, AfterValidator(_snapshot_file)]
+Whole = Annotated[int, Field(ge=0, le=MAX_NUMBER, strict=True)]
+Number = Annotated[float, Field(strict=True)]
+TimeNs = Annotated[int, Field(gt=-(2**63), lt=2**63, strict=True)]
+Counts = dict[str, Whole]
+"""Messages by topic."""
+PointMm = tuple[Number, Number]
+
+
+class Value(BaseModel):
+    """Base of everything here: frozen, without unknown fields or NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Condition(Value):
+    """What a press is commanded to be: the paper's H and alpha, and where the ferrule leans."""
+
+    depth_mm: Number
+    """Depth below the height of the first touch, positive downwards."""
+    tilt_deg: Number
+    heading_deg: Number = 0.0
+    """Direction in which the ferrule leans, counter-clockwise from the sheet's x."""
+
+
+class Press(Value):
+    """One press, or one figure of several strokes; sheet, patch and what was measured are None until they are known."""
+
+    stroke_id: str
+    condition: Condition
+    """Of a figure, that of its deepest point."""
+    take: Whole = 1
+    sheet: Whole | None = None
+    patch: Whole | None = None
+    reached_mm: Number | None = None
+    """Depth that the arm reached, along the paper's normal."""
+    dip_to_touch_s: Annotated[Number, Field(ge=0.0)] | None = None
+    """Time from the brush leaving the ink to its tip touching the paper; the longest if a figure has several dips."""
+
+
+class TouchedPoint(Value):
+    """One point of the paper, and the touches of which it is the mean."""
+
+    x_mm: Number
+    y_mm: Number
+    z_mm: Number
+    span_mm: Number = 0.0
+    """Difference between the highest and the lowest touch."""
+    touches_mm: tuple[Number, ...] = ()
+    sigma_mm: tuple[Number | None, ...] = ()
+    """Standard deviation of each touch; None where the method gives none."""
+
+
+class ZeroTouchResult(Value):
+    """Where the paper lies, in the base frame."""
+
+    kind: Literal[StepKind.ZERO_TOUCH] = StepKind.ZERO_TOUCH
+    method: str
+    touch_z_mm: Number
+    """Height of the paper at the sheet's origin."""
+    slope_x: Number = 0.0
+    slope_y: Number = 0.0
+    slope_deg: Number = 0.0
+    residuals_mm: tuple[Number, ...] = ()
+    """Point minus plane, in the order of the points."""
+    points: tuple[TouchedPoint, ...] = ()
+    moved_mm: Number = 0.0
+    """How far the paper lies above where it was before."""
+
+
+class BoardResult(Value):
+    """The board as the camera sees it."""
+
+    kind: Literal[StepKind.BOARD] = StepKind.BOARD
+    still: Whole
+    corners: Whole
+    mm_per_px: Number
+    rms_px: Number
+    size_px: tuple[Whole, Whole]
+    sheet_px: tuple[PointMm, ...]
+    """Corners of the sheet in the photograph."""
+    camera_delay_ms: Number | None = None
+    camera_jitter_ms: Number | None = None
+    checks: tuple[Check, ...] = ()
+
+
+class TouchResult(Value):
+    """One point of the paper, in the base frame."""
+
+    kind: Literal[StepKind.TOUCH] = StepKind.TOUCH
+    method: str
+    x_mm: Number
+    y_mm: Number
+    z_mm: Number
+    span_mm: Number | None = None
+    """Difference between the highest and the lowest touch; None for a single one."""
+
+
+class SelfCheckResult(Value):
+    """Three marks as commanded and as found."""
+
+    kind: Literal[StepKind.SELF_CHECK] = StepKind.SELF_CHECK
+    sheet: Whole
+    patches: tuple[Whole, ...]
+    commanded_mm: tuple[PointMm, ...]
+    found_mm: tuple[PointMm, ...]
+    offset_mm: PointMm
+    turn_deg: Number
+    scale: PointMm
+    residuals_mm: tuple[Number, ...]
+    """Distance that remains at each mark once offset and turn are taken out."""
+
+
+class DipResult(Value):
+    """The well before the dip; None where nothing measures it."""
+
+    kind: Literal[StepKind.DIP] = StepKind.DIP
+    ink_level: Number | None = None
+    dosed_ml: Number | None = None
+    skipped: Press | None = None
+    """The stroke that is left out, as the operator requested."""
+
+
+class PressResult(Value):
+    """A press that was made."""
+
+    kind: Literal[StepKind.PRESS] = StepKind.PRESS
+    press: Press
+    peak_force_n: Number | None = None
+
+
+class DrawResult(Value):
+    """A figure that was drawn."""
+
+    kind: Literal[StepKind.DRAW] = StepKind.DRAW
+    press: Press
+    peak_force_n: Number | None = None
+    depths_mm: tuple[Number, ...]
+    """Depth that the arm reached in each stroke."""
+
+
+class CaptureResult(Value):
+    """A photograph of a stroke, and whether the stroke counts."""
+
+    kind: Literal[StepKind.CAPTURE] = StepKind.CAPTURE
+    press: Press
+    still: Whole
+    """`sequence` of the still, unique in the session."""
+    kept: bool = True
+    retake: bool = False
+    """Whether the stroke is pressed again on another patch."""
+    verdict: str = ""
+    """Name of the quality check that failed first."""
+    camera_delay_ms: Number | None = None
+    camera_jitter_ms: Number | None = None
+
+
+class Again(Value):
+    """A stroke that was marked bad, and the index of the steps that repeat it."""
+
+    stroke_id: str
+    index: Whole
+
+
+class ReviewResult(Value):
+    """The strokes that are pressed again."""
+
+    kind: Literal[StepKind.REVIEW] = StepKind.REVIEW
+    again: tuple[Again, ...] = ()
+
+
+MarkResult = PressResult | DrawResult
+StepResult = Annotated[
+    ZeroTouchResult
+    | BoardResult
+    | TouchResult
+    | SelfCheckResult
+    | DipResult
+    | PressResult
+    | DrawResult
+    | CaptureResult
+    | ReviewResult,
+    Field(discriminator="kind"),
+]
+
+
+class _Event(Value):
+    t_ns: TimeNs
+    """Time by the host's clock."""
+
+
+class Open(_Event):
+    """The session was made; its configuration is kept as text."""
+
+    event: Literal["open"] = "open"
+    header: Header
+    snapshots: dict[SnapshotFile, str] = Field(default_factory=dict[str, str])
+
+
+class Process(_Event):
+    """A process opened the session."""
+
+    event: Literal["process"] = "process"
+
+
+class Begin(_Event):
+    """An attempt at a step began. Its patches are used from now on, whatever becomes of it."""
+
+    event: Literal["begin"] = "begin"
+    key: str
+    kind: StepKind
+    attempt: Whole
+    sheet: Whole
+    patch: Whole | None = None
+    more_patches: tuple[Whole, ...] = ()
+    press: Press | None = None
+    file: StepFile
+
+
+class Done(_Event):
+    """A step is finished, and never done again."""
+
+    event: Literal["done"] = "done"
+    key: str
+    attempt: Whole
+    file: StepFile
+    sha256: str
+    counts: Counts
+    result: StepResult
+
+    @property
+    def kind(self) -> StepKind:
+        """What the step did."""
+        return self.result.kind
+
+
+class Void(_Event):
+    """An attempt was cut; its patches stay used."""
+
+    event: Literal["void"] = "void"
+    key: str
+    attempt: Whole
+    why: str = ""
+
+
+class FreshSheet(_Event):
+    """A fresh sheet was put in."""
+
+    event: Literal["sheet"] = "sheet"
+    sheet: Whole
+
+
+class Torn(_Event):
+    """A half-written line, left by a crash, was set aside."""
+
+    event: Literal["torn"] = "torn"
+    hex: str
+
+
+class Clock(_Event):
+    """The host's clock was set back."""
+
+    event: Literal["clock"] = "clock"
+    back_s: Number
+
+
+class Ended(_Event):
+    """A run ended before its time."""
+
+    event: Literal["ended"] = "ended"
+    why: str
+
+
+class Closed(_Event):
+    """The steps were merged into one file, and that was read back."""
+
+    event: Literal["closed"] = "closed"
+    file: StepFile
+    sha256: str
+    counts: Counts
+
+
+class Repaired(_Event):
+    """A repair wrote the file of a step again."""
+
+    event: Literal["repaired"] = "repaired"
+    key: str
+    file: StepFile
+    sha256: str
+    counts: Counts
+    missing: Counts = Field(default_factory=dict[str, int])
+    aside: str = ""
+    why: str = ""
+
+
+class Held(_Event):
+    """The file of a step is damaged, and another holds all of it."""
+
+    event: Literal["held"] = "held"
+    key: str
+    file: StepFile
+    by: FileName
+    why: str = ""
+
+
+class Lost(_Event):
+    """A repair could not recover a step: it counts as never done."""
+
+    event: Literal["lost"] = "lost"
+    key: str
+    file: StepFile
+    aside: str = ""
+    why: str = ""
+
+
+class Doubt(_Event):
+    """A sheet may hold a press of which nothing is known: nothing more is pressed on it."""
+
+    event: Literal["doubt"] = "doubt"
+    sheet: Whole
+    file: FileName
+
+
+class JournalRepaired(_Event):
+    """A repair wrote the journal again."""
+
+    event: Literal["journal"] = "journal"
+    aside: str
+    rebuilt: Whole
+    lost: Whole
+
+
+Event = Annotated[
+    Open
+    | Process
+    | Begin
+    | Done
+    | Void
+    | FreshSheet
+    | Torn
+    | Clock
+    | Ended
+    | Closed
+    | Repaired
+    | Held
+    | Lost
+    | Doubt
+    | JournalRepaired,
+    Field(discriminator="event"),
+]
+_EVENTS: TypeAdapter[Event] = TypeAdapter(Event)
+
+
+def parse_event(line: dict[str, Any]) -> Event:
+    """The event in a line of a journal. Raises `ValueError`, naming the first field that is wrong."""
+    try:
+        return _EVENTS.validate_python(line)
+    except ValidationError as error:
+        problem = error.errors(include_url=False, include_input=False)[0]
+        field = ".".join(str(part) for part in problem["loc"][1:]) or "event"
+        wrong = "is missing" if problem["type"] == "missing" else f"is wrong: {problem['msg']}"
+        raise ValueError(f"{field!r} of event {str(line.get('event'))[:40]!r} {wrong}") from None
+
+
+def line_of(event: Event) -> dict[str, Any]:
+    """The line of an event, without its time."""
+    return event.model_dump(mode="json", exclude={"t_ns"}, exclude_none=True)
+
+
+def serial_of(file: str) -> int | None:
+    """Serial number at the start of the name of a step's file; None for a name without one."""
+    serial = _SERIAL.match(file)
+    return int(serial[0]) if serial else None

@@ -1,0 +1,237 @@
+"""The state of a run after the events of its journal so far. Resume, screens, review, lists and repair read it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from brushloop.sessions import events
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import (
+    Begin,
+    CaptureResult,
+    Closed,
+    Done,
+    DrawResult,
+    Event,
+    Lost,
+    Open,
+    Press,
+    PressResult,
+    Repaired,
+    parse_event,
+    serial_of,
+)
+from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, Reading, read, read_journal
+from brushloop.sessions.records import Header, Topic
+
+KILLED = "the process ended during it"
+_R = TypeVar("_R")
+
+
+class DoneTwice(ValueError):
+    """A step is journalled as done twice: its strokes would appear twice."""
+
+
+@dataclass(slots=True)
+class RunState:
+    """What the journal of a session says; `apply` is the only way in which it changes."""
+
+    opened: Open | None = None
+    closed: Closed | None = None
+    done: dict[str, Done] = field(default_factory=dict[str, Done])
+    """Finished steps by key; of a set-up step, the newest."""
+    files: dict[str, Done] = field(default_factory=dict[str, Done])
+    """Finished steps by file, in order of time; the merged file is made of these files."""
+    held: dict[str, str] = field(default_factory=dict[str, str])
+    """Damaged files of steps, and the file that holds all of each."""
+    attempts: dict[str, int] = field(default_factory=dict[str, int])
+    """Attempts that were begun, by key."""
+    running: dict[tuple[str, int], Begin] = field(default_factory=dict[tuple[str, int], Begin])
+    """Attempts of the last process that neither finished nor were cut, by key and number."""
+    cut: list[tuple[Begin, str]] = field(default_factory=list[tuple[Begin, str]])
+    """Attempts that were cut, and why."""
+    used_patches: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
+    """(sheet, patch) of every press that was begun, finished or not: never pressed again."""
+    doubtful_sheets: set[int] = field(default_factory=set[int])
+    """Sheets that may hold an unrecorded press: nothing more is pressed on them."""
+    repairs: list[Repaired | Lost] = field(default_factory=list[Repaired | Lost])
+    """What was repaired or lost; the merged file records it."""
+    sheet: int = 0
+    begun: int = 0
+    """Attempts begun; the next one's serial number."""
+    processes: int = 0
+    ended: str = ""
+    """How the last run ended; empty if its process was cut off before it could say so."""
+    last_ns: int = 0
+    """Time of the latest event, to notice a clock that was set back."""
+    _finished: dict[tuple[str, int], str] = field(default_factory=dict[tuple[str, int], str])
+    """File of each finished attempt, by key and number."""
+
+    @property
+    def segments(self) -> list[Done]:
+        """Finished steps in order of time."""
+        return list(self.files.values())
+
+    @property
+    def voids(self) -> int:
+        """Attempts that were begun and are not finished."""
+        return self.begun - len(self.files)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the session can be resumed. A crash before the first event left nothing to resume."""
+        return self.opened is not None and self.closed is None
+
+    def counts(self) -> dict[str, int]:
+        """Messages by topic that the merged file must hold."""
+        counts: Counter[str] = Counter()
+        for step in self.files.values():
+            counts.update(step.counts)
+        return dict(counts)
+
+    def strokes(self) -> int:
+        """Strokes that the run kept."""
+        return sum(step.counts.get(Topic.STROKE, 0) for step in self.files.values())
+
+    def results(self, kind: type[_R]) -> list[_R]:
+        """Results of one kind, in order of time."""
+        return [step.result for step in self.files.values() if isinstance(step.result, kind)]
+
+    def not_photographed(self) -> list[Press]:
+        """Presses without a capture of the same take."""
+        waiting: dict[tuple[str, int], Press] = {}
+        for step in self.files.values():
+            match step.result:
+                case PressResult(press=press) | DrawResult(press=press):
+                    waiting[press.stroke_id, press.take] = press
+                case CaptureResult(press=press):
+                    waiting.pop((press.stroke_id, press.take), None)
+                case _:
+                    pass
+        return list(waiting.values())
+
+    def apply(self, event: Event) -> None:
+        """Apply the next event. Raises `DoneTwice` for a step that was done already; the state is then unchanged."""
+        match event:
+            case events.Open():
+                self.opened = event
+            case events.Process():
+                self.processes += 1
+                self.ended = ""
+                self.cut += [(begin, KILLED) for begin in self.running.values()]
+                self.running.clear()
+            case events.Begin():
+                self._begin(event)
+            case events.Done():
+                self._done(event)
+            case events.Void(key=key, attempt=attempt, why=why):
+                if (begin := self.running.pop((key, attempt), None)) is not None:
+                    self.cut.append((begin, why))
+            case events.FreshSheet(sheet=sheet):
+                self.sheet = sheet
+            case events.Ended(why=why):
+                self.ended = why
+            case events.Closed():
+                self.closed = event
+            case events.Repaired() | events.Lost():
+                self._repair(event)
+            case events.Held(file=file, by=by):
+                self.held[file] = by
+            case events.Doubt(sheet=sheet, file=file):
+                self.doubtful_sheets.add(sheet)
+                self.begun = max(self.begun, _next_serial(file))
+            case events.Torn() | events.Clock() | events.JournalRepaired():
+                pass  # for people who read the journal
+        self.last_ns = event.t_ns
+
+    def _begin(self, begin: Begin) -> None:
+        # Serials also number stills, so that of a lost line must not be used again.
+        self.begun = max(self.begun + 1, _next_serial(begin.file))
+        self.attempts[begin.key] = max(self.attempts.get(begin.key, 0), begin.attempt)
+        self.running[begin.key, begin.attempt] = begin
+        self.sheet = max(self.sheet, begin.sheet)
+        if begin.patch is not None:
+            self.used_patches |= {(begin.sheet, patch) for patch in (begin.patch, *begin.more_patches)}
+
+    def _done(self, done: Done) -> None:
+        ident, known = (done.key, done.attempt), self.done.get(done.key)
+        earlier = done.file if done.file in self.files else self._finished.get(ident)
+        if known is not None and Topic.STROKE in {**known.counts, **done.counts}:
+            earlier = known.file  # only a set-up step may be done again
+        if earlier is not None:
+            raise DoneTwice(f"says that {done.file} is done: its step was done already, in {earlier}")
+        self.running.pop(ident, None)
+        self.done[done.key] = self.files[done.file] = done
+        self._finished[ident] = done.file
+
+    def _repair(self, repair: Repaired | Lost) -> None:
+        self.repairs.append(repair)
+        step = self.files.get(repair.file)
+        if step is None:
+            return
+        current = self.done.get(step.key) is step
+        if isinstance(repair, Repaired):
+            step = step.model_copy(update={"sha256": repair.sha256, "counts": repair.counts})
+            self.files[repair.file] = step
+            if current:
+                self.done[step.key] = step
+            return
+        del self.files[repair.file], self._finished[step.key, step.attempt]
+        if current:
+            del self.done[step.key]
+
+
+def _next_serial(file: str) -> int:
+    serial = serial_of(file)
+    return 0 if serial is None else serial + 1
+
+
+@dataclass(slots=True)
+class Account:
+    """Everything read from a journal, with its faults."""
+
+    reading: Reading
+    lines: list[Line] = field(default_factory=list[Line])
+    """Lines that can be trusted and make sense, in the order in which they were written."""
+    state: RunState = field(default_factory=RunState)
+    faults: list[Fault] = field(default_factory=list[Fault])
+    """All problems, in the order of the file; every command uses this list."""
+    twice: list[Line] = field(default_factory=list[Line])
+    """`done` lines of steps that were done already."""
+
+
+def account(data: bytes, session: str = "") -> Account:
+    """Read the bytes of a journal and apply its events, those of `session` if it is given, to a new state."""
+    found = Account(read(data, session))
+    found.faults += found.reading.faults
+    for entry in found.reading.entries:
+        try:
+            found.state.apply(parse_event(entry.line))
+        except DoneTwice as error:
+            found.faults.append(Fault(entry.number, str(error)))
+            found.twice.append(entry.line)
+        except ValueError as error:
+            found.faults.append(Fault(entry.number, f"makes no sense: {error}"))
+        else:
+            found.lines.append(entry.line)
+    found.faults.sort(key=lambda fault: fault.number)
+    return found
+
+
+def replay(path: Path) -> RunState:
+    """State after all events of a journal. Raises `SessionDamaged` where anything in it is wrong."""
+    found = account(read_journal(path))
+    if found.faults:
+        more = f" (and {len(found.faults) - 1} more)" if len(found.faults) > 1 else ""
+        raise SessionDamaged(path, f"{found.faults[0]}{more}")
+    return found.state
+
+
+def read_header(folder: Path, state: RunState) -> Header:
+    """Header in the journal. Raises `SessionDamaged`."""
+    if state.opened is None:
+        raise SessionDamaged(folder / JOURNAL_NAME, "has no `open` event")
+    return state.opened.header
