@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from brushloop.sessions.condition import Condition
 from brushloop.sessions.names import bare_name
 from brushloop.sessions.records import Check, Header
 
@@ -63,16 +64,6 @@ class Value(BaseModel):
     """Base of everything here: frozen, without unknown fields or NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Condition(Value):
-    """What a press is commanded to be: the paper's H and alpha, and where the ferrule leans."""
-
-    depth_mm: Number
-    """Depth below the height of the first touch, positive downwards."""
-    tilt_deg: Number
-    heading_deg: Number = 0.0
-    """Direction in which the ferrule leans, counter-clockwise from the sheet's x."""
 
 
 class Press(Value):

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 from collections.abc import Generator
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -179,7 +179,7 @@ def _plain(values: dict[str, object]) -> dict[str, Value]:
         match value:
             case Press():
                 # What was measured does not belong to what was asked for.
-                plain |= {"stroke_id": value.stroke_id, **value.condition.model_dump(exclude_defaults=True)}
+                plain |= {"stroke_id": value.stroke_id, **asdict(value.condition)}
                 plain |= value.model_dump(include={"take", "sheet", "patch"}, exclude_defaults=True)
             case Drawn():
                 plain |= {"strokes": strokes_text(value.strokes)}

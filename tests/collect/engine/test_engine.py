@@ -15,6 +15,7 @@ from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.drivers.arcs.codes import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
 from brushloop.drivers.samples import Identity
+from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import read_lines
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.run_state import replay
@@ -86,6 +87,10 @@ def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab)
     assert len(ids) == len(set(ids)) == 2
     # The cut press burnt its patch: three presses (one of them cut) touched three places.
     assert len(state.used_patches) == 3
+    strokes = list(Recording(folder).stroke_records())
+    pressed = [capture.press for capture in state.results(CaptureResult)]
+    assert [stroke.reached_mm for stroke in strokes] == [press.reached_mm for press in pressed]
+    assert all(abs((stroke.reached_mm or 0.0) - (stroke.depth_mm or 0.0)) < 0.2 for stroke in strokes)
 
 
 def test_stop_before_anything_has_moved(lab: Lab) -> None:
