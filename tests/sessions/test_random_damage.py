@@ -21,6 +21,7 @@ from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 
 from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import PressResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.records import Topic
 from brushloop.sessions.repair import repair_session
@@ -65,16 +66,16 @@ class Damage:
 def collect(make, folder):
     """Set-up done twice, a cut press, a change of sheet and a second process, as in a real session."""
     store = make.store(folder)
-    make.take(store, "touch", "zero_touch", [make.pose(1)], {"touch_z_mm": 1.0})
+    make.take(store, "touch", [make.pose(1)], ZeroTouchResult(method="taught", touch_z_mm=1.0))
     make.collect(store, STROKES - 1)
     store.fresh_sheet()
     store.release()
     store = SessionStore(folder, None, make.clock())
-    make.take(store, "touch", "zero_touch", [make.pose(2)], {"touch_z_mm": 1.1})
-    stroke = {"stroke_id": "H13-a05-r09", "sheet": 1, "patch": 0}
-    make.take(store, "H13-a05-r09 press", "press", [make.pose(900 + n) for n in range(5)], stroke, 0)
+    make.take(store, "touch", [make.pose(2)], ZeroTouchResult(method="taught", touch_z_mm=1.1))
+    pressed = PressResult(press=make.press("H13-a05-r09", sheet=1, patch=0))
+    make.take(store, "H13-a05-r09 press", [make.pose(900 + n) for n in range(5)], pressed, 0)
     shown = [make.still(9), make.stroke(9)]
-    make.take(store, "H13-a05-r09 capture", "capture", shown, {"stroke_id": "H13-a05-r09", "still": 9})
+    make.take(store, "H13-a05-r09 capture", shown, make.captured("H13-a05-r09", 9))
     return store
 
 

@@ -109,7 +109,7 @@ def test_a_photograph_lost_with_its_sheet_gone_has_the_stroke_pressed_again(make
 def test_a_press_that_lost_some_poses_stays_done_and_reports_the_gap(make, folder, repair, go_on):
     cut(file_of(folder, "H13-a05-r00 press"), 0.3)
     report = repair(folder)
-    assert report.lost == ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 1 of /step, 5 of /robot/tcp"]
+    assert report.lost == ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 2 of /step, 5 of /robot/tcp"]
     final = go_on(folder).close()
     assert make.stroke_names(final) == ["H13-a05-r00", "H13-a05-r01"]
     [note] = [note for note in verify_session(folder).notes if "missing" in note]

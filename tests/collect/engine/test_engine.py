@@ -215,7 +215,7 @@ def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
     engine = lab.engine(armed=True)
     run(engine)
     assert any(UNCHECKED in line for line in engine.snapshot().messages)
-    assert "self_check" not in {line["kind"] for line in replay(next(lab.sessions.glob("*/journal.jsonl"))).segments}
+    assert "self_check" not in {step.kind for step in replay(next(lab.sessions.glob("*/journal.jsonl"))).segments}
 
 
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
