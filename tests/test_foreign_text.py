@@ -42,9 +42,10 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("closed", "open", "damaged"):
         header = HEADER.model_copy(update={"session_id": name, "protocol": HOSTILE})
         store = SessionStore.create(folder / name, header, make.snapshots, make.clock())
-        make.perform(store, f"key{NAME}", patch=1)
-        store.void(store.begin(f"cut{NAME}", StepKind.PRESS, patch=2, press=make.press(HOSTILE)), HOSTILE)
-        store.begin(f"begun{NAME}", StepKind.PRESS, patch=3, press=make.press(HOSTILE)).writer.abandon()
+        shown = [make.still(0), make.stroke(0, stroke_id=f"key{NAME}")]
+        make.take(store, "key", shown, make.captured(f"key{NAME}", 0), 1)
+        store.void(store.begin("cut", StepKind.PRESS, patch=2, press=make.press(HOSTILE)), HOSTILE)
+        store.begin("begun", StepKind.PRESS, patch=3, press=make.press(HOSTILE)).writer.abandon()
         if name == "closed":
             store.close()
         store.release()

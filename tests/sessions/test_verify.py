@@ -62,7 +62,7 @@ def test_what_is_missing_is_named(folder):
 
 def test_a_damaged_journal_line_is_reported_and_whether_the_files_make_up_for_it(folder):
     journal = folder / JOURNAL_NAME
-    flip(journal, journal.read_bytes().index(b'"reached_mm":13'))
+    flip(journal, journal.read_bytes().index(b'"result":{"kind":"press"'))
     assert words(folder) == ["journal.jsonl: line 8 does not match its CRC"]
     assert "journal.jsonl: all of it can be rebuilt from the files" in verify_session(folder).notes
 
