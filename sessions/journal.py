@@ -16,6 +16,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -99,8 +100,9 @@ def decode_line(raw: bytes, number: int) -> Entry:
         raise BadLine("is not JSON") from None
     match line:
         case {"seq": int(seq), "session": str(session), "event": str()} if seq > 0 and not isinstance(seq, bool):
-            content = {name: value for name, value in line.items() if name not in ("seq", "session", "crc")}
-            return Entry(number, seq, session, raw, content)
+            for name in ("seq", "session", "crc"):
+                del line[name]
+            return Entry(number, seq, session, raw, line)
         case _:
             raise BadLine("has no number, session or event")
 
@@ -186,6 +188,8 @@ def _lines_within(raw: bytes, number: int) -> tuple[list[Entry], int]:
 def _misplaced(reading: Reading) -> None:
     """Report lines outside the longest run that is in order."""
     held = reading.entries
+    if all(one.number < after.number for one, after in pairwise(held)):
+        return
     ends: list[int] = []
     """Index of the last entry of the best run of each length."""
     before: list[int | None] = []

@@ -35,7 +35,7 @@ def bare_name(value: object) -> str:
     """Return the name of a file in the session's folder. Raises `ValueError` for a name that could lead elsewhere."""
     if not isinstance(value, str):
         raise ValueError("is not a string")
-    plain = value.isprintable() and not any(sign in value for sign in "/\\")
+    plain = value.isprintable() and "/" not in value and "\\" not in value
     if value in ("", ".", "..") or not plain or len(value.encode("utf-8", "replace")) > MAX_NAME_BYTES:
         raise ValueError(f"is {value[:60]!r}, allowed is the name of a file in the session's folder")
     return value
