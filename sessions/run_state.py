@@ -176,6 +176,7 @@ class RunState:
         if step is None:
             return
         current = self.done.get(step.key) is step
+        self.held.pop(repair.file, None)
         if isinstance(repair, Repaired):
             step = step.model_copy(update={"sha256": repair.sha256, "counts": repair.counts})
             self.files[repair.file] = step
