@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -56,7 +57,7 @@ def test_an_output_without_room_is_one_line(folder: Path, words: tuple[str, ...]
 
 
 def test_a_closed_output_is_nobodys_loss(folder: Path) -> None:
-    command = "exec " + " ".join([*PROCESS, "sessions", "show", "s"]) + " >&-"
+    command = "exec " + shlex.join([*PROCESS, "sessions", "show", "s"]) + " >&-"
     ran = subprocess.run(["/bin/sh", "-c", command], cwd=folder, stderr=subprocess.PIPE, check=False)
     assert (ran.returncode, ran.stderr) == (0, b"")
 

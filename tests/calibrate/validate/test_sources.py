@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import json
 import os
 import shutil
 import socket
@@ -26,6 +25,9 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate import sources
 from brushloop.calibrate.validate.sources import fetched, open_session
 from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import Open, line_of
+from brushloop.sessions.journal import Journal
+from brushloop.sessions.recording import Recording
 from tests.calibrate.given import CALIBRATION
 
 
@@ -207,12 +209,11 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
     folder = tmp_path / "presses"
     folder.mkdir()
     (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
-    lines = [{"t_ns": 1, "event": "open", "header": {}}, {"t_ns": 2, "event": "closed", "sha256": "0" * 64}]
-    from brushloop.sessions.journal import encode_line
-
-    with (folder / "journal.jsonl").open("wb") as file:
-        for number, line in enumerate(lines, start=1):
-            file.write(encode_line(line.pop("t_ns"), line, number, "presses"))
-    assert json.loads((folder / "journal.jsonl").read_bytes().splitlines()[0])["event"] == "open"
+    header = Recording(session).header.model_copy(update={"session_id": "presses"})
+    closed = {"event": "closed", "file": "presses.mcap", "sha256": "0" * 64, "counts": {}}
+    journal = Journal(folder / "journal.jsonl", 1, "presses")
+    for line in (line_of(Open(t_ns=1, header=header)), closed):
+        journal.append(1, line)
+    journal.close()
     with pytest.raises(SessionDamaged, match="SHA-256 differs"):
         open_session(str(folder), tmp_path / "work", None, None)

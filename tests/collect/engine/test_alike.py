@@ -12,8 +12,8 @@ from brushloop.collect.engine.steps import dip as dipping
 from brushloop.collect.engine.steps import touch as touching
 from brushloop.collect.engine.steps.context import RunMemory
 from brushloop.collect.planning.summary import make_plan
+from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.drivers.samples import Pose
@@ -91,7 +91,7 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets
     assert targets[targets.index("ink") :][:3] == ["ink", "paper", "park"]
     assert screen[screen.index("dip") :][:4] == ["dip", "check that the sheet is blank", "dip", "press H13-a0-r01"]
     presses = results(folder, "press")  # more than one where a photograph was late and the stroke was made again
-    waits = [press["dip_to_touch_s"] for press in presses]
+    waits = [result["press"]["dip_to_touch_s"] for result in presses]
     assert min(waits) > 0.0
     recording = Recording(folder)
     [capture] = recording.captures()
@@ -128,7 +128,7 @@ async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeyp
 def test_a_protocol_may_ask_for_a_wait(lab: Lab, screen: list[str], protocol: str, kind: str) -> None:
     head, _, rest = protocol.partition("\n")
     folder = run(lab, f"{head}\nwait_after_dip_s = 0.8\n{rest}")
-    waits = [result["dip_to_touch_s"] for result in results(folder, kind)]
+    waits = [result["press"]["dip_to_touch_s"] for result in results(folder, kind)]
     assert len(waits) == 2 if kind == "press" else 1
     assert all(wait > 0.8 for wait in waits)
     assert screen.count("wait with the ink, 0.8 s from the dip") == 2
@@ -151,7 +151,7 @@ def keys(protocol: Any) -> list[str]:
     try:
         while True:
             found.append(step.key)
-            step = generator.send({"sheet": 0, "patch": 1} if step.kind is StepKind.PRESS else {})
+            step = generator.send(as_planned(step, 0, 1))
     except StopIteration:
         return found
 

@@ -12,10 +12,11 @@ from brushloop.collect.motion.moves import inking_moves
 from brushloop.collect.planning.limit_check import all_poses, check_protocol
 from brushloop.collect.planning.walk import moves_of
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.steps import MARKING, Result, Step, StepKind
+from brushloop.collect.protocols.steps import MARKING, Step, StepKind
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.events import StepResult
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting
 from tests.collect.until import wait_for_end
@@ -65,7 +66,7 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     at_work: list[Made] = []
     do = Performer._do
 
-    async def noted(self: Performer, context: StepContext) -> Result:
+    async def noted(self: Performer, context: StepContext) -> StepResult:
         procedures = context.run.procedures
         at_work.append(Made(context.step, context, procedures.plane, procedures._dips))
         try:

@@ -99,4 +99,4 @@ def test_a_touch_that_the_operator_asks_for_by_key_is_checked_before_it(make_ben
     plane = PaperPlane(config.paper.touch_z_mm)
     check_step(Path("rig.toml"), there, plane, TOUCH)
     with pytest.raises(ConfigError, match=r"y = -10\.000 mm is outside .*zero_touch"):
-        check_step(Path("rig.toml"), there, plane, replace(TOUCH, params={"method": "jog"}))
+        check_step(Path("rig.toml"), there, plane, replace(TOUCH, method="jog"))

@@ -26,7 +26,7 @@ def centroid_mm(paper: Paper) -> tuple[float, float]:
     rows, columns = np.indices(paper.density.shape)
     weight = paper.density / paper.density.sum()
     column, row = float((weight * columns).sum()), float((weight * rows).sum())
-    return (column + 0.5) / PX_PER_MM, paper.depth_mm - (row + 0.5) / PX_PER_MM
+    return (column + 0.5) / PX_PER_MM, paper.size_y_mm - (row + 0.5) / PX_PER_MM
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 33.0, 90.0, 180.0, -90.0])
