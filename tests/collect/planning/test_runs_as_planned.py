@@ -66,11 +66,11 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     at_work: list[Made] = []
     do = Performer._do
 
-    async def noted(self: Performer, context: StepContext) -> StepResult:
+    async def noted(self: Performer, step: Step, context: StepContext) -> StepResult:
         procedures = context.run.procedures
-        at_work.append(Made(context.step, context, procedures.plane, procedures._dips))
+        at_work.append(Made(step, context, procedures.plane, procedures._dips))
         try:
-            return await do(self, context)
+            return await do(self, step, context)
         finally:
             steps.append(at_work.pop())
 
