@@ -190,7 +190,7 @@ def _watching(watch: Watch) -> Iterator[None]:
         (dipping, "fill_well", INK),
         (Recorder, "still", ENCODE),
         (capturing, "_judge", JUDGE),
-        (capturing, "_inked_cells", BLANK),
+        (capturing, "_inked_patches", BLANK),
         (SessionStore, "begin", FILES),
         (SessionStore, "done", FILES),
         (SessionStore, "close", "merge"),

@@ -199,7 +199,10 @@ async def power_on(controller: Controller, options: ArcsOptions) -> None:
         await until_mode(controller, {*wanted}, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
 
     await controller.require_safe("power on")
-    if await controller.mode() != RobotMode.RUNNING:
+    mode = await controller.mode()
+    if mode == RobotMode.POWERING_OFF:  # a request for power would be ignored
+        await until(RobotMode.POWER_OFF)
+    if mode != RobotMode.RUNNING:
         await controller.ask("RobotManage.poweron")
         await until(RobotMode.IDLE, RobotMode.RUNNING)
         await controller.ask("RobotManage.startup")

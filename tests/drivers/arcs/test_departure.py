@@ -117,7 +117,7 @@ async def test_an_arm_without_power_is_not_as_it_was_left_and_enabling_it_powers
     arm: AuboArcs, other: Controller
 ):
     await arm.move(ABOVE, **QUICK)
-    await other.ask("RobotManage.poweroff")
+    await other.ask("RobotManage.poweroff")  # takes a moment, in which a request for power is ignored
     for refused in (arm.confirm(), arm.take_up(), arm.move(LOW, **QUICK)):
         with pytest.raises(NotPowered):
             await refused
