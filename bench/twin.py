@@ -14,7 +14,7 @@ from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, 
 from bench.harness import BenchError, Result
 from brushloop.calibrate.compare.ceiling import CEILING
 from brushloop.calibrate.fit.heldout import BEZIER
-from brushloop.sessions.progress import shown
+from brushloop.sessions.terminal import shown
 from brushloop.twin.run import fit_twin, workers
 from brushloop.twin.score import TWIN
 

@@ -10,8 +10,8 @@ from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.pages.calibration import write_calibration_page
 from brushloop.calibrate.report import framed
 from brushloop.calibrate.session import calibrate_session as calibrate
-from brushloop.sessions.progress import Progress, unseen
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.terminal import Progress, unseen
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ def calibrate(
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
 
     from brushloop.calibrate.calibrated import calibrate_session
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     with shown() as progress:
         found = calibrate_session(session, lens, progress)
@@ -95,7 +95,7 @@ def preprocess(
     """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
     from brushloop.calibrate.files import check_target
     from brushloop.calibrate.show_stages import show_photograph, show_stroke
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     check_target(out, ".png", capture, before)
     if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
@@ -136,7 +136,7 @@ def export(
     """
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.sessions.export import export as write
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     if not crops and (frames or calibration is not None):
         raise CalibrationError("--frames" if frames else "--calibration", "needs --crops")

@@ -77,7 +77,7 @@ def intrinsics(
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
     from brushloop.calibrate.pages.lens import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
-    from brushloop.sessions.progress import counted, shown
+    from brushloop.sessions.terminal import counted, shown
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
@@ -154,8 +154,8 @@ def drift(
     """Show pix2len at each view of the board in a session, and its trend. Exit code 5 on warnings."""
     from brushloop.calibrate.board.drift import board_over_session
     from brushloop.calibrate.board.session import board_of, known_lens
-    from brushloop.sessions.progress import shown
     from brushloop.sessions.recording import Recording
+    from brushloop.sessions.terminal import shown
 
     recording = Recording(session)
     known = known_lens(recording, lens)

@@ -34,9 +34,9 @@ from brushloop.calibrate.validate.sources import local_path
 from brushloop.model.brush import Brush
 from brushloop.sessions.condition import Condition
 from brushloop.sessions.export_rows import SAMPLE_COLUMNS, Export, Sample
-from brushloop.sessions.progress import unseen
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header
+from brushloop.sessions.terminal import unseen
 
 if TYPE_CHECKING:
     from brushloop.calibrate.invert.command import Recovered

@@ -15,9 +15,9 @@ from brushloop.calibrate.calibration import Calibration, Foreign
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.params import Params
 from brushloop.sessions.messages import decode_gray
-from brushloop.sessions.progress import Progress, unseen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
+from brushloop.sessions.terminal import Progress, unseen
 
 FITTED = "k1 fitted on the board"
 STEPS = "steps done: read the session, fit the plane, check the file"

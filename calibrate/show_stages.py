@@ -22,9 +22,9 @@ from brushloop.calibrate.stages import Trace, contact_sheet, trace_scaled, trace
 from brushloop.calibrate.stroke.difference import new_stroke
 from brushloop.calibrate.stroke.params import Params
 from brushloop.sessions.messages import decode_gray
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 PAPER = 255
 PARAMS = Params()

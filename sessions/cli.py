@@ -71,7 +71,7 @@ def verify(session: Session) -> None:
 
     Exit code 0: everything is intact. 6: something is damaged, and is named.
     """
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
     from brushloop.sessions.verify import verify_session
 
     with shown() as progress:
@@ -146,7 +146,7 @@ def import_(
     from importlib.metadata import version
 
     from brushloop.sessions.imports import ImportOptions, import_photographs
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     target = out or Path("sessions") / folder.resolve().name

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from brushloop.sessions.condition import Condition
-from brushloop.sessions.names import bare_name
+from brushloop.sessions.disk import bare_name
 from brushloop.sessions.records import Check, Header
 
 MAX_NUMBER = 10**9

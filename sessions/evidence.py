@@ -14,12 +14,18 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, read_bounded
+from brushloop.sessions.disk import (
+    MAX_SNAPSHOT_BYTES,
+    SEGMENT_NAME,
+    SNAPSHOT_NAMES,
+    check_file,
+    file_sha256,
+    read_bounded,
+)
 from brushloop.sessions.errors import SessionDamaged, SessionError
 from brushloop.sessions.events import Begin, Done, Event, Open, line_of, parse_event, serial_of
 from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, read_journal
 from brushloop.sessions.mcap_file import Scan, scan
-from brushloop.sessions.names import SEGMENT_NAME, SNAPSHOT_NAMES, check_file
 from brushloop.sessions.recording import count_messages, parse_header
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Topic
 from brushloop.sessions.run_state import Account, DoneTwice, RunState, account

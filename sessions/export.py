@@ -42,9 +42,8 @@ from brushloop.sessions.export_rows import (
     file_column,
 )
 from brushloop.sessions.messages import decode_gray
-from brushloop.sessions.progress import Progress, unseen
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.terminal import plain
+from brushloop.sessions.terminal import Progress, plain, unseen
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.history import WAIT, unlike
 from brushloop.sessions.messages import PNG_START
-from brushloop.sessions.progress import Progress, counted
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Quality, StepEvent, Stroke, Topic, Wrench
+from brushloop.sessions.terminal import Progress, counted
 
 TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
 CROP_TEXT_COLUMNS = ("mask_file", "flags")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import datetime as dt
 from pathlib import Path
 
+from brushloop.sessions.disk import SEGMENT_NAME, check_folder
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.names import SEGMENT_NAME, check_folder
 from brushloop.sessions.run_state import replay
 
 

@@ -15,14 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.sessions.cells import as_text, number
-from brushloop.sessions.disk import read_bounded, staged_folder
+from brushloop.sessions.disk import SESSION_ID, read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message, upright
-from brushloop.sessions.names import SESSION_ID
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.records import MAX_PX_PER_MM, MIN_PX_PER_MM, Header, Source, Stroke, Topic
 from brushloop.sessions.step_file import ChannelTable, Outgoing
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
 MAX_ROWS = 100_000

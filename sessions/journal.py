@@ -20,9 +20,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
-from brushloop.sessions.disk import fsync_folder, read_bounded
+from brushloop.sessions.disk import check_file, fsync_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error
-from brushloop.sessions.names import check_file
 
 JOURNAL_NAME = "journal.jsonl"
 MAX_JOURNAL_BYTES = 256 * 1024 * 1024

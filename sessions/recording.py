@@ -16,7 +16,15 @@ from google.protobuf.message import DecodeError
 from mcap.records import ChunkIndex
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, file_sha256, fsync_folder, read_bounded, set_aside
+from brushloop.sessions.disk import (
+    MAX_SNAPSHOT_BYTES,
+    SNAPSHOT_NAMES,
+    check_companions,
+    file_sha256,
+    fsync_folder,
+    read_bounded,
+    set_aside,
+)
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error, in_one_line
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.history import remarks_of
@@ -24,7 +32,6 @@ from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile, Record, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.names import SNAPSHOT_NAMES, check_companions
 from brushloop.sessions.records import HEADER_METADATA, Event, Header, StepEvent, Stroke, Topic, header_crc
 from brushloop.sessions.run_state import RunState, replay
 

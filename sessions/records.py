@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from brushloop.sessions.names import bare_name
+from brushloop.sessions.disk import bare_name
 
 SCHEMA_VERSION = 1
 HEADER_METADATA = "brushloop.header"

@@ -14,14 +14,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from brushloop.sessions.disk import check_digest, file_sha256, fsync_folder, holds, set_aside
+from brushloop.sessions.disk import SEGMENT_NAME, check_digest, file_sha256, fsync_folder, holds, set_aside
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
 from brushloop.sessions.events import DrawResult, PressResult, line_of, parse_event
 from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, without_time
 from brushloop.sessions.mcap_file import Part, Record, Scan, scan
-from brushloop.sessions.names import SEGMENT_NAME
 from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session
 from brushloop.sessions.records import (
     BEGIN_NOTE,

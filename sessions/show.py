@@ -18,12 +18,12 @@ from rich.console import RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
+from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import Begin, CaptureResult, DipResult, Done, DrawResult, PressResult
 from brushloop.sessions.folders import check_name, recording_of_renamed
 from brushloop.sessions.history import remarks_of
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.names import check_folder
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
 from brushloop.sessions.run_state import KILLED, RunState, read_header, replay

@@ -8,7 +8,16 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from brushloop.sessions.disk import check_digest, check_room, file_sha256, free_bytes, fsync_folder, write_durably
+from brushloop.sessions.disk import (
+    SEGMENT_NAME,
+    check_digest,
+    check_folder,
+    check_room,
+    file_sha256,
+    free_bytes,
+    fsync_folder,
+    write_durably,
+)
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
 from brushloop.sessions.events import (
     Begin,
@@ -27,7 +36,6 @@ from brushloop.sessions.events import (
     line_of,
 )
 from brushloop.sessions.journal import JOURNAL_NAME, Journal
-from brushloop.sessions.names import SEGMENT_NAME, check_folder
 from brushloop.sessions.recording import merge_session
 from brushloop.sessions.records import Header
 from brushloop.sessions.run_state import RunState, read_header, replay

@@ -9,7 +9,7 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import check_digest, holds
+from brushloop.sessions.disk import SEGMENT_NAME, check_digest, holds
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import Lost, Repaired
 from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
@@ -17,11 +17,10 @@ from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Line
 from brushloop.sessions.mcap_file import Scan, scan
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.names import SEGMENT_NAME
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
 from brushloop.sessions.show import details
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from unittest import mock
 
 from brushloop.__main__ import main
-from brushloop.sessions import progress
+from brushloop.sessions import terminal
 
 
 def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -24,7 +24,7 @@ def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.Complet
     code = 0
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "argv", arguments))
-        stack.enter_context(mock.patch.object(progress, "QUIET_S", math.inf))
+        stack.enter_context(mock.patch.object(terminal, "QUIET_S", math.inf))
         stack.enter_context(contextlib.redirect_stdout(out))
         stack.enter_context(contextlib.redirect_stderr(err))
         if cwd is not None:

@@ -36,8 +36,8 @@ def twin(
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target, write_whole
     from brushloop.calibrate.fit.captures import read_presses
-    from brushloop.sessions.progress import shown
     from brushloop.sessions.recording import Recording
+    from brushloop.sessions.terminal import shown
     from brushloop.twin.camera import noise_gray
     from brushloop.twin.file import Notes, notes_path, resumed, save_notes, twin_toml
     from brushloop.twin.run import fit_twin, workers

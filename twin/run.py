@@ -26,7 +26,7 @@ from brushloop.calibrate.fit.heldout import (
 )
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.config import SoundHead
-from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.terminal import Progress, unseen
 from brushloop.twin.constants import SHAPE, SPREAD, Constant, Vector, brush_at, offset_at, with_values
 from brushloop.twin.drawing import Cell
 from brushloop.twin.quality import sound_head

@@ -14,8 +14,8 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import see_board_and_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.line import Line, fit_line
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 MOVED_PX = 1.0
 """Movement of the board's middle between two views above which the camera or the board must have been touched."""

@@ -26,9 +26,9 @@ from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import on_raster, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header, Stroke
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 Floats = NDArray[np.float64]
 MARGIN_MM = 16.0

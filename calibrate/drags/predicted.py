@@ -18,7 +18,7 @@ from brushloop.calibrate.compare.similarity import binary_scores
 from brushloop.calibrate.drags.artefact import DragArtefact
 from brushloop.calibrate.drags.captures import Drawn, read_drags
 from brushloop.calibrate.drags.predict import Predictor, predictors
-from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
 OURS, LAG, STAMPS = "predicted", "bristle lag alone", "circle stamps"

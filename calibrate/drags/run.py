@@ -20,7 +20,7 @@ from brushloop.calibrate.drags.predict import Predictor, chosen, coarse, coarse_
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.spread import farthest_first
 from brushloop.model.drag import DragModel
-from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 FOLDER = "dragfit"
 FOLDS = 5

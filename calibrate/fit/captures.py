@@ -15,9 +15,9 @@ from brushloop.calibrate.compare.images import brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import calibration_of
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 Floats = NDArray[np.float64]
 Cell = tuple[float, float]

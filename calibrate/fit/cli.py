@@ -51,7 +51,7 @@ def fit(
         return
 
     from brushloop.calibrate.fit.command import FitRequest, fit_presses
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     request = FitRequest(session, mm_per_px or MM_PER_PX, calibration, reference)
     with shown() as progress:
@@ -66,8 +66,8 @@ def _fit_drags(
     from brushloop.calibrate.drags.artefact import DragArtefact
     from brushloop.calibrate.drags.captures import read_drags
     from brushloop.calibrate.drags.run import FOLDER, fit_drawn, refit_drawn
-    from brushloop.sessions.progress import shown
     from brushloop.sessions.recording import Recording
+    from brushloop.sessions.terminal import shown
 
     before = load_artefact(prior, DragArtefact) if prior is not None else None
     scale = mm_per_px or (before.mm_per_px if before is not None else DRAG_MM_PER_PX)

@@ -15,8 +15,8 @@ from brushloop.calibrate.fit.report import write_fit_page
 from brushloop.calibrate.fit.run import Correction, Fitted, correction, fit_session
 from brushloop.calibrate.fit.sizes import FEWEST_CELLS, middle
 from brushloop.calibrate.report import framed, source_label, source_note
-from brushloop.sessions.progress import Progress, unseen
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.terminal import Progress, unseen
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from brushloop.model.brush import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.loops import BEZIER_PIECES, Loop, bezier_side, closed
 from brushloop.model.plane import Plane, fit_plane
-from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"

@@ -16,7 +16,7 @@ from brushloop.calibrate.fit.heldout import HeldOut, leave_cell_out
 from brushloop.calibrate.fit.sizes import FEWEST_CELLS, Estimate, Size, sizes_of
 from brushloop.calibrate.line import student_95
 from brushloop.model.fitted import NAMES, FittedPress
-from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 PLANE = 3
 """Numbers of a plane in depth and tilt."""

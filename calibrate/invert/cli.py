@@ -39,7 +39,7 @@ def invert(
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
 
     from brushloop.calibrate.invert.command import RecoverRequest, recover
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     request = RecoverRequest(
         session=session,

@@ -28,7 +28,7 @@ from brushloop.calibrate.invert.invert import (
 from brushloop.model.fitted import NAMES
 from brushloop.model.fitted_shape import fitted_model
 from brushloop.model.inversion.press import Range
-from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,9 +27,9 @@ from brushloop.model.inversion.press import Flag, Inverter, Range
 from brushloop.model.protocol import Basis, StrokeModel
 from brushloop.model.strokes import UnknownModelError, stroke_model
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header, Stroke
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 _T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"

@@ -27,7 +27,7 @@ def compare(
     from brushloop.calibrate.files import check_folder
     from brushloop.calibrate.loop.compare import compare_sessions
     from brushloop.calibrate.loop.report import PICTURE, summary, write_loop
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     check_folder(out)
     with shown() as progress:

@@ -28,9 +28,9 @@ from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stroke.measure import measure
 from brushloop.model.brush import DomainError
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header, Source
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 if TYPE_CHECKING:
     from brushloop.model.protocol import StrokeModel

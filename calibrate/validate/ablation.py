@@ -16,7 +16,7 @@ from brushloop.calibrate.validate.pool import Scheduler
 from brushloop.calibrate.validate.report.data import Step
 from brushloop.calibrate.validate.rows import CHUNK
 from brushloop.calibrate.validate.run import Outcome
-from brushloop.sessions.progress import Progress
+from brushloop.sessions.terminal import Progress
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 DRAWS = 2

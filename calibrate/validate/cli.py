@@ -62,7 +62,7 @@ def validate(
     from brushloop.calibrate.validate.main import Request, check
     from brushloop.calibrate.validate.main import validate as run
     from brushloop.calibrate.validate.report.outputs import summary
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     request = Request(
         places=tuple(session),

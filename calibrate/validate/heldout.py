@@ -31,7 +31,7 @@ from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import VERSION, Store
 from brushloop.model.fitted import MODES, TERMS, FittedPress
 from brushloop.model.plane import Plane
-from brushloop.sessions.progress import Progress
+from brushloop.sessions.terminal import Progress
 
 
 @dataclass(frozen=True, slots=True)

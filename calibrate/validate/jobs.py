@@ -25,7 +25,7 @@ from brushloop.sessions.recording import Capture
 if TYPE_CHECKING:
     from brushloop.calibrate.validate.pool import Scheduler
     from brushloop.calibrate.validate.sources import LoadedSession
-    from brushloop.sessions.progress import Progress
+    from brushloop.sessions.terminal import Progress
 
 ABSENT = b""
 """Placeholder for the images of a model that does not predict this press."""

@@ -30,7 +30,7 @@ from brushloop.calibrate.validate.report.page import page_of, pages_beside
 from brushloop.calibrate.validate.report.summary import report_of
 from brushloop.calibrate.validate.run import Options, Outcome, validate_presses
 from brushloop.calibrate.validate.sources import URL, LoadedSession, one_source, open_session
-from brushloop.sessions.progress import Progress, counted, unseen
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 FOLDER = "validation"
 WORK = "work"

@@ -25,7 +25,7 @@ from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import Store
 from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
 from brushloop.model.brush import DomainError
-from brushloop.sessions.progress import Progress
+from brushloop.sessions.terminal import Progress
 
 ANOTHER = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""

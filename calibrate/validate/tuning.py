@@ -36,7 +36,7 @@ from brushloop.sessions.errors import SessionDamaged
 if TYPE_CHECKING:
     from brushloop.model.generator.stroke import GeneratorModel
     from brushloop.model.train.loop import Validation
-    from brushloop.sessions.progress import Progress
+    from brushloop.sessions.terminal import Progress
 
 MAX_STROKES = 100_000
 FOLDS = 5

@@ -127,7 +127,7 @@ def compare(
     from brushloop.calibrate.writing.compare import compare_written, read_reference
     from brushloop.calibrate.writing.plan_record import load_plan
     from brushloop.calibrate.writing.report import PICTURE, summary, write_written
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     check_folder(out)
     references: dict[str, tuple[str, Image]] = {}
@@ -161,7 +161,7 @@ def learn(
     from brushloop.calibrate.writing.plan_files import write_record
     from brushloop.calibrate.writing.plan_record import load_plan
     from brushloop.calibrate.writing.rounds import lost_in_words
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     check_folder(out)
     with shown() as progress:
@@ -219,7 +219,7 @@ def fit(
 ) -> None:
     """Fit the footprint of the dragged brush, for `write plan --footprint`."""
     from brushloop.calibrate.writing.footprint import fit_session
-    from brushloop.sessions.progress import shown
+    from brushloop.sessions.terminal import shown
 
     with shown() as progress:
         made, path = fit_session(session, progress)

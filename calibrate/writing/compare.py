@@ -23,9 +23,9 @@ from brushloop.calibrate.stroke.rectify import rectify_by
 from brushloop.calibrate.writing.plan_record import FigureRecord, PlanRecord, points_digest
 from brushloop.calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.progress import Progress, counted, unseen
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 SPECK_SHARE = 0.002
 """Lower than for a press: relative to its longest stroke, a character's dot is smaller than a drop is to a press."""

@@ -14,7 +14,7 @@ from brushloop.calibrate.compare.similarity import binary_scores
 from brushloop.calibrate.drags.captures import read_drags
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.model.footprint import NAMES, Footprint, fit_footprint
-from brushloop.sessions.progress import Progress, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "footprint"
 MM_PER_PX = 0.5

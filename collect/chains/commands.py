@@ -14,9 +14,9 @@ from brushloop.collect.headless import stop_signals
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.progress import shown
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import say as print_lines
+from brushloop.sessions.terminal import shown
 
 Say = Callable[[str], None]
 GIVEN_UP = 3

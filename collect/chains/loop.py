@@ -20,10 +20,10 @@ from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.config_file import read_text
-from brushloop.sessions.progress import shown
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import BareName, Header
 from brushloop.sessions.terminal import say as print_lines
+from brushloop.sessions.terminal import shown
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"

@@ -21,13 +21,13 @@ from brushloop.calibrate.session import lens_in_use
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
+from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.history import Remark, remarks_of, unlike, waits_of
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.names import check_folder
 from brushloop.sessions.records import Check, Quality, Stroke, Topic
 from brushloop.sessions.run_state import replay
 

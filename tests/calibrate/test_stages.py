@@ -114,7 +114,7 @@ def test_the_command_still_takes_a_session_as_it_did(tmp_path: Path) -> None:
 
 
 def test_reading_up_to_a_stroke_says_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("brushloop.sessions.progress.QUIET_S", 0.0)
+    monkeypatch.setattr("brushloop.sessions.terminal.QUIET_S", 0.0)
     place = session(tmp_path, "three", Presses(3, seed=0))
     last = [stroke.stroke_id for stroke in Recording(place).stroke_records()][-1]
     arguments = ["preprocess", str(place), "--stroke", last, "--out", str(tmp_path / "stages.png")]

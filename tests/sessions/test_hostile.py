@@ -12,10 +12,10 @@ from click.testing import CliRunner
 from typer.main import get_command
 
 from brushloop.__main__ import app
+from brushloop.sessions.disk import bare_name
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.folders import open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.names import bare_name
 from brushloop.sessions.store import SessionStore
 
 BRUSHLOOP = get_command(app)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from brushloop.sessions.progress import Lines, counted, shown, unseen
+from brushloop.sessions.terminal import Lines, counted, shown, unseen
 
 
 def test_a_line_for_each_tenth_says_how_long_the_rest_takes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -317,7 +317,7 @@ def test_drift_refuses_what_is_no_session_with_boards(photographed: Photographed
 def test_long_work_says_how_far_it_is(
     photographed: Photographed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("brushloop.sessions.progress.QUIET_S", 0.0)
+    monkeypatch.setattr("brushloop.sessions.terminal.QUIET_S", 0.0)
     paths = [saved(tmp_path / f"{number}.png", BLANK) for number in range(2)]
     assert "photographs searched for the board: 1 of 2, about" in run("intrinsics", *paths, *BOARD).output
     session = photographed(tmp_path / "s", SPEC, [BLANK, BLANK])

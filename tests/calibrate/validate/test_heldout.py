@@ -13,7 +13,7 @@ from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.fit.run import fit_session
 from brushloop.calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.main import Request, validate
-from brushloop.sessions.progress import unseen
+from brushloop.sessions.terminal import unseen
 
 NAMES = {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}
 
