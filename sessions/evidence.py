@@ -25,7 +25,7 @@ from brushloop.sessions.disk import (
 from brushloop.sessions.errors import SessionDamaged, SessionError
 from brushloop.sessions.events import Begin, Done, Event, Open, line_of, parse_event, serial_of
 from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, read_journal
-from brushloop.sessions.mcap_file import Scan, scan
+from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.recording import count_messages, parse_header
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Topic
 from brushloop.sessions.run_state import Account, DoneTwice, RunState, account
@@ -126,7 +126,7 @@ def _session(folder: Path, state: RunState) -> str:
         return named
     finals = {f"{folder.name}.mcap", f"{folder.resolve().name}.mcap"}
     paths = [path for path in folder.glob("*.mcap*") if SEGMENT_NAME.fullmatch(path.name) or path.name in finals]
-    files = Counter(session for path in paths if (session := scan(path, read_chunks=False).session))
+    files = Counter(session for path in paths if (session := McapFile(path).session))
     if folder.name in files or not files:
         return folder.name if files else named
     return named if files[named] == max(files.values()) else files.most_common(1)[0][0]
@@ -221,7 +221,7 @@ def _from_files(found: Evidence, live: dict[str, Done]) -> Header | None:
     return header
 
 
-def _uncovered(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[Path, str, Scan]]:
+def _uncovered(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[Path, str, McapFile]]:
     """Files not fully covered by the journal, each with the name under which it was written."""
     paths = [path for path in sorted(folder.glob("*.mcap*")) if SEGMENT_NAME.fullmatch(path.name)]
     covered = [
@@ -288,7 +288,7 @@ def _header(note: dict[str, Any]) -> Header | None:
 
 def _from_any_segment(found: Evidence) -> Header | None:
     for path in sorted(found.folder.glob("*.mcap*")):
-        header = _header(scan(path).notes.get(BEGIN_NOTE, {})) if SEGMENT_NAME.fullmatch(path.name) else None
+        header = _header(McapFile(path).notes.get(BEGIN_NOTE, {})) if SEGMENT_NAME.fullmatch(path.name) else None
         if header is not None and header.session_id == found.session:
             return header
     return None
@@ -298,7 +298,7 @@ def _from_final(found: Evidence) -> Header | None:
     final = found.folder / f"{found.folder.name}.mcap"
     if not final.is_file():
         return None
-    metadata = scan(final).metadata.get(HEADER_METADATA)
+    metadata = McapFile(final).metadata.get(HEADER_METADATA)
     return parse_header(final, metadata) if metadata else None
 
 
@@ -319,11 +319,7 @@ def _closed(found: Evidence) -> None:
         counts = count_messages(final)
     except SessionError:
         return
-    if (
-        counts
-        and Counter(counts) >= Counter(found.state.counts())
-        and scan(final, read_chunks=False).session in ("", found.session)
-    ):
+    if counts and Counter(counts) >= Counter(found.state.counts()) and McapFile(final).session in ("", found.session):
         event = closed(final, counts, found.state.last_ns)
         found.rebuilt.append(full_line(event))
         found.state.apply(event)

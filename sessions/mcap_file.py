@@ -1,8 +1,7 @@
 """Reading MCAP files that a crash, a bad disk or a stranger may have changed.
 
 Records are read by the mcap library, which believes the lengths that a file states and meets damage with a dozen kinds
-of error. Here every length is bounded before anything is unpacked, every CRC is checked, and damage is a
-`SessionDamaged` that names the file. `scan` reads what is intact in a damaged file.
+of error. Here every length is bounded before anything is unpacked, every CRC is checked, and damage is named.
 """
 
 from __future__ import annotations
@@ -12,34 +11,31 @@ import os
 import struct
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar, cast
+from typing import IO, Any
 
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import FOOTER_SIZE
+from mcap.reader import FOOTER_SIZE, SeekingReader
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
     Message,
     Metadata,
-    MetadataIndex,
     Schema,
-    Statistics,
 )
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.records import HEADER_METADATA, Topic, header_crc, read_note, session_in
+from brushloop.sessions.records import HEADER_METADATA, header_crc, read_note, session_in
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 """Largest record, chunk or index that is read: a chunk is 512 KiB plus one message, the largest image allowed."""
@@ -49,6 +45,7 @@ MESSAGE_START = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; the data follow."""
 _IN_CHUNK = struct.Struct("<BQH")
 """Opcode and length of a record in a chunk, and the channel if it is a message."""
+_DATA_END_BYTES = RECORD_START.size + 4
 _OTHERS = (ValueError, RuntimeError, LookupError, ArithmeticError, EOFError, OSError)
 UNREADABLE = (McapError, struct.error, zstandard.ZstdError, *_OTHERS)
 """Everything that mcap, zstd and the system raised in tests with damaged files.
@@ -58,95 +55,242 @@ Not `MemoryError`: too little memory says nothing about a file. Lengths are boun
 
 Record = tuple[Schema | None, Channel, Message]
 Channels = dict[int, tuple[Schema | None, Channel]]
-_T = TypeVar("_T")
+
+
+@dataclass(slots=True)
+class Part:
+    """One chunk of a file."""
+
+    offset: int
+    index: ChunkIndex | None = None
+    """None if the index of the file is damaged."""
+    counts: Counter[str] | None = None
+    """Number of messages by topic, once `McapFile.check` has read the chunk."""
+    sound: bool = True
+    """False once `McapFile.check` found that the chunk cannot be read or does not match its CRC."""
 
 
 class McapFile:
-    """A finished file, by the index at its end. Raises `InputError` for other files, `SessionDamaged` for damage."""
+    """A file by the index at its end, or, where that is damaged, record by record as far as that goes.
+
+    Raises `InputError` where it cannot be opened; damage is collected in `damage`.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.summary = next(self._guarded(lambda file: iter([_summary(file)])))
+        self.damage: list[str] = []
+        """Descriptions of what is damaged, as far as it was read."""
+        self.index: Summary | None = None
+        """None if it is damaged."""
+        self.complete = False
+        """Whether all chunks are known: the index is intact, or the end of the data was reached."""
+        self.parts: list[Part] = []
+        """Known chunks, in the order in which they were written."""
+        self.counts: Counter[str] = Counter()
+        """Messages by topic in the sound chunks, once `check` has read them."""
+        self.channels: Channels = {}
+        """Channels by number, each with its schema; without an index those that `check` found."""
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.notes: dict[str, dict[str, Any]] = {}
+        """Our own notes (`brushloop.begin`, ...) that match their CRC."""
+        self._attached: list[int] = []
+        self._data_end = 0
+        with opened(path) as file:
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                self.damage.append("does not begin as an MCAP file does")
+            try:
+                self.index, self._data_end = _summary(file)
+            except UNREADABLE as error:
+                self.damage.append(f"its index cannot be read ({in_one_line(error)})")
+                self._walk(file)
+            else:
+                self._list(file, self.index)
 
     @property
-    def channels(self) -> Channels:
-        """The channels by number, each with its schema."""
-        return _channels(self.summary)
+    def stated(self) -> dict[str, int]:
+        """Messages by topic according to the index, without reading them; empty if it is damaged."""
+        statistics = None if self.index is None else self.index.statistics
+        counts = {} if statistics is None else statistics.channel_message_counts
+        return dict(self._by_topic({number: count for number, count in counts.items() if number in self.channels}))
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Messages by topic according to the index, without reading them."""
-        return _stated(self.summary)
+    def session(self) -> str:
+        """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
+        return session_in(self.metadata.get(HEADER_METADATA, {}))
 
-    def messages(
-        self, topics: Iterable[str] | None = None, chunks: Iterable[ChunkIndex] | None = None
-    ) -> Iterator[Record]:
+    def may_hold(self, part: Part, topics: Container[str]) -> bool:
+        """Whether a chunk holds messages on any of these topics; True also where its index does not say."""
+        if part.counts is not None:
+            return any(topic in topics for topic in part.counts)
+        numbers = part.index.message_index_offsets if part.index is not None else {}
+        return not numbers or any(n in self.channels and self.channels[n][1].topic in topics for n in numbers)
+
+    def messages(self, topics: Iterable[str] | None = None, parts: Iterable[Part] | None = None) -> Iterator[Record]:
         """Messages in the order in which they were written, all or those on some topics, every CRC checked.
 
         They are not sorted by log time: a stroke would precede its still if the host's clock was set back between them.
-        `chunks` are those to read, all by default.
+        Without `parts`, all chunks are read but those that `check` found damaged. Raises `SessionDamaged`.
         """
-        wanted = None if topics is None else set(topics)
-        channels = self.channels
-
-        def read(file: IO[bytes]) -> Iterator[Record]:
-            if not self.summary.chunk_indexes and self.counts:
-                raise McapError("has messages outside chunks, which no CRC protects")
-            for index in self.chunks(wanted) if chunks is None else chunks:
-                for message in _messages(_chunk(file, index.chunk_start_offset), channels):
-                    if wanted is None or channels[message.channel_id][1].topic in wanted:
-                        yield *channels[message.channel_id], message
-
-        return self._guarded(read)
-
-    def chunks(self, topics: Iterable[str] | None = None) -> list[ChunkIndex]:
-        """The chunks that may hold messages on some topics, in the order in which they were written."""
-        chunks = sorted(self.summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-        return chunks if topics is None else [chunk for chunk in chunks if self.may_hold(chunk, set(topics))]
-
-    def may_hold(self, chunk: ChunkIndex, topics: Container[str]) -> bool:
-        """Whether a chunk holds messages on any of these topics; True also where its index does not say."""
-        channels = self.summary.channels
-        numbers = chunk.message_index_offsets
-        return not numbers or any(number in channels and channels[number].topic in topics for number in numbers)
+        wanted = None if topics is None else frozenset(topics)
+        with opened(self.path) as file:
+            try:
+                for part in self.parts if parts is None else parts:
+                    if not part.sound or (wanted is not None and not self.may_hold(part, wanted)):
+                        continue
+                    for message in _messages(_chunk(file, part.offset), self.channels):
+                        schema, channel = self.channels[message.channel_id]
+                        if wanted is None or channel.topic in wanted:
+                            yield schema, channel, message
+            except UNREADABLE as error:
+                raise self._unreadable(error) from None
 
     def packed_chunks(self) -> Iterator[tuple[bytes, ChunkIndex, Counter[int]]]:
-        """Every chunk as its bytes, with the indexes of its messages, and its messages by channel; CRCs are checked."""
+        """Every chunk as its bytes, with the indexes of its messages, and its messages by channel; CRCs are checked.
 
-        def read(file: IO[bytes]) -> Iterator[tuple[bytes, ChunkIndex, Counter[int]]]:
-            for index in self.chunks():
-                counts, _records = _counted(_chunk(file, index.chunk_start_offset))
-                size = index.chunk_length + index.message_index_length
-                if not counts.keys() <= self.summary.channels.keys() or size > os.fstat(file.fileno()).st_size:
-                    raise McapError("a chunk is not as the index states")
-                file.seek(index.chunk_start_offset)
-                yield file.read(size), index, counts
-
-        return self._guarded(read)
-
-    def metadata(self) -> Iterator[Metadata]:
-        """Metadata records."""
-        return self._guarded(lambda file: (_metadata(file, one.offset) for one in self.summary.metadata_indexes))
+        Raises `SessionDamaged`.
+        """
+        with opened(self.path) as file:
+            try:
+                for part in self.parts:
+                    counts, _records = _counted(_chunk(file, part.offset))
+                    index = part.index
+                    size = 0 if index is None else index.chunk_length + index.message_index_length
+                    if index is None or not counts.keys() <= self.channels.keys() or size > _size(file):
+                        raise McapError("a chunk is not as the index states")
+                    file.seek(part.offset)
+                    yield file.read(size), index, counts
+            except UNREADABLE as error:
+                raise self._unreadable(error) from None
 
     def attachments(self) -> Iterator[Attachment]:
-        """Attached files, byte for byte."""
-        return self._guarded(lambda file: (_attachment(file, one.offset) for one in self.summary.attachment_indexes))
-
-    def _guarded(self, read: Callable[[IO[bytes]], Iterator[_T]]) -> Generator[_T]:
-        """Yield items; turn the library's exceptions into `SessionDamaged`, not those of the code that uses an item."""
+        """Attached files, byte for byte, but those that `check` found damaged. Raises `SessionDamaged`."""
         with opened(self.path) as file:
-            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise InputError(self.path, "is not an MCAP file")
-            items: Iterator[_T] | None = None
-            while True:
+            try:
+                for offset in self._attached:
+                    yield _attachment(file, offset)
+            except UNREADABLE as error:
+                raise self._unreadable(error) from None
+
+    def check(self) -> None:
+        """Check every CRC in the file and count its messages; none is decoded."""
+        with opened(self.path) as file:
+            for part in self.parts:
                 try:
-                    items = items or read(file)
-                    item = next(items)
-                except StopIteration:
-                    return
+                    part.counts = self._read_chunk(file, part.offset)
+                    self.counts += part.counts
                 except UNREADABLE as error:
-                    raise SessionDamaged(self.path, f"cannot read: {in_one_line(error)}") from None
-                yield item
+                    part.sound = False
+                    self._add_damage("chunk", part.offset, error)
+            for offset in list(self._attached):
+                try:
+                    _attachment(file, offset)
+                except UNREADABLE as error:
+                    self._attached.remove(offset)
+                    self._add_damage("attachment", offset, error)
+            if self.index is not None and not self.damage:
+                try:
+                    _check_data(file, self._data_end)
+                except UNREADABLE as error:
+                    self.damage.append(in_one_line(error))
+        if not self.damage and self.stated != dict(self.counts):
+            self.damage.append(f"holds {dict(self.counts)}, but its index says {self.stated}")
+
+    def _list(self, file: IO[bytes], index: Summary) -> None:
+        """Take over what the index lists, whose channels a lost chunk may have held."""
+        self.complete = True
+        self.channels = {n: (index.schemas.get(one.schema_id), one) for n, one in index.channels.items()}
+        chunks = {one.chunk_start_offset: one for one in index.chunk_indexes}
+        self.parts = [Part(offset, chunks[offset]) for offset in sorted(chunks)]
+        self._attached = [one.offset for one in index.attachment_indexes]
+        for one in index.metadata_indexes:
+            self._add_metadata(file, one.offset)
+        if not chunks and self.stated:
+            self.damage.append("has messages outside chunks, which no CRC protects")
+
+    def _walk(self, file: IO[bytes]) -> None:
+        """Find the records up to the end of the data or to the first that cannot be read."""
+        size, at = _size(file), len(MCAP0_MAGIC)
+        while True:
+            file.seek(at)
+            start = file.read(RECORD_START.size)
+            if len(start) < RECORD_START.size:
+                self.damage.append(f"ends at byte {size} without an index")
+                return
+            opcode, length = RECORD_START.unpack(start)
+            if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+                self.damage.append(f"no record can be read at byte {at}")
+                return
+            if at + RECORD_START.size + length > size:
+                self.damage.append(f"is cut short in the record at byte {at}")
+                return
+            match opcode:
+                case Opcode.CHUNK:
+                    self.parts.append(Part(at))
+                case Opcode.ATTACHMENT:
+                    self._attached.append(at)
+                case Opcode.METADATA:
+                    self._add_metadata(file, at)
+                case Opcode.DATA_END:
+                    self.complete = True
+                    return
+                case _:
+                    pass
+            at += RECORD_START.size + length
+
+    def _read_chunk(self, file: IO[bytes], offset: int) -> Counter[str]:
+        """Messages of a chunk by topic; its channels become known. Raises any of `UNREADABLE`."""
+        counts, others = _counted(_chunk(file, offset))
+        schemas = {one.id: one for one in others if isinstance(one, Schema)}
+        for one in others:
+            if isinstance(one, Channel):
+                self.channels.setdefault(one.id, (schemas.get(one.schema_id), one))
+        return self._by_topic(counts)
+
+    def _by_topic(self, counts: Mapping[int, int]) -> Counter[str]:
+        by_topic: Counter[str] = Counter()
+        for number, count in counts.items():
+            by_topic[self.channels[number][1].topic] += count
+        return by_topic
+
+    def _add_metadata(self, file: IO[bytes], offset: int) -> None:
+        try:
+            record = Metadata.read(_stream(_record(file, offset, Opcode.METADATA)))
+            self.metadata[record.name] = record.metadata
+            if record.name == HEADER_METADATA:
+                if record.metadata.get("crc", "") not in ("", header_crc(record.metadata)):
+                    self.damage.append("its header does not match its CRC")
+            elif "crc" in record.metadata:
+                values = read_note(record.metadata)
+                if values is None:
+                    self.damage.append(f"its note {record.name!r} does not match its CRC")
+                else:
+                    self.notes[record.name] = values
+        except UNREADABLE as error:
+            self._add_damage("metadata", offset, error)
+
+    def _add_damage(self, name: str, offset: int, error: Exception) -> None:
+        self.damage.append(f"the {name} at byte {offset} cannot be read ({in_one_line(error)})")
+
+    def _unreadable(self, error: Exception) -> SessionDamaged:
+        return SessionDamaged(self.path, f"cannot read: {in_one_line(error)}")
+
+
+def open_mcap(path: Path) -> McapFile:
+    """A finished file, by its index. Raises `InputError` for any other file, `SessionDamaged` for a damaged one."""
+    with opened(path) as file:
+        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise InputError(path, "is not an MCAP file")
+    found = McapFile(path)
+    if found.damage:
+        raise SessionDamaged(path, f"cannot read: {'; '.join(found.damage)}")
+    return found
+
+
+def scan(path: Path) -> McapFile:
+    """Read a file once, every CRC checked. Raises `InputError` where it cannot be opened; damage is never raised."""
+    found = McapFile(path)
+    found.check()
+    return found
 
 
 def opened(path: Path) -> IO[bytes]:
@@ -157,48 +301,30 @@ def opened(path: Path) -> IO[bytes]:
         raise InputError(path, f"cannot open: {in_one_line(error)}") from None
 
 
-def _summary(file: IO[bytes]) -> Summary:
-    """The index of a file, its CRC checked: otherwise one wrong bit in it could silently hide strokes."""
+def _summary(file: IO[bytes]) -> tuple[Summary, int]:
+    """The index of a file and the place of the mark before it. Raises any of `UNREADABLE`.
+
+    Its CRC is checked: otherwise one wrong bit in it could silently hide strokes.
+    """
     tail = FOOTER_SIZE + len(MCAP0_MAGIC)
-    footer_at = os.fstat(file.fileno()).st_size - tail
+    footer_at = _size(file) - tail
     file.seek(max(footer_at, 0))
     footer = file.read(tail)
     start, crc = struct.unpack_from("<9xQ8xI", footer)
     if not footer.endswith(MCAP0_MAGIC) or not 0 < start <= footer_at:
         raise McapError("has no index: it was not finished, or is cut short")
     file.seek(start)
-    data = file.read(MAX_RECORD_BYTES)
-    if zlib.crc32(data[: -len(MCAP0_MAGIC) - 4]) != crc:
+    if zlib.crc32(file.read(min(footer_at + FOOTER_SIZE - 4 - start, MAX_RECORD_BYTES))) != crc:
         raise McapError("the index does not match its CRC")
-    summary = Summary()
-    for record in StreamReader(io.BytesIO(data), skip_magic=True).records:
-        match record:
-            case Statistics():
-                summary.statistics = record
-            case Schema():
-                summary.schemas[record.id] = record
-            case Channel():
-                summary.channels[record.id] = record
-            case ChunkIndex():
-                summary.chunk_indexes.append(record)
-            case AttachmentIndex():
-                summary.attachment_indexes.append(record)
-            case MetadataIndex():
-                summary.metadata_indexes.append(record)
-            case _:
-                pass
-    if summary.statistics is None:
+    file.seek(0)
+    summary = SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
+    if summary is None or summary.statistics is None:
         raise McapError("has no index: it was not finished")
-    return summary
+    return summary, start - _DATA_END_BYTES
 
 
-def _channels(summary: Summary) -> Channels:
-    return {n: (summary.schemas.get(channel.schema_id), channel) for n, channel in summary.channels.items()}
-
-
-def _stated(summary: Summary) -> dict[str, int]:
-    counts = cast("Statistics", summary.statistics).channel_message_counts
-    return {summary.channels[key].topic: count for key, count in counts.items() if key in summary.channels}
+def _size(file: IO[bytes]) -> int:
+    return os.fstat(file.fileno()).st_size
 
 
 def _stream(data: bytes) -> ReadDataStream:
@@ -209,13 +335,9 @@ def _record(file: IO[bytes], offset: int, opcode: Opcode) -> bytes:
     """Content of the record at this place. Raises any of `UNREADABLE`."""
     file.seek(offset)
     actual, length = RECORD_START.unpack(file.read(RECORD_START.size))
-    if actual != opcode or length > min(MAX_RECORD_BYTES, os.fstat(file.fileno()).st_size - file.tell()):
+    if actual != opcode or length > min(MAX_RECORD_BYTES, _size(file) - file.tell()):
         raise McapError(f"no {opcode.name.lower()} of at most {MAX_RECORD_BYTES} bytes is at byte {offset}")
     return file.read(length)
-
-
-def _metadata(file: IO[bytes], offset: int) -> Metadata:
-    return Metadata.read(_stream(_record(file, offset, Opcode.METADATA)))
 
 
 def _attachment(file: IO[bytes], offset: int) -> Attachment:
@@ -278,152 +400,9 @@ def _messages(records: bytes, known: Mapping[int, object]) -> Iterator[Message]:
         at = end
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
-    """One chunk of a file, readable or not."""
-
-    offset: int
-    counts: Counter[str] | None
-    """Number of messages by topic; None for a chunk that cannot be read or does not match its CRC."""
-
-    @property
-    def sound(self) -> bool:
-        """Whether it can be read and matches its CRC."""
-        return self.counts is not None
-
-
-@dataclass(slots=True)
-class Scan:
-    """What is intact in a file, and what is wrong with the rest."""
-
-    path: Path
-    parts: list[Part] = field(default_factory=list[Part])
-    """Known chunks, in order."""
-    complete: bool = False
-    """Whether all chunks are known: the walk reached the end, or the index is intact."""
-    channels: Channels = field(default_factory=dict[int, tuple[Schema | None, Channel]])
-    notes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
-    """Our own notes (`brushloop.begin`, ...) that match their CRC."""
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    """All metadata."""
-    attachments: list[Attachment] = field(default_factory=list[Attachment])
-    counts: Counter[str] = field(default_factory=Counter[str])
-    """Messages by topic in the sound chunks."""
-    index: Summary | None = None
-    """None if it is damaged."""
-    damage: list[str] = field(default_factory=list[str])
-    """Descriptions of the damage; empty for an intact file."""
-
-    @property
-    def stated(self) -> dict[str, int] | None:
-        """Number of messages by topic according to the index; None if it is damaged."""
-        return None if self.index is None else _stated(self.index)
-
-    @property
-    def session(self) -> str:
-        """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
-        return session_in(self.metadata.get(HEADER_METADATA, {}))
-
-    def messages(self, parts: Iterable[Part] | None = None, topics: Container[str] = tuple(Topic)) -> Iterator[Record]:
-        """Messages of the sound chunks, or of these, in the order in which they were written. Raises `OSError`."""
-        with self.path.open("rb") as file:
-            for part in self.parts if parts is None else parts:
-                if part.counts is not None and any(topic in topics for topic in part.counts):
-                    for message in _messages(_chunk(file, part.offset), self.channels):
-                        schema, channel = self.channels[message.channel_id]
-                        if channel.topic in topics:
-                            yield schema, channel, message
-
-
-def scan(path: Path, *, read_chunks: bool = True) -> Scan:
-    """Read a file once: every CRC is checked and messages are counted, none is decoded.
-
-    A file that is cut or damaged is read record by record as far as that goes; the index at its end, if it is intact,
-    gives the places of the rest. Raises `InputError` where it cannot be opened; damage is reported, never raised.
-    """
-    found = Scan(path)
-    with opened(path) as file:
-        try:
-            places = dict(_walk(file, found)) | _listed(file, found)
-            for offset in sorted(places):
-                if read_chunks or places[offset] in (Opcode.METADATA, Opcode.ATTACHMENT):
-                    _read_part(file, found, offset, places[offset])
-        except OSError as error:
-            found.damage.append(f"cannot be read: {in_one_line(error)}")
-    if read_chunks and not found.damage and found.stated != dict(found.counts):
-        found.damage.append(f"holds {dict(found.counts)}, but its index says {found.stated}")
-    return found
-
-
-def _walk(file: IO[bytes], found: Scan) -> Iterator[tuple[int, int]]:
-    """Places and opcodes of the records, up to the end of the data or to the first that cannot be read."""
-    size = os.fstat(file.fileno()).st_size
-    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        found.damage.append("does not begin as an MCAP file does")
-    at = len(MCAP0_MAGIC)
-    while True:
-        file.seek(at)
-        start = file.read(RECORD_START.size)
-        if len(start) < RECORD_START.size:
-            found.damage.append(f"ends at byte {size} without an index")
-            return
-        opcode, length = RECORD_START.unpack(start)
-        if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
-            found.damage.append(f"no record can be read at byte {at}")
-            return
-        if at + RECORD_START.size + length > size:
-            found.damage.append(f"is cut short in the record at byte {at}")
-            return
-        if opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END):
-            yield at, opcode
-        if opcode == Opcode.DATA_END:
-            found.complete = True
-            return
-        at += RECORD_START.size + length
-
-
-def _listed(file: IO[bytes], found: Scan) -> dict[int, int]:
-    """Places and opcodes of the records that the index lists, whose channels a lost chunk may have held."""
-    try:
-        summary = _summary(file)
-    except UNREADABLE as error:
-        found.damage.append(f"its index cannot be read ({in_one_line(error)})")
-        return {}
-    found.index, found.channels, found.complete = summary, _channels(summary), True
-    places = {one.chunk_start_offset: int(Opcode.CHUNK) for one in summary.chunk_indexes}
-    places |= {one.offset: int(Opcode.METADATA) for one in summary.metadata_indexes}
-    return places | {one.offset: int(Opcode.ATTACHMENT) for one in summary.attachment_indexes}
-
-
-def _read_part(file: IO[bytes], found: Scan, offset: int, opcode: int) -> None:
-    """Add a record to what was found, or its damage."""
-    try:
-        if opcode == Opcode.METADATA:
-            _add_metadata(_metadata(file, offset), found)
-        elif opcode == Opcode.ATTACHMENT:
-            found.attachments.append(_attachment(file, offset))
-        elif opcode == Opcode.DATA_END:
-            if not found.damage:
-                _check_data(file, offset)
-        else:
-            by_number, others = _counted(_chunk(file, offset))
-            schemas = {one.id: one for one in others if isinstance(one, Schema)}
-            for one in others:
-                if isinstance(one, Channel):
-                    found.channels.setdefault(one.id, (schemas.get(one.schema_id), one))
-            counts = Counter({found.channels[number][1].topic: count for number, count in by_number.items()})
-            found.counts += counts
-            found.parts.append(Part(offset, counts))
-    except UNREADABLE as error:
-        name = Opcode(opcode).name.lower()
-        found.damage.append(f"the {name} at byte {offset} cannot be read ({in_one_line(error)})")
-        if opcode == Opcode.CHUNK:
-            found.parts.append(Part(offset, None))
-
-
 def _check_data(file: IO[bytes], end: int) -> None:
     """Check the CRC of everything before the mark `end`, also of what no other CRC protects."""
-    (expected,) = struct.unpack("<I", _record(file, end, Opcode.DATA_END))
+    expected = int.from_bytes(_record(file, end, Opcode.DATA_END), "little")
     file.seek(0)
     crc = at = 0
     while at < end:
@@ -431,16 +410,3 @@ def _check_data(file: IO[bytes], end: int) -> None:
         crc, at = zlib.crc32(piece, crc), at + len(piece)
     if expected not in (0, crc):
         raise McapError("what is before it does not match its CRC")
-
-
-def _add_metadata(record: Metadata, found: Scan) -> None:
-    found.metadata[record.name] = record.metadata
-    if record.name == HEADER_METADATA:
-        if record.metadata.get("crc", "") not in ("", header_crc(record.metadata)):
-            found.damage.append("its header does not match its CRC")
-    elif "crc" in record.metadata:
-        values = read_note(record.metadata)
-        if values is None:
-            found.damage.append(f"its note {record.name!r} does not match its CRC")
-        else:
-            found.notes[record.name] = values

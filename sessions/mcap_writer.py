@@ -37,11 +37,7 @@ from mcap.records import Header as FileHeader
 from mcap.writer import MCAP0_MAGIC
 
 from brushloop.sessions.disk import sync
-from brushloop.sessions.mcap_file import (
-    MESSAGE_START,
-    RECORD_START,
-    McapFile,
-)
+from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, open_mcap
 from brushloop.sessions.records import HEADER_METADATA, Header, Topic, header_metadata, note
 
 CHUNK_BYTES = 256 * 1024
@@ -131,7 +127,7 @@ class McapWriter:
 
         Chunks are copied whole where the numbers of the channels agree, as they do in files of one session.
         """
-        source = McapFile(path)
+        source = open_mcap(path)
         channels = list(source.channels.values())
         if not all(self._fits(*pair) for pair in channels):
             for record in source.messages():

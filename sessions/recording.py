@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from google.protobuf.message import DecodeError
-from mcap.records import ChunkIndex
 from pydantic import ValidationError
 
 from brushloop.sessions.disk import (
@@ -29,10 +28,10 @@ from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, 
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.history import remarks_of
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.mcap_file import McapFile, Record, scan
+from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.records import HEADER_METADATA, Event, Header, StepEvent, Stroke, Topic, header_crc
+from brushloop.sessions.records import HEADER_METADATA, Event, Header, StepEvent, Stroke, Topic
 from brushloop.sessions.run_state import RunState, replay
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = _find_mcap(path)
-        self._file = McapFile(self.path)
+        self._file = open_mcap(self.path)
         self.header = _read_header(self._file)
 
     @property
@@ -77,7 +76,7 @@ class Recording:
     @property
     def counts(self) -> dict[str, int]:
         """Messages by topic according to the index, without reading them."""
-        return self._file.counts
+        return self._file.stated
 
     def attachment(self, name: str) -> bytes:
         """File attached to the recording (`rig.toml`). Raises `InputError` where there is none."""
@@ -104,12 +103,12 @@ class Recording:
 
         Raises `SessionDamaged` also for a recording whose strokes do not have a chunk each, as they do in ours.
         """
-        before, chunks = 0, list[ChunkIndex]()
-        for chunk in self._file.chunks([Topic.STILL, Topic.STROKE]):
+        before, parts = 0, list[Part]()
+        for part in self._file.parts:
             if before == number:
-                chunks.append(chunk)
-            before += self._file.may_hold(chunk, (Topic.STROKE,))
-        found = list(self._captures(self._file.messages([Topic.STILL, Topic.STROKE], chunks), bad))
+                parts.append(part)
+            before += self._file.may_hold(part, (Topic.STROKE,))
+        found = list(self._captures(self._file.messages([Topic.STILL, Topic.STROKE], parts), bad))
         if before != self.strokes() or len(found) != 1:
             raise SessionDamaged(self.path, f"stroke number {number} cannot be read alone")
         return found[0]
@@ -167,12 +166,9 @@ def _find_mcap(path: Path) -> Path:
 
 
 def _read_header(file: McapFile) -> Header:
-    for record in file.metadata():
-        if record.name == HEADER_METADATA:
-            if record.metadata.get("crc", header_crc(record.metadata)) != header_crc(record.metadata):
-                raise SessionDamaged(file.path, "header does not match its CRC")
-            return parse_header(file.path, record.metadata)
-    raise InputError(file.path, "is an MCAP file without brushloop's header")
+    if HEADER_METADATA not in file.metadata:
+        raise InputError(file.path, "is an MCAP file without brushloop's header")
+    return parse_header(file.path, file.metadata[HEADER_METADATA])
 
 
 def parse_header(path: Path, metadata: dict[str, str]) -> Header:
@@ -255,5 +251,5 @@ def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
         more = Counter(count_messages(final)) - Counter(state.counts())
     except SessionError:
         return
-    if more and scan(final, read_chunks=False).session == header.session_id:
+    if more and McapFile(final).session == header.session_id:
         raise SessionDamaged(final, f"holds {more.total()} messages that the steps in the journal do not have")

@@ -20,7 +20,7 @@ from brushloop.sessions.events import DrawResult, PressResult, line_of, parse_ev
 from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, without_time
-from brushloop.sessions.mcap_file import Part, Record, Scan, scan
+from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
 from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session
 from brushloop.sessions.records import (
     BEGIN_NOTE,
@@ -90,7 +90,7 @@ class FolderRepair:
         self._report = Report(folder.name)
         self._lost_steps: list[str] = []
         """Reported as lost unless the merged file holds them."""
-        self._scans: dict[tuple[int, int, int], tuple[Scan, Step | None]] = {}
+        self._scans: dict[tuple[int, int, int], tuple[McapFile, Step | None]] = {}
         """Content of each file that was read and the step it belongs to, by inode, size and time."""
         evidence = gather(folder)
         self._strays = dict.fromkeys(evidence.strays, "it is a copy of another step")
@@ -144,8 +144,8 @@ class FolderRepair:
             self._damaged(path, line, error.what)
 
     def _damaged(self, path: Path, line: Line, why: str) -> None:
-        found = self._look(path)[0] if path.is_file() else Scan(path)
-        why = "; ".join(found.damage) or why
+        if path.is_file():
+            why = "; ".join(self._look(path)[0].damage) or why
         counts = Counter[str](line["counts"])
         needed = _needed(counts)
 
@@ -164,7 +164,7 @@ class FolderRepair:
         elif any(topic in missing for topic in needed):
             self._lose(path, line, why)
         else:
-            self._write_again(path, line, found, records, dict(missing), why)
+            self._write_again(path, line, records, dict(missing), why)
 
     def _copies(self, path: Path, line: Line) -> Iterator[list[Record]]:
         """What is intact of a step in each file that names it inside, whatever its name, and in the merged file."""
@@ -181,10 +181,10 @@ class FolderRepair:
         if self._is_ours(found):
             self._merged = self._merged or _steps_in(found)
             by_step, by_still = self._merged
-            yield list(found.messages(by_step.get(step, [])))
-            yield list(found.messages(by_still.get(line["result"].get("still"), [])))
+            yield list(found.messages(parts=by_step.get(step, [])))
+            yield list(found.messages(parts=by_still.get(line["result"].get("still"), [])))
 
-    def _look(self, path: Path) -> tuple[Scan, Step | None]:
+    def _look(self, path: Path) -> tuple[McapFile, Step | None]:
         """Read the content of a file and the step it belongs to; only once, even if the file is renamed meanwhile."""
         stat = path.stat()
         known = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
@@ -195,16 +195,15 @@ class FolderRepair:
         self._scans[known][0].path = path
         return self._scans[known]
 
-    def _is_ours(self, found: Scan) -> bool:
+    def _is_ours(self, found: McapFile) -> bool:
         """Whether a file may be evidence. Steps of another session of the same protocol have the same keys."""
         return found.session in ("", self._header.session_id)
 
-    def _write_again(
-        self, path: Path, line: Line, found: Scan, records: list[Record], missing: dict[str, int], why: str
-    ) -> None:
+    def _write_again(self, path: Path, line: Line, records: list[Record], missing: dict[str, int], why: str) -> None:
         begin = {"t_ns": line["t_ns"], "header": self._header.model_dump(mode="json"), "line": self._begin_of(line)}
-        if self._look(path)[1] == (line["key"], line["attempt"]) if path.is_file() else False:
-            begin = found.notes.get(BEGIN_NOTE, begin)
+        if path.is_file():
+            found, whose = self._look(path)
+            begin = found.notes.get(BEGIN_NOTE, begin) if whose == (line["key"], line["attempt"]) else begin
         counts = dict(_count(records))
         done = {name: line[name] for name in ("key", "result", "t_ns")}
         notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line["attempt"], "counts": counts}}
@@ -256,25 +255,25 @@ class FolderRepair:
 
     def _merge_again(self) -> None:
         """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
-        found = self._look(self._final)[0] if self._final.is_file() else Scan(self._final)
+        found = self._look(self._final)[0] if self._final.is_file() else None
         if (
-            self._final.is_file()
+            found is not None
             and self._is_ours(found)
             and len(with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0)
         ):
             self._lost_steps = self._rewrite_final(found)
             return
-        why = "; ".join(found.damage) or ("has changed" if self._final.is_file() else "is missing")
+        why = "is missing" if found is None else "; ".join(found.damage) or "has changed"
         kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
         merge_session(self._folder, self._state, self._header, "damaged")
         self._log(line_of(closed(self._final, self._state.counts(), 0)))
         self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{kept_words(kept)}")
 
-    def _rewrite_final(self, found: Scan) -> list[str]:
+    def _rewrite_final(self, found: McapFile) -> list[str]:
         """Rewrite the merged file, and return descriptions of what was lost."""
         strokes = with_their_stills(found)
         names = {} if self._state.opened is None else self._state.opened.snapshots
-        files = {a.name: a.data for a in found.attachments} | {name: text.encode() for name, text in names.items()}
+        files = {a.name: a.data for a in found.attachments()} | {name: text.encode() for name, text in names.items()}
         repairs = [line_of(repair) for repair in self._state.repairs]
         notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
         kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
@@ -286,7 +285,9 @@ class FolderRepair:
 
     def _left_by_a_close(self) -> None:
         """Put aside a damaged merged file of an open session, which is merged again when it closes."""
-        found, problems = file_problems(self._final) if self._final.is_file() else (Scan(self._final), [])
+        if not self._final.is_file():
+            return
+        found, problems = file_problems(self._final)
         if problems or not self._is_ours(found):
             kept = self._move_aside(self._final)
             self._report.did.append(
@@ -321,7 +322,7 @@ def _count(records: list[Record]) -> Counter[str]:
     return Counter(channel.topic for _schema, channel, _message in records)
 
 
-def _step_of(found: Scan) -> Step | None:
+def _step_of(found: McapFile) -> Step | None:
     """Key and attempt of the step recorded in a file, from its content, whatever its name."""
     for values in (found.notes.get(BEGIN_NOTE, {}).get("line"), found.notes.get(DONE_NOTE)):
         match values:
@@ -329,13 +330,13 @@ def _step_of(found: Scan) -> Step | None:
                 return key, attempt
             case _:
                 pass
-    for _schema, _channel, message in found.messages(topics=(Topic.STEP,)):
+    for _schema, _channel, message in found.messages((Topic.STEP,)):
         event = parsed(StepEvent, message)
         return None if event is None else (event.key, event.attempt)
     return None
 
 
-def _steps_in(found: Scan) -> tuple[dict[Step, list[Part]], dict[int, list[Part]]]:
+def _steps_in(found: McapFile) -> tuple[dict[Step, list[Part]], dict[int, list[Part]]]:
     """Sound chunks of a damaged merged file by step, and those with a photograph and its stroke by the still's number.
 
     A step lies between its begin and end events. Chunks between damage and the next event belong to the step of that
@@ -350,7 +351,7 @@ def _steps_in(found: Scan) -> tuple[dict[Step, list[Part]], dict[int, list[Part]
             continue
         run = [*run, part]
         step: Step | None = None
-        for _schema, channel, message in found.messages([part], (Topic.STEP, Topic.STILL, Topic.STROKE)):
+        for _schema, channel, message in found.messages((Topic.STEP, Topic.STILL, Topic.STROKE), [part]):
             if channel.topic == Topic.STEP and (event := parsed(StepEvent, message)) is not None:
                 step = event.key, event.attempt
                 run = [part] if event.phase == "begin" else run

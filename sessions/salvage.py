@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from brushloop.sessions.disk import fsync_folder, set_aside, sync
 from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.journal import Line
-from brushloop.sessions.mcap_file import Record, Scan, scan
+from brushloop.sessions.mcap_file import McapFile, Record, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_still
 from brushloop.sessions.recording import count_messages, parse_header
@@ -98,7 +98,7 @@ def replace_damaged(
 class Strokes:
     """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
 
-    found: Scan
+    found: McapFile
     kept: tuple[str, ...]
     photograph_lost: tuple[str, ...]
     """Strokes whose still cannot be read."""
@@ -115,7 +115,7 @@ class Strokes:
             yield schema, channel, message
 
 
-def with_their_stills(found: Scan) -> Strokes:
+def with_their_stills(found: McapFile) -> Strokes:
     """Sort the strokes of a damaged file into those with their stills and those that are lost."""
     there = {m.sequence for _, channel, m in found.messages() if channel.topic == Topic.STILL and _shows(m)}
     names: dict[str, bool] = {}
@@ -154,13 +154,13 @@ def repair_file(path: Path) -> Report:
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
     strokes = with_their_stills(found)
     notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
-    files = {attachment.name: attachment.data for attachment in found.attachments}
+    files = {attachment.name: attachment.data for attachment in found.attachments()}
     kept, counts = replace_damaged(path, header, notes, files, strokes.messages())
     why = "; ".join(finding.what for finding in verdict.findings)
     report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept_words(kept)}")
     report.strokes = counts.get(Topic.STROKE, 0)
-    report.lost += lost_words(strokes, Counter(found.stated or {}), counts)
-    if found.stated is None and (not found.complete or any(part.counts is None for part in found.parts)):
+    report.lost += lost_words(strokes, Counter(found.stated), counts)
+    if found.index is None and (not found.complete or any(part.counts is None for part in found.parts)):
         report.lost.append("anything else behind the damage: without its index its amount is unknown")
     if found.index is None:
         return report

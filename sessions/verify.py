@@ -15,7 +15,7 @@ from brushloop.sessions.events import Lost, Repaired
 from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Line
-from brushloop.sessions.mcap_file import Scan, scan
+from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
@@ -194,7 +194,7 @@ def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:
     return [Finding(path.name, f"({step}) {problem}") for problem in problems]
 
 
-def _foreign(found: Scan, evidence: Evidence) -> list[str]:
+def _foreign(found: McapFile, evidence: Evidence) -> list[str]:
     """What is wrong with a file of another session: nothing in it is evidence."""
     session = found.session
     return [] if session in ("", evidence.session) else [f"is of another session, {session[:100]!r}"]
@@ -220,7 +220,7 @@ def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progres
     verdict.findings += [Finding(path.name, problem) for problem in problems]
 
 
-def file_problems(path: Path, progress: Progress = unseen, *, decode: bool = True) -> tuple[Scan, list[str]]:
+def file_problems(path: Path, progress: Progress = unseen, *, decode: bool = True) -> tuple[McapFile, list[str]]:
     """Read a file in full and list what is wrong with its chunks, its index, its photographs and its strokes.
 
     Without `decode`, photographs and strokes are only checked by their CRC.
@@ -230,7 +230,7 @@ def file_problems(path: Path, progress: Progress = unseen, *, decode: bool = Tru
     stills: set[int] = set()
     strokes: set[str] = set()
     try:
-        for _schema, channel, message in found.messages(topics=(Topic.STILL, Topic.STROKE) if decode else ()):
+        for _schema, channel, message in found.messages((Topic.STILL, Topic.STROKE) if decode else ()):
             if channel.topic == Topic.STILL:
                 progress(f"{path.name}: photographs decoded", len(stills), found.counts[Topic.STILL])
                 decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")

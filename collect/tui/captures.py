@@ -26,7 +26,7 @@ from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.history import Remark, remarks_of, unlike, waits_of
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.records import Check, Quality, Stroke, Topic
 from brushloop.sessions.run_state import replay
@@ -171,7 +171,7 @@ class Review:
         path = path if path.is_file() else self.folder / f"{self.folder.name}.mcap"
         image, log_ns, stroke = None, 0, None
         checks: tuple[Check, ...] = ()
-        for _schema, channel, message in McapFile(path).messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
+        for _schema, channel, message in open_mcap(path).messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
             if message.sequence != capture.still:
                 continue
             if channel.topic == Topic.STILL:

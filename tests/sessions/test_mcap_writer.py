@@ -9,7 +9,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 
-from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.mcap_writer import CHUNK_BYTES, McapWriter
 
 PLACES = {"chunk_length", "chunk_start_offset", "compressed_size", "message_index_offsets"}
@@ -103,7 +103,7 @@ def test_messages_of_another_file_are_copied_whatever_numbers_its_channels_have(
         writer.finish()
 
     def messages_of(path):
-        return [(c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in McapFile(path).messages()]
+        return [(c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in open_mcap(path).messages()]
 
     assert messages_of(copy) == 2 * messages_of(source)
     with copy.open("rb") as file:

@@ -13,7 +13,7 @@ from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, 
 from brushloop.sessions.events import PressResult, StepKind
 from brushloop.sessions.folders import next_session_id, open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME, Journal
-from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.recording import Recording, count_messages
 from brushloop.sessions.store import SessionStore
 
@@ -153,7 +153,7 @@ def test_each_attached_file_says_what_it_is(make, tmp_path):
     final = store.close()
     store.release()
     expected = dict.fromkeys(make.snapshots, "application/toml") | {"rig.effective.json": "application/json"}
-    assert {a.name: a.media_type for a in McapFile(final).attachments()} == expected
+    assert {a.name: a.media_type for a in open_mcap(final).attachments()} == expected
 
 
 def test_a_closed_session_is_not_opened_for_writing_again(make, store, resume):

@@ -17,7 +17,7 @@ from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.journal import read_lines
-from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
 from brushloop.sessions.run_state import replay
@@ -65,7 +65,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert engine.snapshot().state is State.DONE, engine.snapshot().messages
 
     [folder] = bent_lab.sessions.iterdir()
-    [(schema, _, message)] = McapFile(Recording(folder).path).messages([str(Topic.CALIBRATION)])
+    [(schema, _, message)] = open_mcap(Recording(folder).path).messages([str(Topic.CALIBRATION)])
     recorded = CameraCalibration.FromString(message.data)
     assert schema is not None
     assert (schema.name, recorded.width, recorded.height) == ("foxglove.CameraCalibration", 1024, 768)
