@@ -20,9 +20,9 @@ import numpy as np
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from bench.harness import BenchError, Result
+from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter, encoded
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Event, Header, Source, Topic, Wrench
-from brushloop.sessions.step_file import Outgoing, SegmentWriter, encoded
 
 POSE_HZ, FORCE_HZ, STILL_HZ = 100, 1000, 0.5
 LOAD_S = 10.0
@@ -31,7 +31,6 @@ FLAT_RUNS = 5
 """Times that each writes it in one round: they are short, and a busy machine delays some."""
 PACED_S = 4.0
 """How long the load runs at its real pace in one round."""
-WAIT_S = 60.0
 
 Write = Callable[[Outgoing], None]
 Contestant = Callable[[Path], AbstractContextManager[Write]]
@@ -147,7 +146,7 @@ def _ours(folder: Path) -> Iterator[Write]:
     header = Header(session_id="bench", source=Source.LOOPBACK, software="bench")
     writer = SegmentWriter(folder / "ours.mcap", header)
     try:
-        yield lambda outgoing: writer.write(outgoing, WAIT_S)
+        yield writer.write
     except BaseException:
         writer.abandon()
         raise

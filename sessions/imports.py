@@ -17,10 +17,9 @@ from pathlib import Path
 from brushloop.sessions.cells import as_text, number
 from brushloop.sessions.disk import SESSION_ID, read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.mcap_writer import new_mcap
+from brushloop.sessions.mcap_writer import Outgoing, new_mcap
 from brushloop.sessions.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message, upright
 from brushloop.sessions.records import MAX_PX_PER_MM, MIN_PX_PER_MM, Header, Source, Stroke, Topic
-from brushloop.sessions.step_file import ChannelTable, Outgoing
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
@@ -118,7 +117,6 @@ def _write(
     progress: Progress,
 ) -> None:
     with new_mcap(final, header, {}, {}) as writer:
-        channels = ChannelTable(writer)
         pairs = zip(rows, digests, strict=True)
         for row, digest in counted(pairs, "photographs written", len(rows), progress):
             data, still = read_bounded(row.image, MAX_IMAGE_BYTES), row.stroke.still
@@ -127,8 +125,8 @@ def _write(
             data = upright(data)
             image_kind = "png" if data.startswith(PNG_START) else "jpeg"
             t_ns = now_ns()
-            channels.add(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, image_kind)))
-            channels.add(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke))
+            writer.record(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, image_kind)))
+            writer.record(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke))
 
 
 def _check(photograph: Path) -> bytes:

@@ -3,18 +3,25 @@
 The mcap library's writer reaches .6 of the rate of foxglove-sdk, because it packs a message field by field and copies
 it four times. Here one `struct` packs all fields, and the library packs what is written rarely.
 Format: https://mcap.dev/spec
+
+A step's file is written by a thread of its own from a queue, and is durable when `finish` returns. A kill -9 loses at
+most the last 250 ms of a step, and that step is done again anyway.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
+import queue
 import struct
+import threading
+import time
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Generator, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
-from typing import IO, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -23,6 +30,7 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -36,19 +44,68 @@ from mcap.records import (
 from mcap.records import Header as FileHeader
 from mcap.writer import MCAP0_MAGIC
 
-from brushloop.sessions.disk import sync
+from brushloop.sessions.disk import file_sha256, fsync_folder, sync
+from brushloop.sessions.errors import SessionError, disk_error
 from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, open_mcap
-from brushloop.sessions.records import HEADER_METADATA, Header, Topic, header_metadata, note
+from brushloop.sessions.records import (
+    BEGIN_NOTE,
+    DONE_NOTE,
+    HEADER_METADATA,
+    Event,
+    Header,
+    Recorded,
+    Topic,
+    header_metadata,
+    note,
+)
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message as Protobuf
 
 CHUNK_BYTES = 256 * 1024
-_CHUNK_START = struct.Struct("<BQQQQII4sQ")
+FLUSH_S = 0.25
+QUEUE_LIMIT = 20_000
+"""Queue size, about 200 s of poses: a full queue means that the disk does not keep up, which is an error."""
+NUMBERS = {topic: number for number, topic in enumerate(Topic, 1)}
+"""A topic has the same number in every file, so that a merge can copy chunks as they are."""
 _INDEX_START = struct.Struct("<BQHI")
-_FOOTER_START = struct.Struct("<BQQQ")
 _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 
 
 class _Writable(Protocol):
     def write(self, stream: RecordBuilder) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A message on its way to a file."""
+
+    topic: Topic
+    log_ns: int
+    publish_ns: int
+    sequence: int
+    message: Event | Protobuf
+
+
+def encoded(message: Event | Protobuf) -> bytes:
+    """The message as it is recorded: an event as JSON, anything else as protobuf."""
+    if isinstance(message, Event):
+        return message.__pydantic_serializer__.to_json(message)  # `model_dump_json` decodes it
+    return message.SerializeToString()
+
+
+def channel_of(outgoing: Outgoing) -> tuple[Schema, Channel]:
+    """The schema of a message and the channel of its topic, both under the topic's number."""
+    message, number = outgoing.message, NUMBERS[outgoing.topic]
+    if isinstance(message, Event):
+        data = json.dumps(type(message).model_json_schema(), sort_keys=True).encode()
+        schema = Schema(id=number, name=f"brushloop.{type(message).__name__}", encoding="jsonschema", data=data)
+        return schema, Channel(number, str(outgoing.topic), "json", {}, number)
+    from mcap_protobuf.schema import build_file_descriptor_set
+
+    data = build_file_descriptor_set(type(message)).SerializeToString()
+    schema = Schema(id=number, name=message.DESCRIPTOR.full_name, encoding="protobuf", data=data)
+    return schema, Channel(number, str(outgoing.topic), "protobuf", {}, number)
 
 
 class McapWriter:
@@ -68,7 +125,7 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._counts: Counter[int] = Counter()
         self._numbers: dict[tuple[str, str], int] = {}
-        """Of the channels to which messages of other files are copied, by topic and name of the schema."""
+        """Of the channels of other files that were copied, by topic and name of the schema."""
         self._crc = 0
         """Of everything written to the file so far."""
         self._write(MCAP0_MAGIC)
@@ -96,9 +153,11 @@ class McapWriter:
 
     def add_channel(self, schema: Schema | None, channel: Channel) -> None:
         """Put a channel and its schema into the chunk in progress; their numbers must be free."""
-        for record in (schema, channel) if schema is not None else (channel,):
-            self._records += _packed(record)
-        self._list(schema, channel)
+        if schema is not None:
+            self._records += _packed(schema)
+            self.schemas[schema.id] = schema
+        self._records += _packed(channel)
+        self.channels[channel.id] = channel
 
     def add_message(self, *, channel_id: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
         """Add a message to the chunk in progress."""
@@ -110,7 +169,23 @@ class McapWriter:
         if len(records) > CHUNK_BYTES:
             self._end_chunk()
 
-    def add(self, schema: Schema | None, channel: Channel, message: Message) -> None:
+    def record(self, outgoing: Outgoing) -> None:
+        """Encode a message and add it; the first on a topic with its schema, which is then flushed."""
+        number = NUMBERS[outgoing.topic]
+        new = number not in self.channels
+        if new:
+            self.add_channel(*channel_of(outgoing))
+        self.add_message(
+            channel_id=number,
+            log_time=outgoing.log_ns,
+            publish_time=outgoing.publish_ns,
+            sequence=outgoing.sequence,
+            data=encoded(outgoing.message),
+        )
+        if new or outgoing.topic == Topic.STROKE:  # ends the chunk, so that a damaged chunk costs one stroke
+            self.flush()
+
+    def copy(self, schema: Schema | None, channel: Channel, message: Message) -> None:
         """Add a message of another file as it is: times, sequence number and data stay."""
         self.add_message(
             channel_id=self._number(schema, channel),
@@ -120,23 +195,20 @@ class McapWriter:
             data=message.data,
         )
         if channel.topic == Topic.STROKE:
-            self.flush()  # ends the chunk, so that a damaged chunk costs one stroke
+            self.flush()
 
-    def add_file(self, path: Path) -> None:
+    def copy_file(self, path: Path) -> None:
         """Add all messages of a file as they are, every CRC checked. Raises `SessionDamaged`.
 
         Chunks are copied whole where the numbers of the channels agree, as they do in files of one session.
         """
         source = open_mcap(path)
-        channels = list(source.channels.values())
-        if not all(self._fits(*pair) for pair in channels):
+        if [self._number(*pair) for pair in source.channels.values()] == list(source.channels):
+            for packed in source.packed_chunks():
+                self._add_chunk(*packed)
+        else:
             for record in source.messages():
-                self.add(*record)
-            return
-        for pair in channels:
-            self._list(*pair)
-        for packed in source.packed_chunks():
-            self._add_chunk(*packed)
+                self.copy(*record)
 
     def flush(self) -> None:
         """End the chunk in progress unless it has no messages, and hand everything to the operating system."""
@@ -165,39 +237,23 @@ class McapWriter:
             offsets.append(SummaryOffset(opcode, start + begin, len(summary) - begin))
         offsets_start = start + len(summary)
         summary += b"".join(map(_packed, offsets))
-        footer = _FOOTER_START.pack(Opcode.FOOTER, 8 + 8 + 4, start, offsets_start)
+        footer = _packed(Footer(start, offsets_start, 0))[:-4]  # its CRC covers all but itself
         self._write(summary)
         self._write(_packed(Footer(start, offsets_start, zlib.crc32(footer, zlib.crc32(summary)))))
         self._write(MCAP0_MAGIC)
 
-    def _fits(self, schema: Schema | None, channel: Channel) -> bool:
-        """Whether the numbers of a channel and its schema are free, or stand for exactly these."""
-        return self.channels.get(channel.id, channel) == channel and (
-            schema is None or self.schemas.get(schema.id, schema) == schema
-        )
-
-    def _list(self, schema: Schema | None, channel: Channel) -> None:
-        """List a channel in the index only: a chunk of another file brings its record along."""
-        if schema is not None:
-            self.schemas[schema.id] = schema
-        self.channels[channel.id] = channel
-
     def _number(self, schema: Schema | None, channel: Channel) -> int:
-        """Number of the channel for messages of this channel of another file."""
+        """Number of another file's channel in this one: its own where that is free or stands for the same."""
         ident = (channel.topic, schema.name if schema else "")
         if ident not in self._numbers:
-            known = {(one.topic, self._schema_name(one)): number for number, one in self.channels.items()}
-            if ident not in known:
-                if not self._fits(schema, channel):
-                    number = max([*self.channels, *self.schemas]) + 1
-                    schema = replace(schema, id=number) if schema else None
-                    channel = replace(channel, id=number, schema_id=number if schema else 0)
-                self.add_channel(schema, channel)
-            self._numbers[ident] = known.get(ident, channel.id)
+            known = self.channels.get(channel.id, channel), self.schemas.get(channel.schema_id, schema)
+            if known != (channel, schema):
+                number = max([*self.channels, *self.schemas]) + 1
+                schema = replace(schema, id=number) if schema else None
+                channel = replace(channel, id=number, schema_id=number if schema else 0)
+            self.add_channel(schema, channel)
+            self._numbers[ident] = channel.id
         return self._numbers[ident]
-
-    def _schema_name(self, channel: Channel) -> str:
-        return self.schemas[channel.schema_id].name if channel.schema_id else ""
 
     def _add_chunk(self, data: bytes, index: ChunkIndex, counts: Mapping[int, int]) -> None:
         """Add a chunk of another file as it is, with the indexes of its messages; `index` says where it was there."""
@@ -229,10 +285,8 @@ class McapWriter:
         first_ns = min(min(index[::2]) for index in self._index.values())
         last_ns = max(max(index[::2]) for index in self._index.values())
         packed = self._compressor.compress(records)
-        length = _CHUNK_START.size + len(packed)
-        header = (length - RECORD_START.size, first_ns, last_ns, len(records), zlib.crc32(records), 4, b"zstd")
-        self._write(_CHUNK_START.pack(Opcode.CHUNK, *header, len(packed)))
-        self._write(packed)
+        chunk = _packed(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(records), len(records)))
+        length = self._write(chunk)
         at, offsets = start + length, dict[int, int]()
         for number, index in self._index.items():
             offsets[number] = at
@@ -267,17 +321,12 @@ def _packed(record: _Writable) -> bytes:
     return builder.end()
 
 
-def start_mcap(
-    file: IO[bytes], header: Header, notes: Mapping[str, Mapping[str, Any]], attachments: Mapping[str, bytes]
-) -> McapWriter:
-    """Begin an MCAP file with everything that comes before its messages."""
+def start_mcap(file: IO[bytes], header: Header, notes: Mapping[str, Mapping[str, Any]]) -> McapWriter:
+    """Begin an MCAP file with the session's header and notes."""
     writer = McapWriter(file, header.software)
     writer.add_metadata(HEADER_METADATA, header_metadata(header))
     for name, values in notes.items():
         writer.add_metadata(name, note(values))
-    for name, data in attachments.items():
-        media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-        writer.add_attachment(name, media_type, data)
     return writer
 
 
@@ -287,7 +336,99 @@ def new_mcap(
 ) -> Generator[McapWriter]:
     """A new file to copy messages into; finished and durable after the block. Raises `OSError`."""
     with path.open("xb") as file:
-        writer = start_mcap(file, header, notes, attachments)
+        writer = start_mcap(file, header, notes)
+        for name, data in attachments.items():
+            writer.add_attachment(name, _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream"), data)
         yield writer
         writer.finish()
         sync(file)
+
+
+class SegmentWriter:
+    """Writes `<name>.mcap.part`, then renames it to `<name>.mcap`.
+
+    `begun` is stored inside as metadata, so that a lost journal can be rebuilt from the files. Raises `SessionError`
+    where either file exists: recordings are never overwritten.
+    """
+
+    def __init__(self, final: Path, header: Header, begun: dict[str, Any] | None = None) -> None:
+        self.final = final
+        self._part = final.with_name(final.name + ".part")
+        self._header = header
+        self._queue: queue.SimpleQueue[Outgoing | None] = queue.SimpleQueue()
+        self._begun = begun
+        self._finished: dict[str, Any] | None = None
+        self._error: Exception | None = None
+        self.counts: Counter[str] = Counter()
+        try:
+            if final.exists():
+                raise FileExistsError
+            self._file = self._part.open("xb")
+        except FileExistsError:
+            raise SessionError(final, "exists already; recordings are never overwritten") from None
+        except OSError as error:
+            raise disk_error(self._part, "cannot create", error) from error
+        self._thread = threading.Thread(target=self._run, name=f"writer {final.name}")
+        self._thread.start()
+
+    def write(self, outgoing: Outgoing) -> None:
+        """Queue a message. Raises `SessionError` for a disk that failed or is too slow."""
+        self._raise_error()
+        if self._queue.qsize() >= QUEUE_LIMIT:
+            raise SessionError(self._part, f"{QUEUE_LIMIT} messages wait: the disk does not keep up")
+        self._queue.put(outgoing)
+
+    def finish(self, finished: dict[str, Any] | None = None) -> Recorded:
+        """Drain, finish, fsync, rename, fsync the folder. Raises `SessionError`; the part file then stays.
+
+        `finished` is stored inside as metadata, with the counts of messages.
+        """
+        self._finished = finished
+        self._join()
+        self._raise_error()
+        try:
+            recorded = Recorded(dict(self.counts), file_sha256(self._part), self._part.stat().st_size)
+            self._part.rename(self.final)
+            fsync_folder(self.final.parent)
+        except OSError as error:
+            raise disk_error(self._part, "cannot finish", error) from error
+        return recorded
+
+    def abandon(self) -> None:
+        """End the thread and keep the part file as evidence of an interrupted step."""
+        self._join()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise disk_error(self._part, "cannot write", self._error) from self._error
+
+    def _join(self) -> None:
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            with self._file:
+                self._write_all()
+                sync(self._file)
+        except Exception as error:
+            self._error = error
+
+    def _write_all(self) -> None:
+        writer = start_mcap(self._file, self._header, {} if self._begun is None else {BEGIN_NOTE: self._begun})
+        writer.flush()
+        flushed = time.monotonic()
+        while True:
+            with contextlib.suppress(queue.Empty):
+                if (outgoing := self._queue.get(timeout=FLUSH_S)) is None:
+                    break
+                writer.record(outgoing)
+            if time.monotonic() - flushed > FLUSH_S:
+                writer.flush()
+                flushed = time.monotonic()
+        writer.flush()
+        self.counts = writer.counts
+        if self._finished is not None:
+            writer.add_metadata(DONE_NOTE, note({**self._finished, "counts": dict(self.counts)}))
+        writer.finish()

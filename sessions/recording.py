@@ -233,9 +233,9 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
         notes = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
         snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
         attachments = {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES) for path in snapshots}
-        with new_mcap(part, header, notes, attachments) as copy:
+        with new_mcap(part, header, notes, attachments) as writer:
             for file in state.files:
-                copy.add_file(folder / file)
+                writer.copy_file(folder / file)
         counts = count_messages(part)
         if counts != expected:
             raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")

@@ -82,9 +82,9 @@ def replace_damaged(
     fresh = path.with_name(path.name + ".repair")
     try:
         fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
-        with new_mcap(fresh, header, notes, attachments) as copy:
+        with new_mcap(fresh, header, notes, attachments) as writer:
             for record in messages:
-                copy.add(*record)
+                writer.copy(*record)
         counts = count_messages(fresh)
         kept = set_aside(path, "damaged").name if path.exists() else ""
         fresh.replace(path)

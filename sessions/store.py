@@ -36,10 +36,10 @@ from brushloop.sessions.events import (
     line_of,
 )
 from brushloop.sessions.journal import JOURNAL_NAME, Journal
+from brushloop.sessions.mcap_writer import SegmentWriter
 from brushloop.sessions.recording import merge_session
 from brushloop.sessions.records import Header
 from brushloop.sessions.run_state import RunState, read_header, replay
-from brushloop.sessions.step_file import QUEUE_LIMIT, SegmentWriter
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
@@ -151,7 +151,7 @@ class SessionStore:
         )
         self._log(begin)
         begun = {"t_ns": begin.t_ns, "header": self.header.model_dump(mode="json"), "line": line_of(begin)}
-        return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, QUEUE_LIMIT, begun))
+        return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, begun))
 
     def done(self, attempt: Attempt, result: StepResult) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""

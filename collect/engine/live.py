@@ -18,16 +18,13 @@ from brushloop.collect.errors import ConfigError
 from brushloop.drivers.protocols import Camera
 from brushloop.drivers.samples import Frame
 from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import decode_gray, image_message
 from brushloop.sessions.records import Topic
-from brushloop.sessions.step_file import ChannelTable, Outgoing
 
 if TYPE_CHECKING:
     from foxglove import Channel
-    from mcap.records import Channel as Record
-    from mcap.records import Schema
 
-    from brushloop.sessions.mcap_writer import McapWriter
     from brushloop.sessions.messages import CompressedImage
 
 HOST = "127.0.0.1"
@@ -117,8 +114,6 @@ class LiveView:
             self.dropped += 1
 
     def _run(self, channels: _Channels) -> None:
-        # The code that writes files registers topics and schemas here too, so that they are the same.
-        table = ChannelTable(cast("McapWriter", channels))
         while not self._closing.is_set():
             item = self._queue.get()
             if item is None:
@@ -127,7 +122,7 @@ class LiveView:
             # Encode nothing while no viewer is subscribed.
             if channels.watched(Topic.PREVIEW if picture else cast("Outgoing", item).topic):
                 with contextlib.suppress(SessionDamaged):
-                    table.add(_preview(item) if picture else cast("Outgoing", item))
+                    channels.show(_preview(item) if picture else cast("Outgoing", item))
 
 
 @contextlib.asynccontextmanager
@@ -146,34 +141,30 @@ async def watching(live: LiveView | None, camera: Camera, log: Callable[[str], N
 
 
 class _Channels:
-    """The methods of an MCAP writer that `ChannelTable` calls, implemented for a viewer's channels."""
+    """The topics that a viewer is offered, with the schemas that files have too."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
-        self._channels: dict[int, Channel] = {}
-        self._topics: dict[str, int] = {}
+        self._channels: dict[Topic, Channel] = {}
 
-    def add_channel(self, schema: Schema, channel: Record) -> None:
+    def show(self, outgoing: Outgoing) -> None:
+        """Send a message to whoever subscribed to its topic, which is advertised at its first message."""
         import foxglove
 
-        described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
-        self._channels[channel.id] = foxglove.Channel(
-            channel.topic, schema=described, message_encoding=channel.message_encoding, context=self._context
-        )
-        self._topics[channel.topic] = channel.id
-
-    def add_message(self, *, channel_id: int, log_time: int, data: bytes, **_: int) -> None:
-        channel = self._channels[channel_id]
+        channel = self._channels.get(outgoing.topic)
+        if channel is None:
+            schema, record = channel_of(outgoing)
+            described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+            channel = self._channels[outgoing.topic] = foxglove.Channel(
+                record.topic, schema=described, message_encoding=record.message_encoding, context=self._context
+            )
         if channel.has_sinks():
-            channel.log(data, log_time=log_time)
-
-    def flush(self) -> None:
-        """Do nothing: no message waits here."""
+            channel.log(encoded(outgoing.message), log_time=outgoing.log_ns)
 
     def watched(self, topic: Topic) -> bool:
         """Whether a viewer subscribed to the topic; also True where it has not been advertised yet."""
-        known = self._topics.get(topic)
-        return known is None or self._channels[known].has_sinks()
+        known = self._channels.get(topic)
+        return known is None or known.has_sinks()
 
 
 def _preview(item: Outgoing | Frame) -> Outgoing:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.samples import ForceSample, Frame, PoseSample, Stamp
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import (
     Transform,
     calibration_message,
@@ -32,7 +33,6 @@ from brushloop.sessions.records import (
     Topic,
     Wrench,
 )
-from brushloop.sessions.step_file import Outgoing, SegmentWriter
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.lens import LensUsed
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, StepResult
+from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message
 from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
-from brushloop.sessions.step_file import Outgoing
 from brushloop.sessions.store import SessionStore
 
 T0_NS = 1_700_000_000_000_000_000

@@ -12,10 +12,10 @@ from brushloop.__main__ import app
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.export import export
+from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
-from brushloop.sessions.step_file import Outgoing
 
 
 @pytest.fixture

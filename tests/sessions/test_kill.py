@@ -22,7 +22,7 @@ from brushloop.sessions.events import Condition, Press, PressResult, StepKind
 from brushloop.sessions.messages import image_message
 from brushloop.sessions.records import Header, Stroke, Topic
 from brushloop.sessions.store import SessionStore
-from brushloop.sessions.step_file import Outgoing
+from brushloop.sessions.mcap_writer import Outgoing
 
 folder, keys = Path(sys.argv[1]), sys.argv[2:]
 header = Header(session_id=folder.name, source="loopback rig", software="test")

@@ -99,7 +99,7 @@ def test_messages_of_another_file_are_copied_whatever_numbers_its_channels_have(
         for channel in others:
             writer.add_channel(None, channel)
         for _ in range(2):
-            writer.add_file(source)
+            writer.copy_file(source)
         writer.finish()
 
     def messages_of(path):

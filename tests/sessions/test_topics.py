@@ -12,6 +12,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.decoder import DecoderFactory
 
 from brushloop.sessions.events import PressResult
+from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import (
     Transform,
     calibration_message,
@@ -21,7 +22,6 @@ from brushloop.sessions.messages import (
     transforms_message,
 )
 from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, SlowSection, Topic, Wrench
-from brushloop.sessions.step_file import Outgoing
 
 JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
 K = [[1500.0, 0.0, 1024.0], [0.0, 1500.0, 768.0], [0.0, 0.0, 1.0]]

@@ -30,9 +30,9 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import start
 from brushloop.drivers.samples import Frame, Stamp
 from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Topic, Wrench
-from brushloop.sessions.step_file import Outgoing
 from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S

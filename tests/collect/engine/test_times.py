@@ -10,7 +10,7 @@ import pytest
 from brushloop.collect.engine.recorder import Recorder
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.samples import ForceSample, Stamp
-from brushloop.sessions.step_file import Outgoing
+from brushloop.sessions.mcap_writer import Outgoing
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -18,9 +18,9 @@ from brushloop.collect.engine.control import State
 from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import read_lines
+from brushloop.sessions.mcap_writer import McapWriter
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.run_state import replay
-from brushloop.sessions.step_file import ChannelTable
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
@@ -41,9 +41,9 @@ class Disk:
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    disk, add, fsync = Disk(), ChannelTable.add, os.fsync
+    disk, add, fsync = Disk(), McapWriter.record, os.fsync
 
-    def slow_add(table: ChannelTable, outgoing: Any) -> None:
+    def slow_add(table: McapWriter, outgoing: Any) -> None:
         time.sleep(disk.message_s)
         disk.written += 1
         if disk.full_after is not None and disk.written > disk.full_after:
@@ -54,7 +54,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
         time.sleep(disk.sync_s)
         fsync(handle)
 
-    monkeypatch.setattr(ChannelTable, "add", slow_add)
+    monkeypatch.setattr(McapWriter, "record", slow_add)
     monkeypatch.setattr(os, "fsync", slow_fsync)
     return disk
 
@@ -82,7 +82,7 @@ def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
     stage: Stage, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A queue of five stands for the 20 000 messages that a slower disk would take minutes to fill."""
-    monkeypatch.setattr("brushloop.sessions.store.QUEUE_LIMIT", 5)
+    monkeypatch.setattr("brushloop.sessions.mcap_writer.QUEUE_LIMIT", 5)
     disk.message_s = 0.1
     error, state = run(stage)
     assert isinstance(error, SessionError)
