@@ -11,7 +11,7 @@ from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from brushloop.sessions.export_rows import Cropper
+    from brushloop.sessions.export import Cropper
     from brushloop.sessions.recording import Recording
 
 LEFT_OUT = 3

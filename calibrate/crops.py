@@ -16,7 +16,7 @@ from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.preprocess import Steps, preprocess
 from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.export_rows import Crop, Cropper
+from brushloop.sessions.export import Crop, Cropper
 from brushloop.sessions.recording import Capture, Recording
 
 

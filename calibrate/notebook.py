@@ -33,10 +33,9 @@ from brushloop.calibrate.validate.main import validate as run_validation
 from brushloop.calibrate.validate.sources import local_path
 from brushloop.model.brush import Brush
 from brushloop.sessions.condition import Condition
-from brushloop.sessions.export_rows import SAMPLE_COLUMNS, Export, Sample
+from brushloop.sessions.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header
-from brushloop.sessions.terminal import unseen
 
 if TYPE_CHECKING:
     from brushloop.calibrate.invert.command import Recovered
@@ -179,9 +178,7 @@ class Session:
     @cached_property
     def samples(self) -> tuple[dict[str, Poses], dict[str, Forces]]:
         """Poses and forces by name of stroke."""
-        names = list(self._export.strokes)
-        poses = _by_stroke(names, self._export.poses())
-        forces = _by_stroke(names, self._export.forces())
+        poses, forces = self._by_stroke(POSES), self._by_stroke(FORCES)
         return (
             {name: Poses(t_ns, at[:, :3], at[:, 3:]) for name, (t_ns, at) in poses.items()},
             {name: Forces(t_ns, wrench) for name, (t_ns, wrench) in forces.items()},
@@ -193,19 +190,14 @@ class Session:
 
     @cached_property
     def _export(self) -> Export:
-        return Export(self.recording, unseen, None, frames=False)
+        return Export(self.recording)
 
-
-def _by_stroke(names: list[str], samples: Iterator[Sample]) -> dict[str, tuple[NDArray[np.int64], Floats]]:
-    """Times (n,) and values (n, width) of each stroke that has any."""
-    rows: dict[str, list[Sample]] = {}
-    for sample in samples:
-        rows.setdefault(names[sample[0][0]], []).append(sample)
-    at = SAMPLE_COLUMNS.index("t_ns")
-    return {
-        name: (np.array([times[at] for times, _ in found], np.int64), np.array([values for _, values in found]))
-        for name, found in rows.items()
-    }
+    def _by_stroke(self, series: Series) -> dict[str, tuple[NDArray[np.int64], Floats]]:
+        """Times (n,) and values (n, width) of each stroke that has any."""
+        when, values = self._export.samples(series)
+        episode, t_ns = (when[:, SAMPLE_COLUMNS.index(name)] for name in ("episode_index", "t_ns"))
+        strokes = list(self._export.strokes)
+        return {strokes[number]: (t_ns[episode == number], values[episode == number]) for number in np.unique(episode)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

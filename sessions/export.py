@@ -24,29 +24,27 @@ import math
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError
+from pydantic import ValidationError
+
 from brushloop.sessions.cells import CsvWriter
 from brushloop.sessions.disk import check_room, staged_folder, sync, write_durably
-from brushloop.sessions.errors import InputError, disk_error
-from brushloop.sessions.export_rows import (
-    FORCE_COLUMNS,
-    POSE_COLUMNS,
-    SAMPLE_COLUMNS,
-    Cropper,
-    Export,
-    Row,
-    Sample,
-    file_column,
-)
-from brushloop.sessions.messages import decode_gray
-from brushloop.sessions.recording import Recording
-from brushloop.sessions.terminal import Progress, plain, unseen
+from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
+from brushloop.sessions.history import unlike
+from brushloop.sessions.messages import PNG_START, decode_gray
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Quality, StepEvent, Stroke, Topic, Wrench
+from brushloop.sessions.terminal import Progress, counted, plain, unseen
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
 
 ROWS_PER_GROUP = 32
 """Photographs held in memory at a time; viewers want small groups for rows with images."""
@@ -54,6 +52,190 @@ SAMPLES_PER_GROUP = 20_000
 FILE = "train-00000-of-00001.parquet"
 LICENCE_ID = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
 """What a card may give as `license`; any other text is given as `license_name`."""
+TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
+CROP_TEXT_COLUMNS = ("mask_file", "flags", "frame_file")
+"""Texts of a stroke that only exports of crops have, the last only with whole frames."""
+PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
+SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
+"""Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
+SAMPLE_TYPES: dict[str, str | int] = {
+    **dict.fromkeys(("episode_index", "frame_index", "index", "task_index"), "int64"),
+    "timestamp": "float64",
+    **dict.fromkeys(("t_ns", "log_ns", "sequence"), "int64"),
+}
+"""Columns of samples in Parquet, in the order that LeRobot has."""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A topic whose samples during the presses are a table of every export."""
+
+    name: str
+    topic: Topic
+    columns: tuple[str, ...]
+    values: Callable[[bytes], tuple[float, ...]]
+    """Values of the columns in a message. Raises `DecodeError` or `ValidationError`."""
+    arrays: dict[str, slice]
+    """Names of the arrays in an `.npz`, and the columns that each holds."""
+    feature: str
+    """Name of all columns together, as LeRobot names it."""
+
+
+def _pose(data: bytes) -> tuple[float, ...]:
+    pose = PoseInFrame.FromString(data).pose
+    at, turned = pose.position, pose.orientation
+    return at.x * 1e3, at.y * 1e3, at.z * 1e3, turned.x, turned.y, turned.z, turned.w
+
+
+def _wrench(data: bytes) -> tuple[float, ...]:
+    return tuple(Wrench.model_validate_json(data).model_dump().values())
+
+
+_POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
+_WRENCH = tuple(Wrench.model_fields)
+_POSE_ARRAYS = {"pose_position_mm": slice(3), "pose_quaternion": slice(3, 7)}
+POSES = Series("pose", Topic.TCP, _POSE, _pose, _POSE_ARRAYS, "observation.state")
+"""Of the brush tip, in the robot's base frame."""
+FORCES = Series("force", Topic.WRENCH, _WRENCH, _wrench, {"force_wrench": slice(6)}, "observation.force")
+"""In the sensor's own frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """The surroundings of a stroke as seen straight from above, at the same scale for every stroke."""
+
+    image_png: bytes
+    """Gray, not corrected for the light."""
+    mask_png: bytes
+    """255 where the stroke's ink is, else 0; as large as the image."""
+    px_per_mm: float
+    anchor_px: tuple[float, float] | None
+    """Zero-touch point on the crop; pixel j covers [j, j + 1)."""
+    flags: str
+    """Defects of the capture, separated by `; `."""
+
+
+Cropper = Callable[[Capture], Crop | str]
+"""Crops a capture, or says why it cannot be cropped."""
+
+
+class Export:
+    """The rows from which every format is written: strokes with their pictures, poses, and forces."""
+
+    def __init__(
+        self, recording: Recording, progress: Progress = unseen, cropper: Cropper | None = None, frames: bool = False
+    ) -> None:
+        """Raises `SessionDamaged` where a stroke appears twice."""
+        self.recording = recording
+        self._progress = progress
+        self.cropper = cropper
+        self.strokes: dict[str, Stroke] = {}
+        for stroke in recording.stroke_records():
+            if self.strokes.setdefault(stroke.stroke_id, stroke) is not stroke:
+                raise SessionDamaged(recording.path, f"holds stroke {stroke.stroke_id} twice")
+        waits = {name: wait for name, stroke in self.strokes.items() if (wait := stroke.dip_to_touch_s) is not None}
+        self._odd = frozenset(unlike(waits))
+        self.quality = {judged.stroke_id: judged.verdict for judged in recording.events(Topic.QUALITY, Quality)}
+        """`passed`, or `failed: ...`, by the name of each stroke that was judged."""
+        self.left_out: list[tuple[str, str]] = []
+        """(stroke, reason) of those that could not be cropped; filled while the captures are read."""
+        self.pictures = ("image",) if cropper is None else ("image", "mask", "frame") if frames else ("image", "mask")
+        """Names of the pictures that each stroke has."""
+        self.text_columns = TEXT_COLUMNS if cropper is None else TEXT_COLUMNS + CROP_TEXT_COLUMNS[: len(self.pictures)]
+        self.series = (POSES, FORCES) if recording.counts.get(Topic.WRENCH, 0) else (POSES,)
+
+    def captures(self) -> Iterator[tuple[Row, dict[str, bytes]]]:
+        """Strokes as rows of plain values, None where a value is not recorded, with their encoded pictures by name."""
+        captures = counted(self.recording.captures(), "strokes exported", len(self.strokes), self._progress)
+        for index, capture in enumerate(captures):
+            row = self.row(index, capture.stroke) | {"marked_bad": capture.bad}
+            pictures = {"image": capture.still_png}
+            if self.cropper is not None:
+                crop = self.cropper(capture)
+                if isinstance(crop, str):
+                    self.left_out.append((capture.stroke.stroke_id, crop))
+                    continue
+                scale = (crop.px_per_mm, crop.px_per_mm)
+                row |= {**_pair("anchor", "px", crop.anchor_px), **_pair("px_per_mm", "", scale), "flags": crop.flags}
+                pictures = {"image": crop.image_png, "mask": crop.mask_png, "frame": capture.still_png}
+            for name in self.pictures:
+                row[file_column(name)] = _file_name(index, capture.stroke.stroke_id, name, pictures[name])
+            yield row, {name: pictures[name] for name in self.pictures}
+
+    def row(self, index: int, stroke: Stroke) -> Row:
+        """Every value of a stroke that does not need its photograph."""
+        header, wait = self.recording.header, stroke.dip_to_touch_s
+        return {
+            "episode_index": index,
+            "file": "",
+            "stroke_id": stroke.stroke_id,
+            "session_id": header.session_id,
+            "source": str(header.source),
+            "kind": stroke.kind,
+            "depth_mm": stroke.depth_mm,
+            "reached_mm": stroke.reached_mm,
+            "tilt_deg": stroke.tilt_deg,
+            "dip_to_touch_s": wait,
+            "dip_to_touch_unlike": None if wait is None else float(stroke.stroke_id in self._odd),
+            "heading_deg": stroke.heading_deg,
+            **_pair("anchor", "mm", stroke.anchor_mm),
+            **_pair("anchor", "px", stroke.anchor_px),
+            **_pair("px_per_mm", "", stroke.px_per_mm),
+            **dict(zip(PATCH_COLUMNS, stroke.cell_mm or (None,) * len(PATCH_COLUMNS), strict=True)),
+            "quality": self.quality.get(stroke.stroke_id, ""),
+            "marked_bad": "",
+            "licence": header.licence,
+            **{f"commanded_{name}": value for name, value in stroke.commanded.items()},
+        }
+
+    def number_columns(self) -> list[str]:
+        """Names of the numeric columns that any stroke has."""
+        names = dict.fromkeys(name for stroke in self.strokes.values() for name in self.row(0, stroke))
+        return [name for name in names if name not in self.text_columns]
+
+    def samples(self, series: Series) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """(n, 5) `SAMPLE_COLUMNS` and (n, w) values of the messages during presses, in the order of the recording.
+
+        Raises `SessionDamaged`.
+        """
+        import numpy as np
+
+        numbers = {name: number for number, name in enumerate(self.strokes)}
+        when: list[tuple[int, ...]] = []
+        values: list[tuple[float, ...]] = []
+        current, frame, on = -1, 0, series.topic
+        try:
+            for _schema, channel, message in self.recording.messages(Topic.STEP, series.topic):
+                on = channel.topic
+                if on == Topic.STEP:
+                    event = StepEvent.model_validate_json(message.data)
+                    pressed = event.phase == "begin" and event.kind != "capture"
+                    current, frame = numbers.get(str(event.params.get("stroke_id")), -1) if pressed else -1, 0
+                elif current >= 0:
+                    when.append((current, frame, message.publish_time, message.log_time, message.sequence))
+                    values.append(series.values(message.data))
+                    frame += 1
+        except (ValidationError, DecodeError):
+            raise SessionDamaged(self.recording.path, f"a message on {on} does not fit its schema") from None
+        return np.array(when, np.int64).reshape(-1, 5), np.array(values, np.float64).reshape(-1, len(series.columns))
+
+
+def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
+    first, second = values or (None, None)
+    end = f"_{unit}" if unit else ""
+    return {f"{stem}_x{end}": first, f"{stem}_y{end}": second}
+
+
+def file_column(picture: str) -> str:
+    """Name of the column that names a picture's file."""
+    return "file" if picture == "image" else f"{picture}_file"
+
+
+def _file_name(index: int, stroke_id: str, picture: str, data: bytes) -> str:
+    """A readable path, safe on any file system and distinct whatever the strokes are called."""
+    safe = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stroke_id)[:80]
+    return f"{picture}s/{index:04d}-{safe}.{'png' if data.startswith(PNG_START) else 'jpg'}"
 
 
 def export(
@@ -86,7 +268,9 @@ def export(
         exported = Export(recording, progress, None if make_cropper is None else make_cropper(recording), frames)
         with staged_folder(out) as stage:
             write(exported, stage)
-            write_durably(stage / "header.json", exported.header_json())
+            origin = {"file": recording.path.name, "sha256": recording.sha256}
+            header = recording.header.model_dump(mode="json") | {"exported_from": origin}
+            write_durably(stage / "header.json", (json.dumps(header, indent=2, ensure_ascii=False) + "\n").encode())
             if len(exported.left_out) == len(exported.strokes):
                 stroke_id, reason = exported.left_out[0]
                 raise InputError(recording.path, f"holds no stroke that can be cropped: {stroke_id} {reason}")
@@ -106,12 +290,10 @@ def write_png(export: Export, folder: Path) -> None:
         rows.append(row)
     columns = list(dict.fromkeys(name for row in rows for name in row))
     _write_csv(folder / "strokes.csv", columns, ([row.get(name) for name in columns] for row in rows))
-    tables = [("poses", POSE_COLUMNS, export.poses())]
-    tables += [("forces", FORCE_COLUMNS, export.forces())] if export.has_force else []
-    for name, values, samples in tables:
-        _write_csv(
-            folder / f"{name}.csv", (*SAMPLE_COLUMNS, *values), ((*when, *measured) for when, measured in samples)
-        )
+    for series in export.series:
+        samples = zip(*(table.tolist() for table in export.samples(series)), strict=True)
+        columns = (*SAMPLE_COLUMNS, *series.columns)
+        _write_csv(folder / f"{series.name}s.csv", columns, ((*when, *values) for when, values in samples))
 
 
 def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -130,10 +312,8 @@ def write_npz(export: Export, folder: Path) -> None:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
 
             def add(name: str, values: ArrayLike) -> None:
-                # Members carry no time, so that equal arrays make equal files.
-                member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
-                member.compress_type = zipfile.ZIP_DEFLATED
-                with archive.open(member, "w", force_zip64=True) as out:
+                # Members opened by name carry no time, so that equal arrays make equal files.
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
                     np.lib.format.write_array(out, np.asarray(values), allow_pickle=False)
 
             rows: list[Row] = []
@@ -146,25 +326,13 @@ def write_npz(export: Export, folder: Path) -> None:
             for name in export.number_columns():
                 values = (row.get(name) for row in rows)
                 add(name, np.array([math.nan if value is None else value for value in values], np.float64))
-            parts = {"pose_position_mm": slice(3), "pose_quaternion": slice(3, 7)}
-            _add_samples(add, "pose", list(export.poses()), len(POSE_COLUMNS), parts)
-            if export.has_force:
-                parts = {"force_wrench": slice(6)}
-                _add_samples(add, "force", list(export.forces()), len(FORCE_COLUMNS), parts)
+            for series in export.series:
+                when, values = export.samples(series)
+                for name, column in zip(SAMPLE_COLUMNS, when.T, strict=True):
+                    add(f"{series.name}_{name}", column)
+                for name, part in series.arrays.items():
+                    add(name, values[:, part])
         sync(file)
-
-
-def _add_samples(
-    add: Callable[[str, ArrayLike], None], stem: str, samples: list[Sample], width: int, parts: dict[str, slice]
-) -> None:
-    import numpy as np
-
-    when = np.array([when for when, _values in samples], np.int64).reshape(-1, len(SAMPLE_COLUMNS))
-    values = np.array([values for _when, values in samples], np.float64).reshape(-1, width)
-    for name, column in zip(SAMPLE_COLUMNS, when.T, strict=True):
-        add(f"{stem}_{name}", column)
-    for name, part in parts.items():
-        add(name, values[:, part])
 
 
 def write_parquet(export: Export, folder: Path) -> None:
@@ -176,22 +344,19 @@ def write_parquet(export: Export, folder: Path) -> None:
         raise InputError("--format", "parquet needs pyarrow: pip install pyarrow") from None
 
     numbers = [name for name in export.number_columns() if name != "episode_index"]
-    picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    strokes = [(name, picture) for name in export.pictures] + [("episode_index", pa.int64())]
-    strokes += [(name, pa.string()) for name in export.text_columns] + [(name, pa.float64()) for name in numbers]
-    sampled = [(name, pa.int64()) for name in ("episode_index", "frame_index", "index", "task_index")]
-    sampled += [("timestamp", pa.float64()), *((name, pa.int64()) for name in ("t_ns", "log_ns", "sequence"))]
-    pictured = (_with_pictures(*capture) for capture in export.captures())
-    tables: list[tuple[str, Any, Iterator[Row], int]] = [("strokes", strokes, pictured, ROWS_PER_GROUP)]
-    series = [("poses", "observation.state", POSE_COLUMNS, export.poses())]
-    series += [("forces", "observation.force", FORCE_COLUMNS, export.forces())]
-    for name, column, names, samples in series:
-        fields = [*sampled, (column, pa.list_(pa.float64(), len(names)))]
-        tables.append((name, fields, _sample_rows(samples, column), SAMPLES_PER_GROUP))
+    strokes: dict[str, str | int] = {**dict.fromkeys(export.pictures, "image"), "episode_index": "int64"}
+    strokes |= dict.fromkeys(export.text_columns, "string") | dict.fromkeys(numbers, "float64")
+    tables: list[tuple[str, dict[str, str | int], Iterator[Row]]] = [("strokes", strokes, _pictured_rows(export))]
+    for series in export.series:
+        columns = {**SAMPLE_TYPES, series.feature: len(series.columns)}
+        tables.append((f"{series.name}s", columns, _sample_rows(export, series)))
     counts: dict[str, int] = {}
-    for name, fields, rows, group in tables:
-        schema = pa.schema(fields)
-        schema = schema.with_metadata({"huggingface": json.dumps({"info": {"features": _features(pa, schema)}})})
+    for name, columns, rows in tables:
+        group = ROWS_PER_GROUP if name == "strokes" else SAMPLES_PER_GROUP
+        types = {column: _types(pa, kind) for column, kind in columns.items()}
+        features = {column: feature for column, (_type, feature) in types.items()}
+        schema = pa.schema([(column, kind) for column, (kind, _feature) in types.items()])
+        schema = schema.with_metadata({"huggingface": json.dumps({"info": {"features": features}})})
         some = list(islice(rows, group))
         if not some:
             continue  # `datasets` refuses a file without rows
@@ -204,31 +369,31 @@ def write_parquet(export: Export, folder: Path) -> None:
     write_durably(folder / "README.md", _card(export, counts))
 
 
-def _with_pictures(row: Row, pictures: dict[str, bytes]) -> Row:
-    return row | {name: {"bytes": data, "path": row[file_column(name)]} for name, data in pictures.items()}
+def _pictured_rows(export: Export) -> Iterator[Row]:
+    for row, pictures in export.captures():
+        yield row | {name: {"bytes": data, "path": row[file_column(name)]} for name, data in pictures.items()}
 
 
-def _sample_rows(samples: Iterator[Sample], column: str) -> Iterator[Row]:
+def _sample_rows(export: Export, series: Series) -> Iterator[Row]:
     start_ns = 0
-    for index, (when, values) in enumerate(samples):
-        row = dict(zip(SAMPLE_COLUMNS, when, strict=True))
+    for index, (when, values) in enumerate(zip(*export.samples(series), strict=True)):
+        row = dict(zip(SAMPLE_COLUMNS, when.tolist(), strict=True))
         start_ns = row["t_ns"] if row["frame_index"] == 0 else start_ns
         seconds = (row["t_ns"] - start_ns) / 1e9
-        yield {**row, "index": index, "task_index": 0, "timestamp": seconds, column: list(values)}
+        yield {**row, "index": index, "task_index": 0, "timestamp": seconds, series.feature: values.tolist()}
 
 
-def _features(pa: Any, schema: Any) -> Row:
-    """Description of the schema as `datasets` stores it in the file's metadata."""
-    features: Row = {}
-    for field in schema:
-        if field.name in ("image", "mask", "frame"):
-            features[field.name] = {"_type": "Image"}
-        elif pa.types.is_fixed_size_list(field.type):
-            value = {"dtype": str(field.type.value_type).replace("double", "float64"), "_type": "Value"}
-            features[field.name] = {"feature": value, "length": field.type.list_size, "_type": "Sequence"}
-        else:
-            features[field.name] = {"dtype": str(field.type).replace("double", "float64"), "_type": "Value"}
-    return features
+def _types(pa: Any, kind: str | int) -> tuple[Any, Row]:
+    """Arrow type of a column, and its description as `datasets` stores it in the file's metadata.
+
+    `kind` is `image`, the name of a type, or the length of a list of numbers.
+    """
+    if kind == "image":
+        return pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
+    if isinstance(kind, int):
+        value = {"dtype": "float64", "_type": "Value"}
+        return pa.list_(pa.float64(), kind), {"feature": value, "length": kind, "_type": "Sequence"}
+    return pa.type_for_alias(kind), {"dtype": kind, "_type": "Value"}
 
 
 def _card(export: Export, counts: dict[str, int]) -> bytes:
@@ -260,8 +425,8 @@ Source: **{header.source}**. {", ".join(f"{count} {name}" for name, count in cou
 `tilt_deg` the tilt alpha. {images}
 
 `poses`, where any were recorded: poses of the brush tip in the robot's base frame; `observation.state` is \
-{", ".join(POSE_COLUMNS)}. `forces`, likewise: samples of the force sensor, in its own frame; `observation.force` is \
-{", ".join(FORCE_COLUMNS)}.
+{", ".join(POSES.columns)}. `forces`, likewise: samples of the force sensor, in its own frame; `observation.force` is \
+{", ".join(FORCES.columns)}.
 
 `episode_index` joins the tables. `timestamp` is in seconds from the stroke's first sample, as measured;
 `sequence` shows gaps.

@@ -25,8 +25,6 @@ SPREADS = 3.0
 """Median absolute deviations within which waits count as alike."""
 LEAST_STROKES = 4
 """Number of strokes below which no wait can be called an outlier."""
-WAIT = "dip_to_touch_s"
-"""Name of the wait in an export's columns."""
 
 _K = TypeVar("_K")
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+_E = TypeVar("_E", bound=Event)
 REPAIRS_NOTE = "brushloop.repairs"
 """Note in a merged file whose session was repaired: what was rewritten, what is missing, and what was lost."""
 MAX_ATTACHMENT_BYTES = 1024 * 1024
@@ -91,8 +92,12 @@ class Recording:
 
     def stroke_records(self) -> Iterator[Stroke]:
         """Strokes as they were commanded, without their stills. Raises `SessionDamaged`."""
-        for _schema, _channel, message in self.messages(Topic.STROKE):
-            yield _event(self.path, Stroke, message.data)
+        return self.events(Topic.STROKE, Stroke)
+
+    def events(self, topic: Topic, kind: type[_E]) -> Iterator[_E]:
+        """Events on a topic, in the order in which they were written. Raises `SessionDamaged`."""
+        for _schema, _channel, message in self.messages(topic):
+            yield _event(self.path, kind, message.data)
 
     def captures(self) -> Iterator[Capture]:
         """Strokes with their stills, in order of capture. Raises `SessionDamaged`."""
@@ -187,9 +192,6 @@ def _still(path: Path, data: bytes) -> bytes:
         return decode_still(data)
     except DecodeError as error:
         raise SessionDamaged(path, f"a still cannot be read: {in_one_line(error)}") from None
-
-
-_E = TypeVar("_E", Stroke, StepEvent)
 
 
 def _event(path: Path, kind: type[_E], data: bytes) -> _E:

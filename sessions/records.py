@@ -154,9 +154,10 @@ class Quality(Event):
     checks: tuple[Check, ...]
 
     @property
-    def passed(self) -> bool:
-        """Whether every check passed."""
-        return all(check.passed for check in self.checks)
+    def verdict(self) -> str:
+        """`passed`, or `failed: ` and the names of the checks that failed."""
+        failed = ", ".join(check.name for check in self.checks if not check.passed)
+        return f"failed: {failed}" if failed else "passed"
 
 
 class SlowSection(Event):

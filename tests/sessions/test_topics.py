@@ -97,8 +97,8 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
 
 def test_quality_passes_where_every_check_does():
     good, bad = Check(name="a", passed=True), Check(name="b", passed=False, reason="too dark")
-    assert Quality(stroke_id="s", checks=(good,)).passed
-    assert not Quality(stroke_id="s", checks=(good, bad)).passed
+    assert Quality(stroke_id="s", checks=(good,)).verdict == "passed"
+    assert Quality(stroke_id="s", checks=(good, bad)).verdict == f"failed: {bad.name}"
 
 
 @pytest.mark.parametrize(
