@@ -336,16 +336,6 @@ class Repaired(_Event):
     why: str = ""
 
 
-class Held(_Event):
-    """The file of a step is damaged, and another holds all of it."""
-
-    event: Literal["held"] = "held"
-    key: str
-    file: StepFile
-    by: FileName
-    why: str = ""
-
-
 class Lost(_Event):
     """A repair could not recover a step: it counts as never done."""
 
@@ -373,6 +363,17 @@ class JournalRepaired(_Event):
     lost: Whole
 
 
+class Remark(_Event):
+    """A remark on one capture, made afterwards: it stands in a journal of its own, and the latest on a still counts."""
+
+    event: Literal["remark"] = "remark"
+    still: Whole
+    """`sequence` of the capture's still, unique in the session."""
+    stroke_id: str
+    bad: bool = False
+    note: str = ""
+
+
 Event = Annotated[
     Open
     | Process
@@ -385,10 +386,10 @@ Event = Annotated[
     | Ended
     | Closed
     | Repaired
-    | Held
     | Lost
     | Doubt
-    | JournalRepaired,
+    | JournalRepaired
+    | Remark,
     Field(discriminator="event"),
 ]
 _EVENTS: TypeAdapter[Event] = TypeAdapter(Event)

@@ -1,16 +1,15 @@
-"""Find out what a damaged session contained, from its journal and its files together; changes nothing.
+"""Find out what a session contained, from its journal and its files together; changes nothing.
 
-The file of every step holds a copy of the journal's `begin` line and, once finished, of its `done` line. Lost lines
-of the journal are rebuilt from these word for word, and put back in their place.
+The file of every step holds a copy of the journal's `begin` line and, once finished, of its `done` line. Lost lines of
+the journal are rebuilt from these word for word, and put back in their place.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -22,284 +21,242 @@ from brushloop.sessions.disk import (
     file_sha256,
     read_bounded,
 )
-from brushloop.sessions.errors import SessionDamaged, SessionError
-from brushloop.sessions.events import Begin, Done, Event, Open, line_of, parse_event, serial_of
-from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, read_journal
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import (
+    Begin,
+    Closed,
+    Done,
+    Doubt,
+    Event,
+    Lost,
+    Open,
+    StepKind,
+    Void,
+    parse_event,
+    serial_of,
+)
+from brushloop.sessions.journal import JOURNAL_NAME, Fault, Reading, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
-from brushloop.sessions.recording import count_messages, parse_header
+from brushloop.sessions.recording import parse_header
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Topic
-from brushloop.sessions.run_state import Account, DoneTwice, RunState, account
+from brushloop.sessions.run_state import DoneTwice, RunState
 from brushloop.sessions.show import step_words
 from brushloop.sessions.store import closed
 
-NONSENSE = (KeyError, TypeError, ValueError)
-"""Exceptions that a malformed note may cause."""
+MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
+"""Kinds of steps that use patches."""
 
 
 @dataclass(slots=True)
 class Evidence:
-    """Journal of a session as it is, and as it must have been."""
+    """A session's folder as it is, and as it must have been."""
 
     folder: Path
-    data: bytes | None
-    """The journal's bytes; None if the file is missing."""
-    lines: list[Line]
-    """Lines that can be trusted, in order."""
-    faults: list[Fault]
-    """Problems of the journal, line by line; every command uses this list."""
-    torn: bytes
-    rebuilt: list[Line] = field(default_factory=list[Line])
-    """Lines missing from the journal and found in the files."""
+    has_journal: bool
+    reading: Reading
+    files: dict[str, McapFile]
+    """What the files of steps and the merged file hold, by name."""
+    session: str
+    """Id of the session: neither lines nor files of another one are evidence of anything."""
+    rebuilt: list[Event] = field(default_factory=list[Event])
+    """Events missing from the journal and found in the files."""
     lost: int = 0
     """Number of damaged or missing lines of which no file holds a copy."""
     doubtful: list[str] = field(default_factory=list[str])
     """Files of attempts whose sheet and patch are unknown."""
-    strays: list[str] = field(default_factory=list[str])
-    """Files that hold a step which the journal lists under another file."""
-    session: str = ""
-    """Id of the session: neither lines nor files of another one are evidence of anything."""
-    foreign: dict[str, str] = field(default_factory=dict[str, str])
-    """Files of other sessions that the journal does not list, and the ids of those sessions."""
+    strays: dict[str, str] = field(default_factory=dict[str, str])
+    """Files that are not of the steps that the journal lists, and what they are."""
     state: RunState = field(default_factory=RunState)
-    """State after all trusted and rebuilt lines."""
+    """State after all events."""
 
     @property
-    def all_lines(self) -> list[Line]:
-        """Journal as it must have been, with the rebuilt lines in their places."""
-        lines = list(self.lines)
-        for line in self.rebuilt:
-            lines.insert(_place(lines, line), line)
-        return lines
+    def final(self) -> Path:
+        """The merged file."""
+        return self.folder / f"{self.folder.name}.mcap"
 
     @property
     def intact(self) -> bool:
         """Whether the journal can be kept; lines may still be added."""
-        return self.data is not None and not self.faults
+        return self.has_journal and not self.reading.faults
+
+    def foreign(self, found: McapFile) -> list[str]:
+        """What is wrong with a file of another session: nothing in it is evidence."""
+        session = found.session
+        return [] if session in ("", self.session) else [f"is of another session, {session[:100]!r}"]
+
+    def events(self) -> Iterator[Event]:
+        """Events of the journal as it must have been, with the rebuilt ones in their places.
+
+        `open` comes first, `closed` last, and those of a step before those of the next.
+        """
+        rebuilt = deque(sorted(self.rebuilt, key=_place))
+        while rebuilt and isinstance(rebuilt[0], Open):
+            yield rebuilt.popleft()
+        for entry in self.reading.entries:
+            if isinstance(entry.event, Begin | Done | Closed):
+                while rebuilt and _place(rebuilt[0]) < _place(entry.event):
+                    yield rebuilt.popleft()
+            yield entry.event
+        yield from rebuilt
 
 
 def gather(folder: Path) -> Evidence:
     """Read the journal and the files. Raises `SessionDamaged` if not even a header is left."""
-    path = folder / JOURNAL_NAME
-    too_large: list[Fault] = []
-    try:
-        data = read_journal(path) if check_file(path) else None
-    except SessionDamaged as error:
-        data, too_large = b"", [Fault(1, error.what)]
-    journal = account(data or b"")
-    session = _session(folder, journal.state)
-    if session and session != _named_in(journal.state):
-        journal = account(data or b"", session)
-    found = Evidence(folder, data, journal.lines, too_large + journal.faults, journal.reading.torn)
-    found.session = session
-    _lost_between(found, journal.twice)
-    header = _from_files(found, journal.state.done)
-    if journal.state.opened is None:
-        header = header or _from_any_segment(found) or _from_final(found)
-        if header is None:
-            raise SessionDamaged(path, "has no `open` event, and no file holds its header")
-        found.rebuilt.insert(0, full_line(Open(t_ns=0, header=header, snapshots=_snapshots(folder))))
-    _fold(found)
-    _closed(found)
-    found.lost = _lost(journal, found.all_lines)
-    return found
+    evidence = _read(folder)
+    _rebuild(evidence)
+    return evidence
 
 
-def full_line(event: Event) -> Line:
-    """The line of an event, with its time."""
-    return {"t_ns": event.t_ns, **line_of(event)}
+def is_collected(folder: Path) -> bool:
+    """Whether a folder holds a journal or files of steps."""
+    return (folder / JOURNAL_NAME).exists() or any(_step_files(folder))
 
 
-def line_words(line: Line) -> str:
-    """Name of the step of a line, for people."""
-    event = parse_event(line)
+def event_words(event: Event) -> str:
+    """Name of the step of an event, for people."""
     return step_words(event) if isinstance(event, Begin | Done) else "the session"
 
 
-def _named_in(state: RunState) -> str:
-    return "" if state.opened is None else state.opened.header.session_id
+def _step_files(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.glob("*.mcap*")) if SEGMENT_NAME.fullmatch(path.name)]
 
 
-def _session(folder: Path, state: RunState) -> str:
+def _place(event: Event) -> float:
+    """Where a rebuilt event belongs: the serial number of its step."""
+    match event:
+        case Open():
+            return -1
+        case Begin() | Done() | Lost():
+            serial = serial_of(event.file)
+            return float("inf") if serial is None else serial
+        case _:
+            return float("inf")
+
+
+def _read(folder: Path) -> Evidence:
+    """Read the journal and the files, and find out whose they are."""
+    path = folder / JOURNAL_NAME
+    too_large: list[Fault] = []
+    has_journal = check_file(path)
+    try:
+        data = read_journal(path) if has_journal else b""
+    except SessionDamaged as error:
+        data, too_large = b"", [Fault(1, error.what)]
+    final = folder / f"{folder.name}.mcap"
+    files = {path.name: scan(path) for path in [*_step_files(folder), *([final] if final.is_file() else [])]}
+    reading = read(data)
+    named = "" if reading.state.opened is None else reading.state.opened.header.session_id
+    session = _session(folder.name, named, Counter(found.session for found in files.values() if found.session))
+    if session not in ("", named):
+        reading = read(data, session)
+    reading.faults[:0] = too_large
+    return Evidence(folder, has_journal, reading, files, session)
+
+
+def _session(folder: str, named: str, files: Counter[str]) -> str:
     """Id of the session in a folder: its name, unless neither journal nor files say it; then the id of most files."""
-    named = _named_in(state)
-    if named == folder.name:
-        return named
-    finals = {f"{folder.name}.mcap", f"{folder.resolve().name}.mcap"}
-    paths = [path for path in folder.glob("*.mcap*") if SEGMENT_NAME.fullmatch(path.name) or path.name in finals]
-    files = Counter(session for path in paths if (session := McapFile(path).session))
-    if folder.name in files or not files:
-        return folder.name if files else named
-    return named if files[named] == max(files.values()) else files.most_common(1)[0][0]
+    if folder == named or folder in files:
+        return folder
+    return named if not files or files[named] == max(files.values()) else files.most_common(1)[0][0]
 
 
-def _fold(found: Evidence) -> None:
-    for line in found.all_lines:
-        try:
-            found.state.apply(parse_event(line))
-        except DoneTwice:
-            # Only a rebuilt line can raise this: the journal's own lines were applied before.
-            found.rebuilt = [other for other in found.rebuilt if other is not line]
-
-
-def _lost_between(found: Evidence, twice: list[Line]) -> None:
-    """Rebuild the `lost` line of a step that is done twice and whose first file is gone."""
-    for line in twice:
-        held = (one for one in found.lines if one["event"] == "done" and one["key"] == line["key"])
-        first = next(held, line)
-        if first["file"] != line["file"] and not (found.folder / first["file"]).exists():
+def _rebuild(evidence: Evidence) -> None:
+    """Rebuild what the journal lost from the notes in the files, and the state after it."""
+    reading = evidence.reading
+    for done in reading.twice:
+        first = reading.state.done.get(done.key, done)
+        if first.file != done.file and not (evidence.folder / first.file).exists():
             why = "its file is gone, and the step was done again"
-            lost = {"t_ns": line.get("t_ns", 0), "event": "lost", "key": line["key"], "file": first["file"]}
-            found.rebuilt += [{**lost, "aside": "", "why": why}, line]
+            evidence.rebuilt += [Lost(t_ns=done.t_ns, key=done.key, file=first.file, why=why), done]
+    _rebuild_steps(evidence)
+    if reading.state.opened is None:
+        evidence.rebuilt.append(Open(t_ns=0, header=_header(evidence), snapshots=_snapshots(evidence.folder)))
+    for event in list(evidence.events()):
+        try:
+            evidence.state.apply(event)
+        except DoneTwice:
+            # Only a rebuilt event can raise this: the journal's own were applied before.
+            evidence.rebuilt = [other for other in evidence.rebuilt if other is not event]
+    _rebuild_closed(evidence)
+    evidence.lost = _lost(evidence)
 
 
-def _lost(journal: Account, lines: list[Line]) -> int:
-    """Number of missing or damaged lines, less those that were rebuilt in the same place."""
-    numbers = {id(entry.line): entry.seq for entry in journal.reading.entries}
-    lost = rebuilt = last = 0
-    for line in lines:
-        seq = numbers.get(id(line))
-        if seq is None:
-            rebuilt += 1
-        else:
-            lost, rebuilt, last = lost + max(0, seq - last - 1 - rebuilt), 0, seq
-    end = max((entry.number for entry in journal.reading.entries), default=0)
-    return lost + max(0, sum(number > end for number in journal.reading.damaged) - rebuilt)
-
-
-def _place(lines: list[Line], line: Line) -> int:
-    """Index for a rebuilt line: `open` first, `closed` last, the lines of a step before those of the next."""
-    if line["event"] == "open":
-        return 0
-    serial = serial_of(str(line.get("file", "")))
-    if line["event"] == "closed" or serial is None:
-        return len(lines)
-    for at, other in enumerate(lines):
-        later = serial_of(str(other["file"])) if other["event"] in ("begin", "done") else None
-        if other["event"] == "closed" or (later is not None and later > serial):
-            return at
-    return len(lines)
-
-
-def _from_files(found: Evidence, live: dict[str, Done]) -> Header | None:
-    """Rebuild `begin` and `done` lines from the notes in the files of steps; return the header from one of them.
-
-    `live` are the journal's `done` lines that no `lost` line revokes.
-    """
-    begun = {str(line.get("file")) for line in found.lines if line["event"] == "begin"}
-    done = {str(line.get("file")) for line in [*found.lines, *found.rebuilt] if line["event"] == "done"}
-    celled = {line["kind"] for line in found.lines if line["event"] == "begin" and line.get("patch") is not None}
-    uncelled = {line["kind"] for line in found.lines if line["event"] == "begin"} - celled
-    doubted = {line.get("file") for line in found.lines if line["event"] == "doubt"}
-    header: Header | None = None
-    strays: list[str] = []
-    for path, name, seen in _uncovered(found.folder, begun, done):
-        if seen.session not in ("", found.session):
-            found.foreign[path.name] = seen.session
+def _rebuild_steps(evidence: Evidence) -> None:
+    """Rebuild `begin` and `done` from the notes in the files of steps, whatever these are called now."""
+    events = [entry.event for entry in evidence.reading.entries]
+    begun = {event.file: event for event in events if isinstance(event, Begin)}
+    finished = {event.file for event in [*events, *evidence.rebuilt] if isinstance(event, Done)}
+    doubted = {event.file for event in events if isinstance(event, Doubt)}
+    over: set[str | tuple[str, int]] = {event.file for event in events if isinstance(event, Lost)}
+    over |= {(event.key, event.attempt) for event in events if isinstance(event, Void)}
+    attempts = dict(evidence.reading.state.attempts)
+    unlisted: list[str] = []
+    for name, found in evidence.files.items():
+        step_name = SEGMENT_NAME.fullmatch(name)
+        if step_name is None:
             continue
-        if path.name.removesuffix(".part") != name:
-            strays.append(path.name)
-        if name in begun and (name in done or path.name.endswith(".part")):
+        own = name.removesuffix(".part")
+        if foreign := evidence.foreign(found):
+            evidence.strays |= {} if own in begun else {name: foreign[0]}
             continue
-        finished = not path.name.endswith(".part")
-        note = seen.notes.get(BEGIN_NOTE, {})
-        header = header or _header(note)
-        if name not in begun:
-            line = _begin_line(note)
-            if line is None:
-                match = SEGMENT_NAME.fullmatch(path.name)
-                if match is not None and match[2] not in uncelled and path.name not in doubted:
-                    found.doubtful.append(path.name)
-                continue
-            found.rebuilt.append(line)
-        finish = _done_line(seen.notes.get(DONE_NOTE, {}), name)
-        if finished and name not in done and finish is not None and not _superseded(found, finish, live):
+        begin = _begin(found) or begun.get(own)
+        if begin is None:
+            if step_name[2] in MARKING and name not in doubted:
+                evidence.doubtful.append(name)
+            continue
+        if begin.file not in begun:
+            begun[begin.file] = begin
+            attempts[begin.key] = max(attempts.get(begin.key, 0), begin.attempt)
+            evidence.rebuilt.append(begin)
+        if own != begin.file:
+            unlisted.append(name)
+        done = None if name != own or begin.file in finished else _done(found, begin.file)
+        if done is None or done.file in over or (done.key, done.attempt) in over:
+            continue
+        known = evidence.reading.state.done.get(done.key)
+        stands = known is not None and Topic.STROKE in known.counts
+        if not stands and attempts.get(done.key, 0) <= done.attempt:
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
-            whole = path.name == name and not seen.damage and dict(seen.counts) == finish["counts"]
-            found.rebuilt.append({**finish, "sha256": file_sha256(path) if whole else ""})
-    begun |= {line["file"] for line in found.rebuilt if line["event"] == "begin"}
-    found.strays = [name for name in strays if name.removesuffix(".part") not in begun]
-    return header
+            whole = own == begin.file and not found.damage and dict(found.counts) == done.counts
+            sha256 = file_sha256(found.path) if whole else ""
+            finished.add(done.file)
+            evidence.rebuilt.append(done.model_copy(update={"sha256": sha256}))
+    words = "holds a step that the journal lists under another file"
+    evidence.strays |= {name: words for name in unlisted if name.removesuffix(".part") not in begun}
 
 
-def _uncovered(folder: Path, begun: set[str], done: set[str]) -> Iterator[tuple[Path, str, McapFile]]:
-    """Files not fully covered by the journal, each with the name under which it was written."""
-    paths = [path for path in sorted(folder.glob("*.mcap*")) if SEGMENT_NAME.fullmatch(path.name)]
-    covered = [
-        path for path in paths if path.name in begun & done or path.name.removesuffix(".part") in begun - {path.name}
-    ]
-    others = [path for path in paths if path not in covered]
-    exchanged = False
-    while others:
-        path = others.pop(0)
-        seen = scan(path)
-        line = _begin_line(seen.notes.get(BEGIN_NOTE, {}))
-        name: str = path.name if line is None else line["file"]
-        if name.removesuffix(".part") != path.name.removesuffix(".part") and not exchanged:
-            exchanged = True
-            others += covered  # files were exchanged: a covered one may hold another step
-        yield path, name.removesuffix(".part"), seen
-
-
-def _begin_line(note: dict[str, Any]) -> Line | None:
+def _begin(found: McapFile) -> Begin | None:
+    """The `begin` that a file notes; None where it makes no sense."""
     try:
-        line: Line = {"t_ns": note["t_ns"], **note["line"]}
-        parse_event(line)
-    except NONSENSE:
+        note = found.notes[BEGIN_NOTE]
+        event = parse_event({"t_ns": note["t_ns"], **note["line"]})
+    except (KeyError, TypeError, ValueError):
         return None
-    return line if line["event"] == "begin" else None
+    return event if isinstance(event, Begin) else None
 
 
-def _done_line(note: dict[str, Any], name: str) -> Line | None:
-    """Make the `done` line from a file's note, without a digest; None where the note makes no sense."""
+def _done(found: McapFile, file: str) -> Done | None:
+    """The `done` that a file notes, without a digest; None where it makes no sense."""
     try:
-        line: Line = {"event": "done", **note, "file": name, "sha256": ""}
-        parse_event(line)
-    except NONSENSE:
+        event = parse_event({"event": "done", **found.notes[DONE_NOTE], "file": file, "sha256": ""})
+    except (KeyError, TypeError, ValueError):
         return None
-    return line
+    return event if isinstance(event, Done) else None
 
 
-def _superseded(found: Evidence, finish: Line, live: dict[str, Done]) -> bool:
-    """Whether the attempt was cut or lost, or its step begun or done again, according to the journal."""
-    held = live.get(finish["key"])
-    if held is not None and (held.attempt > finish["attempt"] or Topic.STROKE in held.counts):
-        return True
-    for line in [*found.lines, *found.rebuilt]:
-        if line.get("key") != finish["key"]:
+def _header(evidence: Evidence) -> Header:
+    """Header of the session in a file of a step, or in the merged file. Raises `SessionDamaged`."""
+    for found in evidence.files.values():
+        try:
+            header = Header.model_validate(found.notes.get(BEGIN_NOTE, {}).get("header"))
+        except ValidationError:
             continue
-        match line["event"]:
-            case "lost" if line["file"] == finish["file"]:
-                return True
-            case "begin" if line["attempt"] > finish["attempt"]:
-                return True
-            case "void" if line["attempt"] == finish["attempt"]:
-                return True
-            case _:
-                pass
-    return False
-
-
-def _header(note: dict[str, Any]) -> Header | None:
-    try:
-        return Header.model_validate(note["header"])
-    except (KeyError, ValidationError):
-        return None
-
-
-def _from_any_segment(found: Evidence) -> Header | None:
-    for path in sorted(found.folder.glob("*.mcap*")):
-        header = _header(McapFile(path).notes.get(BEGIN_NOTE, {})) if SEGMENT_NAME.fullmatch(path.name) else None
-        if header is not None and header.session_id == found.session:
+        if header.session_id == evidence.session:
             return header
-    return None
-
-
-def _from_final(found: Evidence) -> Header | None:
-    final = found.folder / f"{found.folder.name}.mcap"
-    if not final.is_file():
-        return None
-    metadata = McapFile(final).metadata.get(HEADER_METADATA)
-    return parse_header(final, metadata) if metadata else None
+    final = evidence.files.get(evidence.final.name)
+    if final is None or HEADER_METADATA not in final.metadata:
+        raise SessionDamaged(evidence.folder / JOURNAL_NAME, "has no `open` event, and no file holds its header")
+    return parse_header(evidence.final, final.metadata[HEADER_METADATA])
 
 
 def _snapshots(folder: Path) -> dict[str, str]:
@@ -307,19 +264,30 @@ def _snapshots(folder: Path) -> dict[str, str]:
     return {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace") for path in present}
 
 
-def _closed(found: Evidence) -> None:
-    """Rebuild the `closed` line if the merged file is sound and holds all messages that the journal counts, or more.
+def _rebuild_closed(evidence: Evidence) -> None:
+    """Rebuild `closed` if the merged file is sound and holds all messages that the journal counts, or more.
 
     It holds more where the files of steps are lost with their lines: it is then the only copy.
     """
-    final = found.folder / f"{found.folder.name}.mcap"
-    if found.state.closed is not None or not final.is_file():
+    found, state = evidence.files.get(evidence.final.name), evidence.state
+    if state.closed is not None or found is None or found.damage or evidence.foreign(found):
         return
-    try:
-        counts = count_messages(final)
-    except SessionError:
-        return
-    if counts and Counter(counts) >= Counter(found.state.counts()) and McapFile(final).session in ("", found.session):
-        event = closed(final, counts, found.state.last_ns)
-        found.rebuilt.append(full_line(event))
-        found.state.apply(event)
+    if found.counts and found.counts >= Counter(state.counts()):
+        event = closed(evidence.final, dict(found.counts), state.last_ns)
+        evidence.rebuilt.append(event)
+        state.apply(event)
+
+
+def _lost(evidence: Evidence) -> int:
+    """Number of missing or damaged lines, less those that were rebuilt in the same place."""
+    entries = evidence.reading.entries
+    numbers = {id(entry.event): entry.seq for entry in entries}
+    lost = rebuilt = last = 0
+    for event in evidence.events():
+        seq = numbers.get(id(event))
+        if seq is None:
+            rebuilt += 1
+        else:
+            lost, rebuilt, last = lost + max(0, seq - last - 1 - rebuilt), 0, seq
+    end = max((entry.number for entry in entries), default=0)
+    return lost + max(0, sum(number > end for number in evidence.reading.damaged) - rebuilt)

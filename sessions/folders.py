@@ -7,8 +7,7 @@ from pathlib import Path
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_folder
 from brushloop.sessions.errors import InputError, SessionError
-from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.run_state import replay
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 
 
 def check_name(folder: Path) -> None:

@@ -1,27 +1,30 @@
-"""The lines of a journal: written one at a time, each on disk before anything depends on it, and read back.
+"""The lines of a journal: written one at a time, each on disk before anything depends on it, and read back as events.
 
 A line is a JSON object with its number `seq` (1, 2, 3 ...), the id of its `session`, its time, its event, and a CRC-32
 of all that as the last field. Reading reports lines that do not match their CRC, are missing, stand twice, are out of
-place or are of another session. A last line that is cut off is what a crash leaves, and is harmless. A line that was
-changed and given a new CRC is not noticed.
+place, are of another session or make no sense. A last line that is cut off is what a crash leaves, and is harmless. A
+line that was changed and given a new CRC is not noticed.
 """
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
 import zlib
-from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
 from brushloop.sessions.disk import check_file, fsync_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error
+from brushloop.sessions.events import Done, Event, parse_event
+from brushloop.sessions.records import Header
+from brushloop.sessions.run_state import DoneTwice, RunState
 
 JOURNAL_NAME = "journal.jsonl"
 MAX_JOURNAL_BYTES = 256 * 1024 * 1024
@@ -33,7 +36,7 @@ _WHOLE = re.compile(rb'\{"seq":.*?,"crc":"[0-9a-f]{8}"\}', re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line that matches its CRC."""
+    """One line that matches its CRC and makes sense."""
 
     number: int
     """Number of the line in the file as it is now, from 1."""
@@ -41,8 +44,7 @@ class Entry:
     """Number of the line as it was written, from 1."""
     session: str
     raw: bytes
-    line: Line
-    """Time and event."""
+    event: Event
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +62,22 @@ class Fault:
 
 @dataclass(slots=True)
 class Reading:
-    """Lines of a journal that can be used, and what is wrong with the rest."""
+    """What a journal says, and what is wrong with it."""
 
     entries: list[Entry] = field(default_factory=list[Entry])
-    """In the order in which they were written, each number once."""
+    """Lines that can be trusted, in the order in which they were written, each number once."""
+    state: RunState = field(default_factory=RunState)
+    """State after them."""
     faults: list[Fault] = field(default_factory=list[Fault])
-    """In the order of the file; empty for a journal without damage."""
+    """All problems, in the order of the file; every command uses this list. Empty for a journal without damage."""
     damaged: list[int] = field(default_factory=list[int])
     """Numbers of the lines that cannot be read."""
+    twice: list[Done] = field(default_factory=list[Done])
+    """Steps that were done already."""
     torn: bytes = b""
     """Last line, cut off by a crash: the next process sets it aside."""
+    next_seq: int = 1
+    """Number of the next line."""
 
 
 class BadLine(Exception):
@@ -81,11 +89,6 @@ def encode_line(t_ns: int, line: Line, seq: int, session: str) -> bytes:
     values = {"seq": seq, "session": session, "t_ns": t_ns, **line}
     body = json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
     return body[:-1] + f',"crc":"{zlib.crc32(body):08x}"}}\n'.encode()
-
-
-def without_time(line: Line) -> Line:
-    """The line without its time, which `encode_line` adds."""
-    return {name: value for name, value in line.items() if name != "t_ns"}
 
 
 def decode_line(raw: bytes, number: int) -> Entry:
@@ -101,9 +104,12 @@ def decode_line(raw: bytes, number: int) -> Entry:
         case {"seq": int(seq), "session": str(session), "event": str()} if seq > 0 and not isinstance(seq, bool):
             for name in ("seq", "session", "crc"):
                 del line[name]
-            return Entry(number, seq, session, raw, line)
         case _:
             raise BadLine("has no number, session or event")
+    try:
+        return Entry(number, seq, session, raw, parse_event(line))
+    except ValueError as error:
+        raise BadLine(f"makes no sense: {error}") from None
 
 
 def read_journal(path: Path) -> bytes:
@@ -116,40 +122,59 @@ def read_journal(path: Path) -> bytes:
         raise SessionError(path, error.what) from None
 
 
-def read_lines(path: Path) -> Iterator[Line]:
-    """Complete lines, without a torn last one; any other damage raises `SessionDamaged`."""
-    reading = read(read_journal(path))
-    if reading.faults:
-        raise SessionDamaged(path, str(reading.faults[0]))
-    return iter([entry.line for entry in reading.entries])
-
-
 def read(data: bytes, session: str = "") -> Reading:
     """Read whatever is intact in the bytes of a journal.
 
     Lines of another session than `session` are not used; without it, those of the session with most lines are.
     """
-    reading = Reading()
-    entries = _decoded(reading, data)
-    if entries and not session:
-        session = Counter(entry.session for entry in entries).most_common(1)[0][0]
-    foreign = [entry for entry in entries if entry.session != session]
-    for other in dict.fromkeys(entry.session for entry in foreign):
-        first, *others = [entry.number for entry in foreign if entry.session == other]
-        more = f", as are {len(others)} more" if others else ""
-        reading.faults.append(Fault(first, f"is of another session, {other[:100]!r}{more}"))
-    by_seq: dict[int, Entry] = {}
-    for entry in entries:
-        if entry.session == session:
-            known = by_seq.setdefault(entry.seq, entry)
-            if known is not entry:
-                how = "stands twice: it is" if known.raw == entry.raw else "stands in the place of"
-                reading.faults.append(Fault(entry.number, f"{how} line {entry.seq}"))
-    reading.entries = [by_seq[seq] for seq in sorted(by_seq)]
-    _misplaced(reading)
-    _missing(reading)
-    reading.faults.sort(key=lambda fault: fault.number)
+    with _without_collection():
+        reading = Reading()
+        entries = _in_order(reading, _decoded(reading, data), session)
+        _missing(reading, entries)
+        for entry in entries:
+            try:
+                reading.state.apply(entry.event)
+            except DoneTwice as error:
+                reading.faults.append(Fault(entry.number, str(error)))
+                reading.twice += [entry.event] if isinstance(entry.event, Done) else []
+            else:
+                reading.entries.append(entry)
+        reading.faults.sort(key=lambda fault: fault.number)
+        return reading
+
+
+def replay(path: Path) -> RunState:
+    """State after all events of a journal. Raises `SessionDamaged` where anything in it is wrong."""
+    return undamaged(path).state
+
+
+def undamaged(path: Path) -> Reading:
+    """A journal whose every line can be trusted. Raises `SessionDamaged` for any other."""
+    reading = read(read_journal(path))
+    if reading.faults:
+        more = f" (and {len(reading.faults) - 1} more)" if len(reading.faults) > 1 else ""
+        raise SessionDamaged(path, f"{reading.faults[0]}{more}")
     return reading
+
+
+def read_header(folder: Path, state: RunState) -> Header:
+    """Header in the journal. Raises `SessionDamaged`."""
+    if state.opened is None:
+        raise SessionDamaged(folder / JOURNAL_NAME, "has no `open` event")
+    return state.opened.header
+
+
+@contextmanager
+def _without_collection() -> Generator[None]:
+    """Within the block, cyclic garbage is not collected: of the many small objects of a long journal none is garbage,
+    and looking at all of them again and again takes more time than reading them."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _decoded(reading: Reading, data: bytes) -> list[Entry]:
@@ -184,33 +209,41 @@ def _lines_within(raw: bytes, number: int) -> tuple[list[Entry], int]:
     return entries, left + (len(raw) - at > 1 or not entries)
 
 
-def _misplaced(reading: Reading) -> None:
-    """Report lines outside the longest run that is in order."""
-    held = reading.entries
-    if all(one.number < after.number for one, after in pairwise(held)):
-        return
-    ends: list[int] = []
-    """Index of the last entry of the best run of each length."""
-    before: list[int | None] = []
-    for index, entry in enumerate(held):
-        at = bisect_right(ends, entry.number, key=lambda end: held[end].number)
-        before.append(ends[at - 1] if at else None)
-        ends[at : at + 1] = [index]
-    in_order: set[int] = set()
-    index = ends[-1] if ends else None
-    while index is not None:
-        in_order.add(index)
-        index = before[index]
-    for index, entry in enumerate(held):
-        if index not in in_order:
-            reading.faults.append(Fault(entry.number, f"is out of place: it was written as line {entry.seq}"))
+def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entry]:
+    """The lines of the session as they were written; those of others, or doubled or moved ones, are reported."""
+    if entries and not session:
+        session = Counter(entry.session for entry in entries).most_common(1)[0][0]
+    foreign: dict[str, list[Entry]] = {}
+    by_seq: dict[int, Entry] = {}
+    for entry in entries:
+        if entry.session != session:
+            foreign.setdefault(entry.session, []).append(entry)
+        elif (known := by_seq.setdefault(entry.seq, entry)) is not entry:
+            how = "stands twice: it is" if known.raw == entry.raw else "stands in the place of"
+            reading.faults.append(Fault(entry.number, f"{how} line {entry.seq}"))
+    for other, lines in foreign.items():
+        reading.faults.append(_one_of(lines, f"is of another session, {other[:100]!r}"))
+    as_they_stand = list(by_seq.values())
+    as_written = [by_seq[seq] for seq in sorted(by_seq)]
+    moved = [one for one, other in zip(as_they_stand, as_written, strict=True) if one is not other]
+    if moved:
+        reading.faults.append(_one_of(moved, f"is out of place: it was written as line {moved[0].seq}"))
+    reading.next_seq = as_written[-1].seq + 1 if as_written else 1
+    return as_written
 
 
-def _missing(reading: Reading) -> None:
+def _one_of(lines: list[Entry], what: str) -> Fault:
+    return Fault(lines[0].number, what + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""))
+
+
+def _missing(reading: Reading, entries: list[Entry]) -> None:
     """Report numbers that no line has, except those of lines that cannot be read."""
+    unreadable = set(reading.damaged)
     seq = at = 0
-    for entry in reading.entries:
-        gone = entry.seq - seq - 1 - sum(at < number < entry.number for number in set(reading.damaged))
+    for entry in entries:
+        gone = entry.seq - seq - 1
+        if gone > 0:
+            gone -= sum(at < number < entry.number for number in unreadable)
         if gone > 0:
             lines = "a line that is" if gone == 1 else f"{gone} lines that are"
             reading.faults.append(Fault(entry.number, f"comes after {lines} missing"))
@@ -261,7 +294,7 @@ def _whole_lines(path: Path, t_ns: int, session: str) -> int:
     """Make the journal end with a whole line, and return the number of the next one."""
     data = read_journal(path)
     reading = read(data)
-    seq = reading.entries[-1].seq + 1 if reading.entries else 1
+    seq = reading.next_seq
     keep = data.rfind(b"\n") + 1
     if keep == len(data):
         return seq

@@ -27,12 +27,12 @@ from brushloop.sessions.disk import (
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error, in_one_line
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.history import remarks_of
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.records import HEADER_METADATA, Event, Header, StepEvent, Stroke, Topic
-from brushloop.sessions.run_state import RunState, replay
+from brushloop.sessions.run_state import RunState
 
 if TYPE_CHECKING:
     import numpy as np

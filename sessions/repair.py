@@ -10,26 +10,32 @@ interrupted anywhere and started again ends with the same result.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from brushloop.sessions.disk import SEGMENT_NAME, check_digest, file_sha256, fsync_folder, holds, set_aside
-from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
-from brushloop.sessions.events import DrawResult, PressResult, line_of, parse_event
-from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
-from brushloop.sessions.folders import check_name, not_a_session
-from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, without_time
-from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
-from brushloop.sessions.recording import REPAIRS_NOTE, count_messages, merge_session
-from brushloop.sessions.records import (
-    BEGIN_NOTE,
-    DONE_NOTE,
-    StepEvent,
-    Stroke,
-    Topic,
+from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside
+from brushloop.sessions.errors import disk_error
+from brushloop.sessions.events import (
+    Begin,
+    BoardResult,
+    CaptureResult,
+    Done,
+    Doubt,
+    DrawResult,
+    Event,
+    JournalRepaired,
+    Lost,
+    PressResult,
+    Repaired,
+    line_of,
 )
-from brushloop.sessions.run_state import RunState, read_header, replay
+from brushloop.sessions.evidence import Evidence, event_words, gather, is_collected
+from brushloop.sessions.folders import check_name, not_a_session
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
+from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
+from brushloop.sessions.recording import REPAIRS_NOTE, merge_session
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, StepEvent, Topic
 from brushloop.sessions.salvage import (
     Report,
     kept_words,
@@ -42,12 +48,10 @@ from brushloop.sessions.salvage import (
 )
 from brushloop.sessions.show import step_words
 from brushloop.sessions.store import closed, lock
-from brushloop.sessions.verify import file_problems
+from brushloop.sessions.verify import judge
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 """Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""
-
-
 Step = tuple[str, int]
 """Key and attempt of a step."""
 
@@ -65,66 +69,94 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
         check_name(path)
         if target.is_file():
             return repair_file(target)
-        files = [file.name for file in target.glob("*.mcap*")]
-        if not (target / JOURNAL_NAME).exists() and not any(map(SEGMENT_NAME.fullmatch, files)):
+        if not is_collected(target):
             final = target / f"{target.name}.mcap"
             if not final.is_file():
                 raise not_a_session(path)
             return repair_file(final)
         held = lock(target)
         try:
-            return FolderRepair(target, now_ns).run()
+            return _FolderRepair(gather(target), now_ns).run()
         finally:
             held.release()
     except OSError as error:
         raise disk_error(target, "cannot be repaired", error) from error
 
 
-class FolderRepair:
+class _FolderRepair:
     """Repair of one folder while its lock is held."""
 
-    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
-        self._folder = folder
-        self._final = folder / f"{folder.name}.mcap"
+    def __init__(self, evidence: Evidence, now_ns: Callable[[], int]) -> None:
+        self._evidence, self._verdict = evidence, judge(evidence)
+        self._final_problems = self._verdict.problems(evidence.final.name)
+        self._folder, self._final, self._state = evidence.folder, evidence.final, evidence.state
         self._now_ns = now_ns
-        self._report = Report(folder.name)
+        self._header = read_header(evidence.folder, evidence.state)
+        self._report = Report(evidence.folder.name)
         self._lost_steps: list[str] = []
         """Reported as lost unless the merged file holds them."""
-        self._scans: dict[tuple[int, int, int], tuple[McapFile, Step | None]] = {}
-        """Content of each file that was read and the step it belongs to, by inode, size and time."""
-        evidence = gather(folder)
-        self._strays = dict.fromkeys(evidence.strays, "it is a copy of another step")
-        self._strays |= {name: f"it is of another session, {other!r}" for name, other in evidence.foreign.items()}
-        self._begins = [line for line in evidence.all_lines if line["event"] == "begin"]
-        self._header = read_header(folder, evidence.state)
-        self._journal = _repaired_journal(evidence, self._header.session_id, now_ns, self._report)
-        try:
-            self._state = replay(folder / JOURNAL_NAME)
-            self._final_sound = _final_is_sound(folder, self._state)
-            self._merged: tuple[dict[Step, list[Part]], dict[int, list[Part]]] | None = None
-        except BaseException:
-            self._journal.close()
-            raise
+        self._begins = {event.file: event for event in evidence.events() if isinstance(event, Begin)}
 
     def run(self) -> Report:
-        """Repair configuration, steps and merged file."""
+        """Repair journal, configuration, steps and merged file."""
+        report, state = self._report, self._state
+        if not self._evidence.intact:
+            self._rewrite_journal()
+        self._journal = Journal(self._folder / JOURNAL_NAME, self._now_ns(), self._header.session_id)
         try:
+            self._add_lines()
             self._snapshots()
-            for step in self._state.segments:
-                self._segment(full_line(step))
-            for name, why in self._strays.items():
+            damaged = [step for step in state.files.values() if step.file in self._verdict.damaged]
+            self._copies = self._copies_by_step() if damaged else {}
+            for step in damaged:
+                self._repair_step(step, self._verdict.damaged[step.file])
+            for name, what in self._evidence.strays.items():
                 kept = self._move_aside(self._folder / name)
-                self._report.did.append(f"put {name} aside: {why}{kept_words(kept)}")
-            if self._state.closed is None:
-                self._left_by_a_close()
-            elif not self._final_sound:
+                report.did.append(f"put {name} aside: it {what}{kept_words(kept)}")
+            if state.closed is None and self._final_problems:
+                kept = self._move_aside(self._final)
+                report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}")
+            elif state.closed is not None and self._final_problems:
                 self._merge_again()
         finally:
             self._journal.close()
-        self._report.lost += self._lost_steps
-        counts = self._state.counts() if self._state.closed is None else self._state.closed.counts
-        self._report.strokes = counts.get(Topic.STROKE, 0)
-        return self._report
+        report.lost += self._lost_steps
+        counts = state.counts() if state.closed is None else state.closed.counts
+        report.strokes = counts.get(Topic.STROKE, 0)
+        return report
+
+    def _rewrite_journal(self) -> None:
+        evidence, path = self._evidence, self._folder / JOURNAL_NAME
+        aside = f"{path.name}.damaged" if path.exists() else ""
+        note = JournalRepaired(t_ns=self._now_ns(), aside=aside, rebuilt=len(evidence.rebuilt), lost=evidence.lost)
+        session = self._header.session_id
+        lines = enumerate([*evidence.events(), note], 1)
+        data = b"".join(encode_line(event.t_ns, line_of(event), number, session) for number, event in lines)
+        kept = write_anew(path, data)
+        report, lines = self._report, len(evidence.reading.entries)
+        report.did.append(
+            f"wrote {JOURNAL_NAME} again: {lines} lines as they were, {len(evidence.rebuilt)} rebuilt "
+            f"from the files{kept_words(kept)}"
+        )
+        report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
+        if evidence.lost:
+            count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
+            report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
+
+    def _add_lines(self) -> None:
+        for event in self._evidence.rebuilt if self._evidence.intact else ():
+            self._journal.append(event.t_ns, line_of(event))
+            shown = getattr(event, "file", "the header")
+            self._report.did.append(f"journalled {event.event!r} of {event_words(event)}, which {shown} shows")
+        sheet = self._state.sheet
+        if sheet in self._state.doubtful_sheets:
+            return
+        for name in self._evidence.doubtful:
+            self._log(Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
+            self._report.lost.append(
+                f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
+                f"go on with a fresh one, --sheet {sheet + 2}"
+            )
 
     def _snapshots(self) -> None:
         for name, text in ({} if self._state.opened is None else self._state.opened.snapshots).items():
@@ -134,139 +166,128 @@ class FolderRepair:
                 kept = write_anew(path, data)
                 self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
 
-    def _segment(self, line: Line) -> None:
-        path = self._folder / line["file"]
-        if line["file"] in self._state.held and self._final_sound:
-            return
-        try:
-            check_digest(path, str(line["sha256"]))
-        except SessionDamaged as error:
-            self._damaged(path, line, error.what)
-
-    def _damaged(self, path: Path, line: Line, why: str) -> None:
-        if path.is_file():
-            why = "; ".join(self._look(path)[0].damage) or why
-        counts = Counter[str](line["counts"])
-        needed = _needed(counts)
+    def _repair_step(self, step: Done, why: str) -> None:
+        counts = Counter(step.counts)
+        # A photograph without a stroke (the board) is found by the event of its step.
+        needed = MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
 
         def worth(records: list[Record]) -> tuple[bool, int]:
             missing = counts - _count(records)
             return not any(topic in missing for topic in needed), len(records)
 
-        copies = [records for records in self._copies(path, line) if _count(records) <= counts]
+        copies = [records for records in self._copies_of(step) if _count(records) <= counts]
         records = max(copies, key=worth, default=list[Record]())
         missing = counts - _count(records)
-        if missing and self._final_sound:
-            kept = self._move_aside(path)
-            self._log({"event": "held", "key": line["key"], "file": path.name, "by": self._final.name, "why": why})
-            held = f"{path.name} ({line_words(line)}) {why}: the merged file holds all of it{kept_words(kept)}"
-            self._report.did.append(held)
-        elif any(topic in missing for topic in needed):
-            self._lose(path, line, why)
+        if any(topic in missing for topic in needed):
+            self._lose(step, why)
         else:
-            self._write_again(path, line, records, dict(missing), why)
+            self._write_again(step, records, dict(missing), why)
 
-    def _copies(self, path: Path, line: Line) -> Iterator[list[Record]]:
-        """What is intact of a step in each file that names it inside, whatever its name, and in the merged file."""
-        step: Step = line["key"], line["attempt"]
-        others = (other for other in sorted(self._folder.glob("*.mcap*")) if other not in (path, self._final))
-        for file in (path, *others):
-            if file.is_file():
-                found, whose = self._look(file)
-                if whose == step:
-                    yield list(found.messages())
-        if not self._final.is_file():
-            return
-        found = self._look(self._final)[0]
-        if self._is_ours(found):
-            self._merged = self._merged or _steps_in(found)
-            by_step, by_still = self._merged
-            yield list(found.messages(parts=by_step.get(step, [])))
-            yield list(found.messages(parts=by_still.get(line["result"].get("still"), [])))
+    def _copies_by_step(self) -> dict[Step | int, list[tuple[McapFile, list[Part]]]]:
+        """Files that hold a step, and the chunks of each, by the step that the file names inside, whatever its name.
 
-    def _look(self, path: Path) -> tuple[McapFile, Step | None]:
-        """Read the content of a file and the step it belongs to; only once, even if the file is renamed meanwhile."""
-        stat = path.stat()
-        known = (stat.st_ino, stat.st_size, stat.st_mtime_ns)
-        if known not in self._scans:
-            found = scan(path)
-            whole = path == self._final or not self._is_ours(found)
-            self._scans[known] = found, None if whole else _step_of(found)
-        self._scans[known][0].path = path
-        return self._scans[known]
+        Of the merged file, also by the number of a still.
+        """
+        copies: dict[Step | int, list[tuple[McapFile, list[Part]]]] = defaultdict(list)
+        aside = [scan(path) for path in sorted(self._folder.glob("*.mcap*.damaged-*"))]
+        for found in [*self._evidence.files.values(), *aside]:
+            if self._evidence.foreign(found):
+                continue
+            if found.path == self._final:
+                for step, parts in _parts_by_step(found).items():
+                    copies[step].append((found, parts))
+            elif (step := _step_of(found)) is not None:
+                copies[step].append((found, found.parts))
+        return copies
 
-    def _is_ours(self, found: McapFile) -> bool:
-        """Whether a file may be evidence. Steps of another session of the same protocol have the same keys."""
-        return found.session in ("", self._header.session_id)
+    def _copies_of(self, step: Done) -> Iterator[list[Record]]:
+        """What is intact of a step in each file."""
+        ident, still = (step.key, step.attempt), None
+        if isinstance(step.result, CaptureResult | BoardResult):
+            still = step.result.still
+        for found, parts in [*self._copies.get(ident, ()), *(self._copies.get(still, ()) if still is not None else ())]:
+            records = found.messages(parts=parts)
+            yield list(records) if found.path != self._final else list(_of_step(records, ident, still))
 
-    def _write_again(self, path: Path, line: Line, records: list[Record], missing: dict[str, int], why: str) -> None:
-        begin = {"t_ns": line["t_ns"], "header": self._header.model_dump(mode="json"), "line": self._begin_of(line)}
-        if path.is_file():
-            found, whose = self._look(path)
-            begin = found.notes.get(BEGIN_NOTE, begin) if whose == (line["key"], line["attempt"]) else begin
+    def _write_again(self, step: Done, records: list[Record], missing: dict[str, int], why: str) -> None:
+        path = self._folder / step.file
+        # Without its `begin` in the journal, one is made from its `done`.
+        begin = self._begins.get(step.file) or Begin(
+            t_ns=step.t_ns,
+            key=step.key,
+            kind=step.kind,
+            attempt=step.attempt,
+            sheet=self._state.sheet,
+            file=step.file,
+        )
+        begun = {"t_ns": begin.t_ns, "header": self._header.model_dump(mode="json"), "line": line_of(begin)}
+        done = {name: value for name, value in line_of(step).items() if name in ("key", "attempt", "result")}
         counts = dict(_count(records))
-        done = {name: line[name] for name in ("key", "result", "t_ns")}
-        notes = {BEGIN_NOTE: begin, DONE_NOTE: {**done, "attempt": line["attempt"], "counts": counts}}
+        notes: dict[str, Line] = {BEGIN_NOTE: begun, DONE_NOTE: {"t_ns": step.t_ns, **done, "counts": counts}}
         kept, counts = replace_damaged(path, self._header, notes, {}, records)
-        event: Line = {"event": "repaired", "key": line["key"], "file": path.name, "sha256": file_sha256(path)}
-        self._log({**event, "counts": counts, "missing": missing, "aside": kept, "why": why})
+        self._kept_as(path, kept)
+        self._log(
+            Repaired(
+                t_ns=self._now_ns(),
+                key=step.key,
+                file=path.name,
+                sha256=file_sha256(path),
+                counts=counts,
+                missing=missing,
+                aside=kept,
+                why=why,
+            )
+        )
         words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
         how = f"without {words}" if words else "whole"
-        self._report.did.append(f"wrote {path.name} ({line_words(line)}) again {how}: {why}{kept_words(kept)}")
+        self._report.did.append(f"wrote {path.name} ({step_words(step)}) again {how}: {why}{kept_words(kept)}")
         if words:
-            self._lost_steps.append(f"messages in {path.name} ({line_words(line)}): {words}")
+            self._lost_steps.append(f"messages in {path.name} ({step_words(step)}): {words}")
 
-    def _begin_of(self, line: Line) -> Line:
-        """The attempt's `begin` line in the journal; without one, a line made from its `done` line."""
-        for begin in self._begins:
-            if begin["file"] == line["file"]:
-                return without_time(begin)
-        known = {"event": "begin", "key": line["key"], "kind": line["result"]["kind"], "attempt": line["attempt"]}
-        return {**known, "sheet": self._state.sheet, "file": line["file"]}
-
-    def _lose(self, path: Path, line: Line, why: str) -> None:
-        kept = self._move_aside(path)
+    def _lose(self, step: Done, why: str) -> None:
+        kept = self._move_aside(self._folder / step.file)
         again = "" if self._state.closed is not None else "; it is done again when the session goes on"
-        self._log({"event": "lost", "key": line["key"], "file": path.name, "aside": kept, "why": why})
-        self._report.did.append(f"marked {path.name} ({line_words(line)}) as lost: {why}{kept_words(kept)}")
-        self._lost_steps.append(f"{line_words(line)}{again}")
-        if self._state.closed is None:
-            self._lose_its_press(line)
+        self._log(Lost(t_ns=self._now_ns(), key=step.key, file=step.file, aside=kept, why=why))
+        self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}{kept_words(kept)}")
+        self._lost_steps.append(f"{step_words(step)}{again}")
+        if self._state.closed is None and isinstance(step.result, CaptureResult):
+            self._lose_press(step.result.press.stroke_id)
 
-    def _lose_its_press(self, line: Line) -> None:
-        """Mark the press as lost too if its sheet was removed: it cannot be photographed again."""
-        stroke = line["result"].get("press", {}).get("stroke_id")
-        for other in self._state.segments:
-            if not isinstance(other.result, PressResult | DrawResult) or other.result.press.stroke_id != stroke:
+    def _lose_press(self, stroke_id: str) -> None:
+        """Mark the press of a lost photograph as lost too if its sheet was removed: it cannot be photographed again."""
+        for step in list(self._state.files.values()):
+            if not isinstance(step.result, PressResult | DrawResult) or step.result.press.stroke_id != stroke_id:
                 continue
-            sheet = other.result.press.sheet
+            sheet = step.result.press.sheet
             if sheet is not None and sheet != self._state.sheet:
                 why = f"its photograph is lost and its sheet {sheet + 1} is no longer in"
-                self._log({"event": "lost", "key": other.key, "file": other.file, "aside": "", "why": why})
-                self._report.did.append(f"marked {other.file} ({step_words(other)}) as lost: {why}")
+                self._log(Lost(t_ns=self._now_ns(), key=step.key, file=step.file, why=why))
+                self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}")
 
     def _move_aside(self, path: Path) -> str:
         if not path.exists():
             return ""
-        kept = set_aside(path, "damaged")
+        kept = set_aside(path, "damaged").name
         path.unlink()
         fsync_folder(self._folder)
-        return kept.name
+        self._kept_as(path, kept)
+        return kept
+
+    def _kept_as(self, path: Path, kept: str) -> None:
+        """Read what a file held from where it is kept: another step may be in it."""
+        if kept and path.name in self._evidence.files:
+            self._evidence.files[path.name].path = self._folder / kept
 
     def _merge_again(self) -> None:
         """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
-        found = self._look(self._final)[0] if self._final.is_file() else None
-        if (
-            found is not None
-            and self._is_ours(found)
-            and len(with_their_stills(found).kept) > self._state.counts().get(Topic.STROKE, 0)
-        ):
+        found, strokes = self._evidence.files.get(self._final.name), self._state.counts().get(Topic.STROKE, 0)
+        if found is not None and not self._evidence.foreign(found) and len(with_their_stills(found).kept) > strokes:
             self._lost_steps = self._rewrite_final(found)
             return
-        why = "is missing" if found is None else "; ".join(found.damage) or "has changed"
+        why = "; ".join(self._final_problems)
         kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
         merge_session(self._folder, self._state, self._header, "damaged")
-        self._log(line_of(closed(self._final, self._state.counts(), 0)))
+        self._log(closed(self._final, self._state.counts(), self._now_ns()))
         self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{kept_words(kept)}")
 
     def _rewrite_final(self, found: McapFile) -> list[str]:
@@ -278,44 +299,14 @@ class FolderRepair:
         notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
         kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
         before = Counter[str]({} if self._state.closed is None else self._state.closed.counts)
-        self._log(line_of(closed(self._final, counts, 0)))
-        why = "; ".join(found.damage) or "has changed"
+        self._log(closed(self._final, counts, self._now_ns()))
+        why = "; ".join(self._final_problems)
         self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
         return lost_words(strokes, before, counts)
 
-    def _left_by_a_close(self) -> None:
-        """Put aside a damaged merged file of an open session, which is merged again when it closes."""
-        if not self._final.is_file():
-            return
-        found, problems = file_problems(self._final)
-        if problems or not self._is_ours(found):
-            kept = self._move_aside(self._final)
-            self._report.did.append(
-                f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}"
-            )
-
-    def _log(self, line: Line) -> None:
-        t_ns = self._now_ns()
-        self._journal.append(t_ns, line)
-        self._state.apply(parse_event({"t_ns": t_ns, **line}))
-
-
-def _needed(counts: Counter[str]) -> tuple[str, ...]:
-    """Topics that a step needs; a photograph without a stroke (the board) is found by the event of its step."""
-    return MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
-
-
-def _final_is_sound(folder: Path, state: RunState) -> bool:
-    """Whether the merged file is unchanged since the close, and reads back with every CRC."""
-    final = folder / f"{folder.name}.mcap"
-    if state.closed is None or not final.is_file():
-        return False
-    try:
-        if file_sha256(final) != state.closed.sha256:
-            return False
-        return count_messages(final) == state.closed.counts and not file_problems(final)[1]
-    except (SessionError, OSError):
-        return False
+    def _log(self, event: Event) -> None:
+        self._journal.append(event.t_ns, line_of(event))
+        self._state.apply(event)
 
 
 def _count(records: list[Record]) -> Counter[str]:
@@ -330,84 +321,41 @@ def _step_of(found: McapFile) -> Step | None:
                 return key, attempt
             case _:
                 pass
-    for _schema, _channel, message in found.messages((Topic.STEP,)):
+    for _schema, _channel, message in found.messages(topics=(Topic.STEP,)):
         event = parsed(StepEvent, message)
         return None if event is None else (event.key, event.attempt)
     return None
 
 
-def _steps_in(found: McapFile) -> tuple[dict[Step, list[Part]], dict[int, list[Part]]]:
-    """Sound chunks of a damaged merged file by step, and those with a photograph and its stroke by the still's number.
-
-    A step lies between its begin and end events. Chunks between damage and the next event belong to the step of that
-    event if it ends there.
-    """
-    by_step: dict[Step, list[Part]] = {}
-    by_still: dict[int, list[Part]] = {}
-    run: list[Part] = []
+def _parts_by_step(found: McapFile) -> dict[Step | int, list[Part]]:
+    """Sound chunks of a merged file by the step, between its begin and end, and by the number of the still in them."""
+    parts: dict[Step | int, list[Part]] = defaultdict(list)
+    step: Step | None = None
     for part in found.parts:
         if not part.sound:
-            run = []
+            step = None
             continue
-        run = [*run, part]
-        step: Step | None = None
-        for _schema, channel, message in found.messages((Topic.STEP, Topic.STILL, Topic.STROKE), [part]):
-            if channel.topic == Topic.STEP and (event := parsed(StepEvent, message)) is not None:
-                step = event.key, event.attempt
-                run = [part] if event.phase == "begin" else run
-            elif channel.topic == Topic.STILL:
-                by_still.setdefault(message.sequence, []).append(part)
-            elif channel.topic == Topic.STROKE and (stroke := parsed(Stroke, message)) is not None:
-                parts = by_still.setdefault(stroke.still, [])
-                parts += [] if part in parts else [part]
-        if step is not None:
-            known = by_step.get(step, [])
-            run = by_step[step] = [*known, *(part for part in run if part not in known)]
-    return by_step, by_still
+        inside: set[Step | int] = set() if step is None else {step}
+        for _schema, channel, message in found.messages(parts=[part], topics=(Topic.STEP, Topic.STILL, Topic.STROKE)):
+            if channel.topic != Topic.STEP:
+                inside.add(message.sequence)  # a stroke has that of its still
+            elif (event := parsed(StepEvent, message)) is not None:
+                inside.add((event.key, event.attempt))
+                step = (event.key, event.attempt) if event.phase == "begin" else None
+        for name in inside:
+            parts[name].append(part)
+    return parts
 
 
-def _repaired_journal(evidence: Evidence, session: str, now_ns: Callable[[], int], report: Report) -> Journal:
-    """Repair the session's journal and open it for further lines. Raises `SessionError`."""
-    if not evidence.intact:
-        _rewrite_journal(evidence, session, now_ns, report)
-    journal = Journal(evidence.folder / JOURNAL_NAME, now_ns(), session)
-    try:
-        _add_lines(journal, evidence, now_ns, report)
-    except BaseException:
-        journal.close()
-        raise
-    return journal
-
-
-def _rewrite_journal(evidence: Evidence, session: str, now_ns: Callable[[], int], report: Report) -> None:
-    path = evidence.folder / JOURNAL_NAME
-    aside = f"{path.name}.damaged" if path.exists() else ""
-    words = {"event": "journal", "aside": aside, "rebuilt": len(evidence.rebuilt), "lost": evidence.lost}
-    lines = [*evidence.all_lines, {"t_ns": now_ns(), **words}]
-    data = (encode_line(int(line.get("t_ns", 0)), without_time(line), n, session) for n, line in enumerate(lines, 1))
-    kept = write_anew(path, b"".join(data))
-    report.did.append(
-        f"wrote {JOURNAL_NAME} again: {len(evidence.lines)} lines as they were, {len(evidence.rebuilt)} rebuilt "
-        f"from the files{kept_words(kept)}"
-    )
-    report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.faults]
-    if evidence.lost:
-        count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
-        report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
-
-
-def _add_lines(journal: Journal, evidence: Evidence, now_ns: Callable[[], int], report: Report) -> None:
-    if evidence.intact:
-        for line in evidence.rebuilt:
-            journal.append(int(line["t_ns"]), without_time(line))
-            what = line_words(line) if line["event"] != "closed" else "the session"
-            shown = str(line.get("file", "the header"))
-            report.did.append(f"journalled {line['event']!r} of {what}, which {shown} shows")
-    sheet = evidence.state.sheet
-    if evidence.doubtful and sheet not in evidence.state.doubtful_sheets:
-        for name in evidence.doubtful:
-            journal.append(now_ns(), {"event": "doubt", "file": name, "sheet": sheet})
-            report.lost.append(
-                f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
-                f"go on with a fresh one, --sheet {sheet + 2}"
-            )
+def _of_step(records: Iterator[Record], step: Step, still: int | None) -> Iterator[Record]:
+    """The messages of one step among those of a merged file."""
+    inside = False
+    for record in records:
+        _schema, channel, message = record
+        event = parsed(StepEvent, message) if channel.topic == Topic.STEP else None
+        if event is not None:
+            inside = (event.key, event.attempt) == step
+        if inside or (channel.topic in MEASURED and message.sequence == still):
+            yield record
+        if event is not None and event.phase == "end":
+            inside = False

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 from collections import Counter
-from collections.abc import Generator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TypeVar
 
 from brushloop.sessions import events
-from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import (
     Begin,
     CaptureResult,
@@ -24,11 +19,9 @@ from brushloop.sessions.events import (
     Press,
     PressResult,
     Repaired,
-    parse_event,
     serial_of,
 )
-from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, Reading, read, read_journal
-from brushloop.sessions.records import Header, Topic
+from brushloop.sessions.records import Topic
 
 KILLED = "the process ended during it"
 _R = TypeVar("_R")
@@ -48,8 +41,6 @@ class RunState:
     """Finished steps by key; of a set-up step, the newest."""
     files: dict[str, Done] = field(default_factory=dict[str, Done])
     """Finished steps by file, in order of time; the merged file is made of these files."""
-    held: dict[str, str] = field(default_factory=dict[str, str])
-    """Damaged files of steps, and the file that holds all of each."""
     attempts: dict[str, int] = field(default_factory=dict[str, int])
     """Attempts that were begun, by key."""
     running: dict[tuple[str, int], Begin] = field(default_factory=dict[tuple[str, int], Begin])
@@ -70,13 +61,6 @@ class RunState:
     """How the last run ended; empty if its process was cut off before it could say so."""
     last_ns: int = 0
     """Time of the latest event, to notice a clock that was set back."""
-    _finished: dict[tuple[str, int], str] = field(default_factory=dict[tuple[str, int], str])
-    """File of each finished attempt, by key and number."""
-
-    @property
-    def segments(self) -> list[Done]:
-        """Finished steps in order of time."""
-        return list(self.files.values())
 
     @property
     def voids(self) -> int:
@@ -141,12 +125,10 @@ class RunState:
                 self.closed = event
             case events.Repaired() | events.Lost():
                 self._repair(event)
-            case events.Held(file=file, by=by):
-                self.held[file] = by
             case events.Doubt(sheet=sheet, file=file):
                 self.doubtful_sheets.add(sheet)
                 self.begun = max(self.begun, _next_serial(file))
-            case events.Torn() | events.Clock() | events.JournalRepaired():
+            case events.Torn() | events.Clock() | events.JournalRepaired() | events.Remark():
                 pass  # for people who read the journal
         self.last_ns = event.t_ns
 
@@ -160,15 +142,14 @@ class RunState:
             self.used_patches |= {(begin.sheet, patch) for patch in (begin.patch, *begin.more_patches)}
 
     def _done(self, done: Done) -> None:
-        ident, known = (done.key, done.attempt), self.done.get(done.key)
-        earlier = done.file if done.file in self.files else self._finished.get(ident)
-        if known is not None and Topic.STROKE in {**known.counts, **done.counts}:
-            earlier = known.file  # only a set-up step may be done again
+        earlier, known = self.files.get(done.file), self.done.get(done.key)
+        # Only a set-up step may be done again, as a later attempt.
+        if known is not None and (known.attempt >= done.attempt or Topic.STROKE in {**known.counts, **done.counts}):
+            earlier = known
         if earlier is not None:
-            raise DoneTwice(f"says that {done.file} is done: its step was done already, in {earlier}")
-        self.running.pop(ident, None)
+            raise DoneTwice(f"says that {done.file} is done: its step was done already, in {earlier.file}")
+        self.running.pop((done.key, done.attempt), None)
         self.done[done.key] = self.files[done.file] = done
-        self._finished[ident] = done.file
 
     def _repair(self, repair: Repaired | Lost) -> None:
         self.repairs.append(repair)
@@ -176,14 +157,13 @@ class RunState:
         if step is None:
             return
         current = self.done.get(step.key) is step
-        self.held.pop(repair.file, None)
         if isinstance(repair, Repaired):
             step = step.model_copy(update={"sha256": repair.sha256, "counts": repair.counts})
             self.files[repair.file] = step
             if current:
                 self.done[step.key] = step
             return
-        del self.files[repair.file], self._finished[step.key, step.attempt]
+        del self.files[repair.file]
         if current:
             del self.done[step.key]
 
@@ -191,69 +171,3 @@ class RunState:
 def _next_serial(file: str) -> int:
     serial = serial_of(file)
     return 0 if serial is None else serial + 1
-
-
-@dataclass(slots=True)
-class Account:
-    """Everything read from a journal, with its faults."""
-
-    reading: Reading
-    lines: list[Line] = field(default_factory=list[Line])
-    """Lines that can be trusted and make sense, in the order in which they were written."""
-    state: RunState = field(default_factory=RunState)
-    faults: list[Fault] = field(default_factory=list[Fault])
-    """All problems, in the order of the file; every command uses this list."""
-    twice: list[Line] = field(default_factory=list[Line])
-    """`done` lines of steps that were done already."""
-
-
-def account(data: bytes, session: str = "") -> Account:
-    """Read the bytes of a journal and apply its events, those of `session` if it is given, to a new state."""
-    with _without_collection():
-        return _account(data, session)
-
-
-@contextmanager
-def _without_collection() -> Generator[None]:
-    """Within the block, cyclic garbage is not collected: of the many small objects of a long journal none is garbage,
-    and looking at all of them again and again takes more time than reading them."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-def _account(data: bytes, session: str) -> Account:
-    found = Account(read(data, session))
-    found.faults += found.reading.faults
-    for entry in found.reading.entries:
-        try:
-            found.state.apply(parse_event(entry.line))
-        except DoneTwice as error:
-            found.faults.append(Fault(entry.number, str(error)))
-            found.twice.append(entry.line)
-        except ValueError as error:
-            found.faults.append(Fault(entry.number, f"makes no sense: {error}"))
-        else:
-            found.lines.append(entry.line)
-    found.faults.sort(key=lambda fault: fault.number)
-    return found
-
-
-def replay(path: Path) -> RunState:
-    """State after all events of a journal. Raises `SessionDamaged` where anything in it is wrong."""
-    found = account(read_journal(path))
-    if found.faults:
-        more = f" (and {len(found.faults) - 1} more)" if len(found.faults) > 1 else ""
-        raise SessionDamaged(path, f"{found.faults[0]}{more}")
-    return found.state
-
-
-def read_header(folder: Path, state: RunState) -> Header:
-    """Header in the journal. Raises `SessionDamaged`."""
-    if state.opened is None:
-        raise SessionDamaged(folder / JOURNAL_NAME, "has no `open` event")
-    return state.opened.header

@@ -23,10 +23,10 @@ from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import Begin, CaptureResult, DipResult, Done, DrawResult, PressResult
 from brushloop.sessions.folders import check_name, recording_of_renamed
 from brushloop.sessions.history import remarks_of
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header
-from brushloop.sessions.run_state import KILLED, RunState, read_header, replay
+from brushloop.sessions.run_state import KILLED, RunState
 
 Cell = tuple[float | None, float | None]
 """H in mm and alpha in degrees; None where a recording does not state them."""
@@ -121,10 +121,10 @@ def _of_journal(folder: Path) -> Details:
     shown = _of_header(header, "open" if state.closed is None else "closed")
     shown.session_id = folder.name
     shown.processes = state.processes
-    shown.finished = dict(Counter(str(step.kind) for step in state.segments))
+    shown.finished = dict(Counter(str(step.kind) for step in state.files.values()))
     shown.void, shown.next = _cut(state)
     shown.messages = state.counts()
-    shown.segments = [_segment(folder, step) for step in state.segments]
+    shown.segments = [_segment(folder, step) for step in state.files.values()]
     patches: dict[int, list[int]] = {state.sheet: []}
     for sheet, patch in sorted(state.used_patches):
         patches.setdefault(sheet, []).append(patch)

@@ -35,11 +35,11 @@ from brushloop.sessions.events import (
     Void,
     line_of,
 )
-from brushloop.sessions.journal import JOURNAL_NAME, Journal
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, read_header, replay
 from brushloop.sessions.mcap_writer import SegmentWriter
 from brushloop.sessions.recording import merge_session
 from brushloop.sessions.records import Header
-from brushloop.sessions.run_state import RunState, read_header, replay
+from brushloop.sessions.run_state import RunState
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
@@ -186,7 +186,7 @@ class SessionStore:
     def verify(self) -> None:
         """Raise `SessionDamaged` naming the first finished step whose file is missing or has changed."""
         try:
-            for step in self.state.segments:
+            for step in self.state.files.values():
                 check_digest(self.folder / step.file, step.sha256)
         except SessionDamaged as error:
             error.add_note(f"Try `brushloop sessions repair {self.folder}`.")

@@ -1,4 +1,7 @@
-"""Check whether a session is as it was recorded: every file is read again in full, and all damage is described."""
+"""Judge a session: every file is read again in full, and every difference from what was recorded is described.
+
+`brushloop sessions verify` prints the verdict, and `repair` acts on it; judging changes nothing.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,17 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import SEGMENT_NAME, check_digest, holds
+from brushloop.sessions.disk import check_digest, holds
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
-from brushloop.sessions.events import Lost, Repaired
-from brushloop.sessions.evidence import Evidence, full_line, gather, line_words
+from brushloop.sessions.events import Begin, Closed, Done, Lost, Open, Repaired
+from brushloop.sessions.evidence import Evidence, gather, is_collected
 from brushloop.sessions.folders import check_name, not_a_session
-from brushloop.sessions.journal import JOURNAL_NAME, Line
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
-from brushloop.sessions.show import details
+from brushloop.sessions.show import details, step_words
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 
@@ -45,11 +48,21 @@ class Verdict:
     """Number of files read in full."""
     strokes: int = 0
     messages: int = 0
+    damaged: dict[str, str] = field(default_factory=dict[str, str])
+    """Files of finished steps that are missing or have changed, and how."""
 
     @property
     def sound(self) -> bool:
         """Whether nothing is damaged."""
         return not self.findings
+
+    def find(self, file: str, *problems: str) -> None:
+        """Add what is wrong with a file."""
+        self.findings += [Finding(file, what) for what in problems]
+
+    def problems(self, file: str) -> list[str]:
+        """What is wrong with a file."""
+        return [finding.what for finding in self.findings if finding.file == file]
 
 
 def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
@@ -62,177 +75,51 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
         return _verify_file(path, path.name, progress)
     if not path.is_dir():
         raise not_a_session(path)
-    name = path.resolve().name
-    collected = (path / JOURNAL_NAME).is_file() or any(SEGMENT_NAME.fullmatch(p.name) for p in path.glob("*.mcap*"))
-    if not collected:
-        final = path / f"{name}.mcap"
+    if not is_collected(path):
+        final = path / f"{path.resolve().name}.mcap"
         if not final.is_file():
             raise not_a_session(path)
-        return _verify_file(final, name, progress)
-    return _verify_folder(path.resolve(), progress)
-
-
-def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
-    verdict = Verdict(name, "recording", files=1)
-    found, problems = file_problems(path, progress)
-    if found.index is not None and HEADER_METADATA not in (one.name for one in found.index.metadata_indexes):
-        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_METADATA}")
-    verdict.findings += [Finding(path.name, problem) for problem in problems]
-    if not problems:
-        try:
-            Recording(path)
-        except SessionError as error:
-            verdict.findings.append(Finding(path.name, error.what))
-    _count(verdict, found.counts)
-    return verdict
-
-
-def _verify_folder(folder: Path, progress: Progress) -> Verdict:
-    verdict = Verdict(folder.name, "open")
+        return _verify_file(final, final.stem, progress)
     try:
-        evidence = gather(folder)
+        evidence = gather(path.resolve())
     except SessionDamaged as error:
-        verdict.findings.append(Finding(error.path.name, error.what))
-        return verdict
-    _journal(verdict, evidence)
-    state = evidence.state
-    for step in counted(state.segments, "files of steps read", len(state.segments), progress):
-        verdict.findings += _segment(verdict, evidence, full_line(step))
+        return Verdict(path.resolve().name, "open", [Finding(error.path.name, error.what)])
+    return judge(evidence, progress)
+
+
+def judge(evidence: Evidence, progress: Progress = unseen) -> Verdict:
+    """Judge a session's folder by its files and by what its journal must have said."""
+    folder, state = evidence.folder, evidence.state
+    verdict = Verdict(folder.name, "open" if state.closed is None else "closed")
+    _judge_journal(verdict, evidence)
+    for done in counted(list(state.files.values()), "files of steps read", len(state.files), progress):
+        _judge_step(verdict, evidence, done)
     for name, text in ({} if state.opened is None else state.opened.snapshots).items():
-        path = folder / str(name)
-        if not path.is_file():
-            verdict.findings.append(Finding(str(name), "is missing, though the journal holds its text"))
-        elif not holds(path, str(text).encode()):
-            verdict.findings.append(Finding(str(name), "has changed since the session was started"))
-    if state.closed is not None:
-        verdict.state = "closed"
-        _final(verdict, folder, evidence, progress)
-    elif (final := folder / f"{folder.name}.mcap").is_file():
-        # Left by an interrupted close, or by one whose line in the journal is lost.
-        verdict.files += 1
-        found, problems = file_problems(final)
-        verdict.findings += [Finding(final.name, problem) for problem in _foreign(found, evidence) or problems]
+        if not (folder / name).is_file():
+            verdict.find(name, "is missing, though the journal holds its text")
+        elif not holds(folder / name, text.encode()):
+            verdict.find(name, "has changed since the session was started")
+    _judge_final(verdict, evidence, progress)
     if verdict.sound:
-        _shown(verdict, folder)
+        _try_readers(verdict, folder)
     _count(verdict, Counter(state.counts() if state.closed is None else state.closed.counts))
     verdict.notes += [f"{repair.file}: {_repair_words(repair)}" for repair in state.repairs]
-    kept = [p for p in folder.iterdir() if ".damaged-" in p.name or ".superseded-" in p.name]
+    kept = [path for path in folder.iterdir() if ".damaged-" in path.name or ".superseded-" in path.name]
     if kept:
         verdict.notes.append(f"{len(kept)} damaged or replaced files are kept beside the session's own")
     return verdict
 
 
-def _count(verdict: Verdict, counts: Counter[str]) -> None:
-    verdict.strokes, verdict.messages = counts[Topic.STROKE], counts.total()
-
-
-def _repair_words(repair: Repaired | Lost) -> str:
-    if isinstance(repair, Lost):
-        return f"was lost: {repair.why}"
-    missing = ", ".join(f"{count} of {topic}" for topic, count in repair.missing.items())
-    return f"was repaired; missing: {missing or 'nothing'}"
-
-
-def _shown(verdict: Verdict, folder: Path) -> None:
-    """Report as damage any error that `show` or a reader raises."""
-    try:
-        details(folder)
-        if verdict.state == "closed":
-            Recording(folder)
-    except (InputError, SessionDamaged) as error:
-        verdict.findings.append(Finding(error.path.name, error.what))
-
-
-def _journal(verdict: Verdict, evidence: Evidence) -> None:
-    verdict.findings += [Finding(JOURNAL_NAME, str(fault)) for fault in evidence.faults]
-    if evidence.lost:
-        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines cannot be rebuilt")
-    elif evidence.faults:
-        verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
-    if evidence.data is None:
-        verdict.findings.append(Finding(JOURNAL_NAME, "is missing, though the folder holds recordings"))
-    if evidence.torn:
-        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
-    for line in evidence.rebuilt:
-        match line["event"]:
-            case "begin":
-                verdict.findings.append(Finding(JOURNAL_NAME, f"does not mention {line['file']}"))
-            case "done":
-                verdict.notes.append(f"{line['file']}: {line_words(line)} is finished, but not journalled as done")
-            case "closed":
-                verdict.notes.append(f"{line['file']} is complete, but not journalled as closed")
-            case _:
-                verdict.findings.append(Finding(JOURNAL_NAME, "does not say how the session was opened"))
-    for name in evidence.strays:
-        verdict.findings.append(Finding(name, "holds a step that the journal lists under another file"))
-    for name, session in evidence.foreign.items():
-        verdict.findings.append(Finding(name, f"is of another session, {session[:100]!r}"))
-    for name in evidence.doubtful:
-        verdict.findings.append(Finding(name, "the patch and the sheet that it pressed are unknown"))
-
-
-def _segment(verdict: Verdict, evidence: Evidence, line: Line) -> list[Finding]:
-    path, step = evidence.folder / str(line["file"]), line_words(line)
-    if line["file"] in evidence.state.held:
-        return []
-    verdict.files += 1
-    try:
-        check_digest(path, str(line["sha256"]))
-    except SessionDamaged as error:
-        if not path.is_file():
-            return [Finding(path.name, f"({step}) {error.what}")]
-        found, problems = file_problems(path)
-        problems = _foreign(found, evidence) or problems
-        lost = Counter[str](line["counts"]) - found.counts
-        words = ", ".join(f"{count} of {topic}" for topic, count in lost.items()) or "none"
-        why = "; ".join(problems) or error.what
-        return [Finding(path.name, f"({step}) {why}; messages lost: {words}")]
-    # The merged file holds the same messages, so they are decoded only there.
-    found, problems = file_problems(path, decode=evidence.state.closed is None)
-    if dict(found.counts) != line["counts"]:
-        problems.append(f"holds {dict(found.counts)}, but the journal says {line['counts']}")
-    return [Finding(path.name, f"({step}) {problem}") for problem in problems]
-
-
-def _foreign(found: McapFile, evidence: Evidence) -> list[str]:
-    """What is wrong with a file of another session: nothing in it is evidence."""
-    session = found.session
-    return [] if session in ("", evidence.session) else [f"is of another session, {session[:100]!r}"]
-
-
-def _final(verdict: Verdict, folder: Path, evidence: Evidence, progress: Progress) -> None:
-    state = evidence.state
-    closed = state.closed
-    assert closed is not None
-    path = folder / f"{folder.name}.mcap"
-    verdict.files += 1
-    try:
-        check_digest(path, closed.sha256)
-    except SessionDamaged as error:
-        verdict.findings.append(Finding(path.name, error.what))
-    if not path.is_file():
-        return
-    found, problems = file_problems(path, progress)
-    problems = _foreign(found, evidence) or problems
-    expected = closed.counts
-    if dict(found.counts) != expected and not problems:
-        problems.append(f"holds {dict(found.counts)}, but the journal says {expected}")
-    verdict.findings += [Finding(path.name, problem) for problem in problems]
-
-
-def file_problems(path: Path, progress: Progress = unseen, *, decode: bool = True) -> tuple[McapFile, list[str]]:
-    """Read a file in full and list what is wrong with its chunks, its index, its photographs and its strokes.
-
-    Without `decode`, photographs and strokes are only checked by their CRC.
-    """
-    found = scan(path)
-    problems = list(found.damage)
+def content_problems(found: McapFile, progress: Progress = unseen) -> list[str]:
+    """Decode the photographs and the strokes of a file, and list what is wrong with them."""
+    problems: list[str] = []
     stills: set[int] = set()
     strokes: set[str] = set()
+    name = found.path.name
     try:
-        for _schema, channel, message in found.messages((Topic.STILL, Topic.STROKE) if decode else ()):
+        for _schema, channel, message in found.messages(topics=(Topic.STILL, Topic.STROKE)):
             if channel.topic == Topic.STILL:
-                progress(f"{path.name}: photographs decoded", len(stills), found.counts[Topic.STILL])
+                progress(f"{name}: photographs decoded", len(stills), found.counts[Topic.STILL])
                 decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
                 stills.add(message.sequence)
                 continue
@@ -248,4 +135,109 @@ def file_problems(path: Path, progress: Progress = unseen, *, decode: bool = Tru
         problems.append(f"a message does not fit its schema ({type(error).__name__})")
     except OSError as error:
         problems.append(f"cannot be read: {error.strerror}")
-    return found, problems
+    return problems
+
+
+def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
+    verdict = Verdict(name, "recording", files=1)
+    found = scan(path)
+    if found.index is not None and HEADER_METADATA not in (one.name for one in found.index.metadata_indexes):
+        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_METADATA}")
+    verdict.find(path.name, *found.damage, *content_problems(found, progress))
+    if verdict.sound:
+        try:
+            Recording(path)
+        except SessionError as error:
+            verdict.find(path.name, error.what)
+    _count(verdict, found.counts)
+    return verdict
+
+
+def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
+    verdict.find(JOURNAL_NAME, *(str(fault) for fault in evidence.reading.faults))
+    if evidence.lost:
+        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines cannot be rebuilt")
+    elif evidence.reading.faults:
+        verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
+    if not evidence.has_journal:
+        verdict.find(JOURNAL_NAME, "is missing, though the folder holds recordings")
+    if evidence.reading.torn:
+        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
+    for event in evidence.rebuilt:
+        match event:
+            case Begin(file=file):
+                verdict.find(JOURNAL_NAME, f"does not mention {file}")
+            case Done(file=file):
+                verdict.notes.append(f"{file}: {step_words(event)} is finished, but not journalled as done")
+            case Closed(file=file):
+                verdict.notes.append(f"{file} is complete, but not journalled as closed")
+            case Open():
+                verdict.find(JOURNAL_NAME, "does not say how the session was opened")
+            case _:
+                pass
+    for name, what in evidence.strays.items():
+        verdict.find(name, what)
+    for name in evidence.doubtful:
+        verdict.find(name, "the patch and the sheet that it pressed are unknown")
+
+
+def _judge_step(verdict: Verdict, evidence: Evidence, done: Done) -> None:
+    found = evidence.files.get(done.file)
+    verdict.files += 1
+    # The merged file holds the same messages, so they are decoded only there.
+    problems = [] if found is None else _problems(evidence, found, decode=evidence.state.closed is None)
+    if changed := _changed(evidence.folder / done.file, done.sha256):
+        why = verdict.damaged[done.file] = "; ".join(problems) or changed
+        lost = Counter[str]() if found is None else Counter(done.counts) - found.counts
+        words = ", ".join(f"{count} of {topic}" for topic, count in lost.items()) or "none"
+        problems = [why if found is None else f"{why}; messages lost: {words}"]
+    elif found is not None and dict(found.counts) != done.counts:
+        problems.append(f"holds {dict(found.counts)}, but the journal says {done.counts}")
+    verdict.find(done.file, *(f"({step_words(done)}) {problem}" for problem in problems))
+
+
+def _judge_final(verdict: Verdict, evidence: Evidence, progress: Progress) -> None:
+    """Judge the merged file; that of an open session was left by a close that was cut off or is not in the journal."""
+    found, closed = evidence.files.get(evidence.final.name), evidence.state.closed
+    verdict.files += closed is not None or found is not None
+    if closed is not None and (changed := _changed(evidence.final, closed.sha256)):
+        verdict.find(evidence.final.name, changed)
+    if found is not None:
+        problems = _problems(evidence, found, progress)
+        if closed is not None and not problems and dict(found.counts) != closed.counts:
+            problems = [f"holds {dict(found.counts)}, but the journal says {closed.counts}"]
+        verdict.find(evidence.final.name, *problems)
+
+
+def _problems(evidence: Evidence, found: McapFile, progress: Progress = unseen, *, decode: bool = True) -> list[str]:
+    """What is wrong with the content of a file; nothing in one of another session is evidence."""
+    return evidence.foreign(found) or [*found.damage, *(content_problems(found, progress) if decode else ())]
+
+
+def _changed(path: Path, sha256: str) -> str:
+    try:
+        check_digest(path, sha256)
+    except SessionDamaged as error:
+        return error.what
+    return ""
+
+
+def _try_readers(verdict: Verdict, folder: Path) -> None:
+    """Report as damage any error that `show` or a reader raises."""
+    try:
+        details(folder)
+        if verdict.state == "closed":
+            Recording(folder)
+    except (InputError, SessionDamaged) as error:
+        verdict.find(error.path.name, error.what)
+
+
+def _count(verdict: Verdict, counts: Counter[str]) -> None:
+    verdict.strokes, verdict.messages = counts[Topic.STROKE], counts.total()
+
+
+def _repair_words(repair: Repaired | Lost) -> str:
+    if isinstance(repair, Lost):
+        return f"was lost: {repair.why}"
+    missing = ", ".join(f"{count} of {topic}" for topic, count in repair.missing.items())
+    return f"was repaired; missing: {missing or 'nothing'}"

@@ -19,9 +19,9 @@ from mcap.reader import make_reader
 from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.report.tables import table_1
-from brushloop.sessions.journal import read_lines
+from brushloop.sessions.journal import replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.run_state import replay
+from tests.journal_lines import read_lines
 from tests.waiting import wait_until
 
 SMALL = """

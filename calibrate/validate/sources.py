@@ -27,10 +27,9 @@ from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.session import calibration_of
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Source, Stroke
-from brushloop.sessions.run_state import replay
 
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3

@@ -44,8 +44,7 @@ from brushloop.collect.rig.devices import Rig, connected
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.run_state import replay
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.store import SessionStore
 
 PARKED_MM = 2.0

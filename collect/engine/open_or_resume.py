@@ -25,9 +25,8 @@ from brushloop.sessions.difference import ABSENT, Difference, differences
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unwritable
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.folders import next_session_id, open_sessions
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Header, Source
-from brushloop.sessions.run_state import replay
 from brushloop.sessions.store import SessionStore, Snapshots
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"

@@ -23,13 +23,12 @@ from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
-from brushloop.sessions.events import CaptureResult
-from brushloop.sessions.history import Remark, remarks_of, unlike, waits_of
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.events import CaptureResult, Remark
+from brushloop.sessions.history import remarks_of, unlike, waits_of
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.records import Check, Quality, Stroke, Topic
-from brushloop.sessions.run_state import replay
 
 if TYPE_CHECKING:
     import numpy as np
@@ -121,7 +120,7 @@ class Review:
                 result.press.dip_to_touch_s,
                 odd.get(result.still, ""),
             )
-            for step in state.segments
+            for step in state.files.values()
             if isinstance(result := step.result, CaptureResult)
         )
 

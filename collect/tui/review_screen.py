@@ -24,7 +24,8 @@ from brushloop.collect.tui.pictures import Pictures, binary_picture
 from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain
 from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.history import Remark, add_remark
+from brushloop.sessions.events import Remark
+from brushloop.sessions.history import add_remark
 
 KEYS = (
     ("escape", "back"),
@@ -192,7 +193,10 @@ class ReviewScreen(Screen[None]):
         if capture is None:
             return
         try:
-            add_remark(self._review.folder, Remark(capture.still, capture.stroke_id, bad, note, self._now_ns()))
+            add_remark(
+                self._review.folder,
+                Remark(t_ns=self._now_ns(), still=capture.still, stroke_id=capture.stroke_id, bad=bad, note=note),
+            )
             self._review.read()
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")

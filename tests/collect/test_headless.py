@@ -12,9 +12,8 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.headless import eta_text
 from brushloop.drivers.sim.faults.phases import Phase
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.run_state import replay
 from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
 

@@ -23,11 +23,11 @@ import pytest
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.events import CaptureResult
-from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
-from brushloop.sessions.run_state import replay
 from brushloop.sessions.verify import verify_session
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -192,7 +192,7 @@ def check_nothing_was_taken_back(lab: Lab, finished: dict[str, str]) -> None:
     if path is None:
         assert not finished
         return
-    now = {step.file: step.sha256 for step in replay(path).segments}
+    now = {step.file: step.sha256 for step in replay(path).files.values()}
     assert finished.items() <= now.items()
     assert {name: file_sha256(path.parent / name) for name in now} == now
     finished.update(now)
@@ -212,7 +212,7 @@ def check(lab: Lab, toll: Toll, presses_before: int) -> None:
 
     verdict = verify_session(path.parent)
     assert verdict.sound, verdict.findings
-    assert verdict.files == len(state.segments) + 1
+    assert verdict.files == len(state.files) + 1
     recording = Recording(path.parent)
     strokes = [capture.stroke for capture in recording.captures() if capture.image().size]
     assert sorted(stroke.stroke_id for stroke in strokes) == wanted

@@ -19,11 +19,12 @@ from mcap.reader import make_reader
 
 from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, PressResult, StepKind, StepResult
 from brushloop.sessions.imports import ImportOptions, import_photographs
-from brushloop.sessions.journal import JOURNAL_NAME, encode_line, read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, encode_line
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
 from brushloop.sessions.store import SessionStore
+from tests.journal_lines import read_lines
 
 BOARD = BoardResult(still=1000, corners=54, mm_per_px=0.05, rms_px=0.1, size_px=(24, 24), sheet_px=())
 

@@ -3,13 +3,14 @@
 import errno
 import json
 import os
+import re
 
 import pytest
 
 from brushloop.sessions.errors import SessionDamaged, SessionError
 from brushloop.sessions.events import Condition
-from brushloop.sessions.journal import Journal, encode_line, read, read_lines
-from brushloop.sessions.run_state import replay
+from brushloop.sessions.journal import Journal, encode_line, read, replay
+from tests.journal_lines import read_lines
 
 BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "patch": 4, "file": "0000-k1.mcap"}
 DONE = {
@@ -98,13 +99,10 @@ WRONG = "line 5 does not match its CRC"
         (lambda a: [*a[:4], *a[7:]], ["line 5 comes after 3 lines that are missing"]),
         (lambda a: a[1:], ["line 1 comes after a line that is missing"]),
         (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 stands twice: it is line 5"]),
-        (lambda a: [*a[:4], a[5], a[4], *a[6:]], ["line 6 is out of place: it was written as line 5"]),
+        (lambda a: [*a[:4], a[5], a[4], *a[6:]], ["line 5 is out of place: it was written as line 6 (and 1 more)"]),
         (
             lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
-            [
-                "line 4 is out of place: it was written as line 10",
-                "line 10 is out of place: it was written as line 4",
-            ],
+            ["line 4 is out of place: it was written as line 10 (and 1 more)"],
         ),
         (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'"]),
         (lambda a: [*a[:4], b"{oops\n", *a[5:]], [WRONG]),
@@ -134,7 +132,7 @@ def test_what_happened_to_lines_is_named(path, change, expected):
     path.write_bytes(b"".join(change(LINES)))
     assert [str(fault) for fault in read(path.read_bytes()).faults] == expected
     if expected:
-        with pytest.raises(SessionDamaged, match=expected[0]) as caught:
+        with pytest.raises(SessionDamaged, match=re.escape(expected[0])) as caught:
             replay(path)
         assert caught.value.path == path
 

@@ -11,13 +11,14 @@ from brushloop.sessions import mcap_writer, salvage
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
 from brushloop.sessions.events import StepKind
-from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
 from brushloop.sessions.repair import repair_session
 from brushloop.sessions.show import details
 from brushloop.sessions.store import SessionStore
 from brushloop.sessions.verify import verify_session
+from tests.journal_lines import read_lines
 
 
 @pytest.fixture

@@ -16,10 +16,11 @@ import pytest
 from brushloop.sessions import disk
 from brushloop.sessions.errors import DiskFull, SessionError
 from brushloop.sessions.events import PressResult, StepKind
-from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import STEP_BYTES, SessionStore
 from brushloop.sessions.verify import verify_session
+from tests.journal_lines import read_lines
 from tests.waiting import PATIENCE_S
 
 Usage = namedtuple("Usage", "total used free")

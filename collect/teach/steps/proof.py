@@ -22,8 +22,7 @@ from brushloop.collect.teach.rig_text import rig_of, rig_text
 from brushloop.collect.teach.store import Notebook, StepName
 from brushloop.drivers.cancellation import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
-from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.run_state import replay
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 
 ABOVE_MM = 30.0
 SLOW_MM_S = 45.0

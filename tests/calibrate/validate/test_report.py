@@ -24,7 +24,8 @@ from brushloop.calibrate.validate.report.findings import trust
 from brushloop.calibrate.validate.report.outputs import COLUMNS, score_rows
 from brushloop.calibrate.validate.report.page import _of_session
 from brushloop.calibrate.validate.run import Outcome
-from brushloop.sessions.history import Remark, add_remark
+from brushloop.sessions.events import Remark
+from brushloop.sessions.history import add_remark
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.browser import BROWSER, content_widths_px
@@ -206,13 +207,13 @@ def test_a_capture_that_a_person_marked_bad_is_left_out_by_name(session: Path, t
     shutil.copytree(session, marked)
     still = next(stroke.still for stroke in Recording(marked).stroke_records() if stroke.stroke_id == "003")
     run(marked, "--out", tmp_path / "before", "--model", "line", "--no-held-out")
-    add_remark(marked, Remark(still, "003", bad=True, note="<b>hair</b> in it"))
+    add_remark(marked, Remark(t_ns=1, still=still, stroke_id="003", bad=True, note="<b>hair</b> in it"))
     for out in ("before", "after"):  # also where the work of before is still there
         run(marked, "--out", tmp_path / out, "--model", "line", "--no-held-out")
         reasons = {one.stroke_id: one.why for one in load_report(tmp_path / out / "report.json").refused}
         assert reasons["003"] == "was marked bad: <b>hair</b> in it"
         assert "&lt;b&gt;hair" in (tmp_path / out / "report.html").read_text()
-    add_remark(marked, Remark(still, "003"))
+    add_remark(marked, Remark(t_ns=2, still=still, stroke_id="003"))
     run(marked, "--out", tmp_path / "after", "--model", "line", "--no-held-out")
     assert "003" not in {one.stroke_id for one in load_report(tmp_path / "after" / "report.json").refused}
 

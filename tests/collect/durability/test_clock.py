@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import the_session
 from tests.collect.until import until, wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Lab

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from brushloop.sessions.journal import JOURNAL_NAME, read_lines
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.run_state import replay
 from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import Disk, parked, the_session
 from tests.command import brushloop
+from tests.journal_lines import read_lines
 from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
@@ -38,12 +38,12 @@ def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_c
     assert "No space left on device" in stderr.splitlines()[-1] or "make room" in stderr.splitlines()[-1]
     assert parked(lab)
     folder = the_session(lab)
-    finished = {(step.file, step.sha256) for step in replay(folder / JOURNAL_NAME).segments}
+    finished = {(step.file, step.sha256) for step in replay(folder / JOURNAL_NAME).files.values()}
 
     assert run(lab)[0] == 4, "there is no more room than before"
     disk.make_room()
     assert run(lab)[0] == 0
-    assert finished <= {(step.file, step.sha256) for step in replay(folder / JOURNAL_NAME).segments}
+    assert finished <= {(step.file, step.sha256) for step in replay(folder / JOURNAL_NAME).files.values()}
     assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 2
     begun = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == "begin"]
     patches = [line["patch"] for line in begun if "patch" in line]

@@ -17,12 +17,12 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.drivers.samples import Pose
-from brushloop.sessions.journal import read_lines
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic
 from tests.collect.sent import noting
 from tests.collect.until import wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,10 +16,10 @@ from brushloop.drivers.arcs.codes import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
 from brushloop.drivers.samples import Identity
 from brushloop.sessions.events import CaptureResult
-from brushloop.sessions.journal import read_lines
+from brushloop.sessions.journal import replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.run_state import replay
 from tests.collect.until import until, wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from conftest import Collected, Lab
@@ -215,7 +215,7 @@ def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
     engine = lab.engine(armed=True)
     run(engine)
     assert any(UNCHECKED in line for line in engine.snapshot().messages)
-    assert "self_check" not in {step.kind for step in replay(next(lab.sessions.glob("*/journal.jsonl"))).segments}
+    assert "self_check" not in {step.kind for step in replay(next(lab.sessions.glob("*/journal.jsonl"))).files.values()}
 
 
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,8 @@ from brushloop.collect.quality.checks import check_drawing
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.drivers.sim.brush.flaws import Flaw
 from brushloop.sessions.events import DrawResult
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.run_state import replay
 from tests.collect.until import until, wait_for_end
 from tests.waiting import wait_until
 

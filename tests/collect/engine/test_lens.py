@@ -16,12 +16,12 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
-from brushloop.sessions.journal import read_lines
+from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
-from brushloop.sessions.run_state import replay
 from tests.collect.until import wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from conftest import Lab

@@ -17,10 +17,10 @@ from brushloop.collect.protocols.steps import Step, StepKind, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.events import StepResult
 from brushloop.sessions.history import mark_bad_or_good
-from brushloop.sessions.journal import read_lines
 from brushloop.sessions.recording import Recording
 from tests.collect.conftest import Lab
 from tests.collect.until import until, wait_for_end
+from tests.journal_lines import read_lines
 from tests.waiting import wait_until
 
 

@@ -14,8 +14,8 @@ from brushloop.drivers.arcs.rpc import RpcConnection
 from brushloop.drivers.arcs.waiting import Tolerance, until_settled
 from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
-from brushloop.sessions.journal import read_lines
 from tests.collect.until import until, wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from conftest import Lab

@@ -13,8 +13,8 @@ from brushloop.collect.engine.steps import capture as capturing
 from brushloop.collect.engine.steps.context import meanwhile
 from brushloop.collect.errors import BadPicture, CollectAborted
 from brushloop.collect.motion.procedures import Procedures
-from brushloop.sessions.journal import read_lines
 from tests.collect.until import until, wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from conftest import Lab

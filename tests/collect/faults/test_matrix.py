@@ -31,11 +31,11 @@ from brushloop.drivers.geometry import distance
 from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.faults.kinds import ALWAYS, Fault
 from brushloop.drivers.sim.faults.phases import Phase
-from brushloop.sessions.journal import read_lines
-from brushloop.sessions.run_state import replay
+from brushloop.sessions.journal import replay
 from brushloop.sessions.store import SessionStore
 from tests.collect.faults.conftest import CAMERA_TIMEOUT_S
 from tests.collect.until import wait_for_end
+from tests.journal_lines import read_lines
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.drivers.sim.faults.phases import Phase
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.journal import read_lines
+from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_writer import McapWriter
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.run_state import replay
 from tests.collect.until import wait_for_end
+from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
     from conftest import Stage

@@ -13,7 +13,7 @@ from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.sessions.history import Remark
+from brushloop.sessions.events import Remark
 from brushloop.sessions.show import Details, Sheet, Summary
 from tests.collect.tui.fake import blot
 
@@ -87,7 +87,7 @@ class FakeReview(Review):
 
     def read(self) -> None:
         self.open = False
-        bad = Remark(7, "H13-a0-r02", True, "smudged, 墨 ran", 1)
+        bad = Remark(t_ns=1, still=7, stroke_id="H13-a0-r02", bad=True, note="smudged, 墨 ran")
         self.captures = (
             ReviewCapture("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None, 1.24),
             ReviewCapture("H13-a0-r02", 13.0, 0.0, 7, True, "", "0007-capture-b.mcap", bad),
