@@ -18,7 +18,7 @@ import threading
 import time
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import IO, TYPE_CHECKING, Any, Protocol
@@ -39,7 +39,6 @@ from mcap.records import (
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 from mcap.records import Header as FileHeader
 from mcap.writer import MCAP0_MAGIC
@@ -69,7 +68,6 @@ QUEUE_LIMIT = 20_000
 NUMBERS = {topic: number for number, topic in enumerate(Topic, 1)}
 """A topic has the same number in every file, so that a merge can copy chunks as they are."""
 _INDEX_START = struct.Struct("<BQHI")
-_MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 
 
 class _Writable(Protocol):
@@ -220,26 +218,23 @@ class McapWriter:
         self._end_chunk()
         self._write(_packed(DataEnd(self._crc)))
         start = self._file.tell()
-        groups: list[tuple[Opcode, Iterable[_Writable]]] = [
-            (Opcode.SCHEMA, self.schemas.values()),
-            (Opcode.CHANNEL, self.channels.values()),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
-        ]
-        summary = bytearray()
-        offsets: list[SummaryOffset] = []
-        for opcode, records in groups:
-            begin = len(summary)
-            for record in records:
-                summary += _packed(record)
-            offsets.append(SummaryOffset(opcode, start + begin, len(summary) - begin))
-        offsets_start = start + len(summary)
-        summary += b"".join(map(_packed, offsets))
-        footer = _packed(Footer(start, offsets_start, 0))[:-4]  # its CRC covers all but itself
-        self._write(summary)
-        self._write(_packed(Footer(start, offsets_start, zlib.crc32(footer, zlib.crc32(summary)))))
+        statistics = Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=self._counts.total(),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self.schemas),
+        )
+        summary: list[_Writable] = [*self.schemas.values(), *self.channels.values(), statistics]
+        summary += [*self._chunks, *self._attachments, *self._metadata]
+        data = b"".join(map(_packed, summary))
+        footer = _packed(Footer(start, 0, 0))[:-4]  # its CRC covers all but itself
+        self._write(data)
+        self._write(_packed(Footer(start, 0, zlib.crc32(footer, zlib.crc32(data)))))
         self._write(MCAP0_MAGIC)
 
     def _number(self, schema: Schema | None, channel: Channel) -> int:
@@ -264,19 +259,6 @@ class McapWriter:
         start = index.chunk_start_offset + shift
         self._chunks.append(replace(index, chunk_start_offset=start, message_index_offsets=offsets))
         self._counts.update(counts)
-
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
-            message_count=self._counts.total(),
-            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
-            metadata_count=len(self._metadata),
-            schema_count=len(self.schemas),
-        )
 
     def _end_chunk(self) -> None:
         if not self._index:
@@ -338,7 +320,8 @@ def new_mcap(
     with path.open("xb") as file:
         writer = start_mcap(file, header, notes)
         for name, data in attachments.items():
-            writer.add_attachment(name, _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream"), data)
+            media_type = {".toml": "application/toml", ".json": "application/json"}.get(PurePath(name).suffix)
+            writer.add_attachment(name, media_type or "application/octet-stream", data)
         yield writer
         writer.finish()
         sync(file)

@@ -21,7 +21,13 @@ BARE = Channel(2, "/bare", "", {}, 0)
 
 
 def theirs(file):
-    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer = Writer(
+        file,
+        chunk_size=CHUNK_BYTES,
+        compression=CompressionType.ZSTD,
+        enable_data_crcs=True,
+        use_summary_offsets=False,
+    )
     writer.start(profile="", library="test")
 
     def add_channel(schema, channel):
