@@ -38,7 +38,7 @@ from brushloop.sessions.events import (
 from brushloop.sessions.journal import JOURNAL_NAME, Fault, Reading, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.recording import parse_header
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_METADATA, Header, Topic
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, Header, Topic
 from brushloop.sessions.run_state import DoneTwice, RunState
 from brushloop.sessions.show import step_words
 from brushloop.sessions.store import closed
@@ -254,9 +254,9 @@ def _header(evidence: Evidence) -> Header:
         if header.session_id == evidence.session:
             return header
     final = evidence.files.get(evidence.final.name)
-    if final is None or HEADER_METADATA not in final.metadata:
+    if final is None or final.header is None:
         raise SessionDamaged(evidence.folder / JOURNAL_NAME, "has no `open` event, and no file holds its header")
-    return parse_header(evidence.final, final.metadata[HEADER_METADATA])
+    return parse_header(final)
 
 
 def _snapshots(folder: Path) -> dict[str, str]:

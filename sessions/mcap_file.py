@@ -35,7 +35,7 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.records import HEADER_METADATA, header_crc, read_note, session_in
+from brushloop.sessions.records import HEADER_NOTE, NOTES, read_note
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 """Largest record, chunk or index that is read: a chunk is 512 KiB plus one message, the largest image allowed."""
@@ -90,9 +90,10 @@ class McapFile:
         """Messages by topic in the sound chunks, once `check` has read them."""
         self.channels: Channels = {}
         """Channels by number, each with its schema; without an index those that `check` found."""
-        self.metadata: dict[str, dict[str, str]] = {}
         self.notes: dict[str, dict[str, Any]] = {}
-        """Our own notes (`brushloop.begin`, ...) that match their CRC."""
+        """Our own notes (`brushloop.header`, ...) that match their CRC."""
+        self.header: dict[str, Any] | None = None
+        """Values of the header, also where they do not match their CRC; None for a file without a header."""
         self._attached: list[int] = []
         self._data_end = 0
         with opened(path) as file:
@@ -116,7 +117,7 @@ class McapFile:
     @property
     def session(self) -> str:
         """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
-        return session_in(self.metadata.get(HEADER_METADATA, {}))
+        return str(self.notes.get(HEADER_NOTE, {}).get("session_id", ""))
 
     def may_hold(self, part: Part, topics: Container[str]) -> bool:
         """Whether a chunk holds messages on any of these topics; True also where its index does not say."""
@@ -255,16 +256,14 @@ class McapFile:
     def _add_metadata(self, file: IO[bytes], offset: int) -> None:
         try:
             record = Metadata.read(_stream(_record(file, offset, Opcode.METADATA)))
-            self.metadata[record.name] = record.metadata
-            if record.name == HEADER_METADATA:
-                if record.metadata.get("crc", "") not in ("", header_crc(record.metadata)):
-                    self.damage.append("its header does not match its CRC")
-            elif "crc" in record.metadata:
-                values = read_note(record.metadata)
-                if values is None:
-                    self.damage.append(f"its note {record.name!r} does not match its CRC")
-                else:
-                    self.notes[record.name] = values
+            if record.name not in NOTES:
+                return
+            values, sound = read_note(record.metadata)
+            if sound:
+                self.notes[record.name] = values
+            else:
+                self.damage.append(f"its note {record.name!r} does not match its CRC")
+            self.header = values if record.name == HEADER_NOTE else self.header
         except UNREADABLE as error:
             self._add_damage("metadata", offset, error)
 

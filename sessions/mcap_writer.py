@@ -49,12 +49,11 @@ from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, open_mcap
 from brushloop.sessions.records import (
     BEGIN_NOTE,
     DONE_NOTE,
-    HEADER_METADATA,
+    HEADER_NOTE,
     Event,
     Header,
     Recorded,
     Topic,
-    header_metadata,
     note,
 )
 
@@ -306,8 +305,7 @@ def _packed(record: _Writable) -> bytes:
 def start_mcap(file: IO[bytes], header: Header, notes: Mapping[str, Mapping[str, Any]]) -> McapWriter:
     """Begin an MCAP file with the session's header and notes."""
     writer = McapWriter(file, header.software)
-    writer.add_metadata(HEADER_METADATA, header_metadata(header))
-    for name, values in notes.items():
+    for name, values in {HEADER_NOTE: header.model_dump(mode="json"), **notes}.items():
         writer.add_metadata(name, note(values))
     return writer
 

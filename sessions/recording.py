@@ -5,12 +5,11 @@ Photographs are read one at a time.
 
 from __future__ import annotations
 
-import json
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
@@ -31,7 +30,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.records import HEADER_METADATA, Event, Header, StepEvent, Stroke, Topic
+from brushloop.sessions.records import REPAIRS_NOTE, Event, Header, StepEvent, Stroke, Topic
 from brushloop.sessions.run_state import RunState
 
 if TYPE_CHECKING:
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _E = TypeVar("_E", bound=Event)
-REPAIRS_NOTE = "brushloop.repairs"
-"""Note in a merged file whose session was repaired: what was rewritten, what is missing, and what was lost."""
 MAX_ATTACHMENT_BYTES = 1024 * 1024
 STILLS_KEPT = 8
 """Stills kept in memory: a stroke refers to one shortly before it, so older ones can be dropped."""
@@ -67,7 +64,7 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self.path = _find_mcap(path)
         self._file = open_mcap(self.path)
-        self.header = _read_header(self._file)
+        self.header = parse_header(self._file)
 
     @property
     def sha256(self) -> str:
@@ -170,21 +167,14 @@ def _find_mcap(path: Path) -> Path:
     return merged
 
 
-def _read_header(file: McapFile) -> Header:
-    if HEADER_METADATA not in file.metadata:
+def parse_header(file: McapFile) -> Header:
+    """Header of a file; its CRC is not checked. Raises `InputError` where it has none, `SessionDamaged`."""
+    if file.header is None:
         raise InputError(file.path, "is an MCAP file without brushloop's header")
-    return parse_header(file.path, file.metadata[HEADER_METADATA])
-
-
-def parse_header(path: Path, metadata: dict[str, str]) -> Header:
-    """Header from its metadata record; its CRC is not checked. Raises `SessionDamaged`."""
     try:
-        values: dict[str, Any] = {name: json.loads(text) for name, text in metadata.items() if name != "crc"}
-        return Header.model_validate(values, strict=False)
+        return Header.model_validate(file.header, strict=False)
     except ValidationError as error:
-        raise SessionDamaged(path, _first_error(Header, error)) from None
-    except (ValueError, RecursionError) as error:
-        raise SessionDamaged(path, f"header cannot be read: {in_one_line(error)}") from None
+        raise SessionDamaged(file.path, _first_error(Header, error)) from None
 
 
 def _still(path: Path, data: bytes) -> bytes:

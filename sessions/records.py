@@ -10,16 +10,19 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from brushloop.sessions.disk import bare_name
 
 SCHEMA_VERSION = 1
-HEADER_METADATA = "brushloop.header"
+HEADER_NOTE = "brushloop.header"
 BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"
 """Notes of a step's file: the journal's lines about it, so that a lost journal can be rebuilt."""
+REPAIRS_NOTE = "brushloop.repairs"
+"""Note in a merged file whose session was repaired: what was rewritten, what is missing, and what was lost."""
+NOTES = (HEADER_NOTE, BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE)
 
 
 def _bare_or_empty(value: str) -> str:
@@ -218,39 +221,17 @@ class Recorded:
     size_bytes: int
 
 
-def header_metadata(header: Header) -> dict[str, str]:
-    """Header as MCAP metadata: every value as JSON, so that it reads back unchanged, and a CRC, which MCAP lacks."""
-    values = {name: json.dumps(value) for name, value in header.model_dump(mode="json").items()}
-    return {**values, "crc": header_crc(values)}
-
-
-def header_crc(values: dict[str, str]) -> str:
-    """CRC-32 of a header's metadata, without `crc` itself."""
-    texts = {name: text for name, text in values.items() if name != "crc"}
-    return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"
-
-
-def session_in(metadata: dict[str, str]) -> str:
-    """Id of the session in a header's metadata; empty where it does not match its CRC."""
-    try:
-        session = json.loads(metadata.get("session_id", '""'))
-    except (ValueError, RecursionError):
-        return ""
-    return session if isinstance(session, str) and metadata.get("crc") == header_crc(metadata) else ""
-
-
 def note(values: Mapping[str, Any]) -> dict[str, str]:
-    """Values as MCAP metadata with a CRC."""
-    text = json.dumps(values, separators=(",", ":"), allow_nan=False)
-    return {"json": text, "crc": f"{zlib.crc32(text.encode()):08x}"}
+    """Values as MCAP metadata: each as JSON, so that it reads back unchanged, and a CRC, which MCAP lacks."""
+    texts = {name: json.dumps(value, separators=(",", ":"), allow_nan=False) for name, value in values.items()}
+    return {**texts, "crc": _crc(texts)}
 
 
-def read_note(metadata: dict[str, str]) -> dict[str, Any] | None:
-    """Values of a note; None where it does not match its CRC. Raises `ValueError` where it is not a note."""
-    text = metadata.get("json", "")
-    if metadata.get("crc") != f"{zlib.crc32(text.encode()):08x}":
-        return None
-    values = json.loads(text)
-    if not isinstance(values, dict):
-        raise ValueError("holds no values")
-    return cast("dict[str, Any]", values)
+def read_note(metadata: dict[str, str]) -> tuple[dict[str, Any], bool]:
+    """Values of a note, and whether they match its CRC. Raises `ValueError` or `RecursionError` where they are none."""
+    texts = {name: text for name, text in metadata.items() if name != "crc"}
+    return {name: json.loads(text) for name, text in texts.items()}, metadata.get("crc") == _crc(texts)
+
+
+def _crc(texts: dict[str, str]) -> str:
+    return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"

@@ -34,8 +34,8 @@ from brushloop.sessions.evidence import Evidence, event_words, gather, is_collec
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
-from brushloop.sessions.recording import REPAIRS_NOTE, merge_session
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, StepEvent, Topic
+from brushloop.sessions.recording import merge_session
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE, StepEvent, Topic
 from brushloop.sessions.salvage import (
     Report,
     kept_words,

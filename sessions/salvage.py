@@ -22,7 +22,7 @@ from brushloop.sessions.mcap_file import McapFile, Record, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_still
 from brushloop.sessions.recording import count_messages, parse_header
-from brushloop.sessions.records import HEADER_METADATA, Header, StepEvent, Stroke, Topic, header_crc
+from brushloop.sessions.records import HEADER_NOTE, Header, StepEvent, Stroke, Topic
 from brushloop.sessions.verify import verify_session
 
 
@@ -146,14 +146,13 @@ def repair_file(path: Path) -> Report:
     if verdict.sound:
         return report
     found = scan(path)
-    metadata = found.metadata.get(HEADER_METADATA)
-    if metadata is None:
+    if found.header is None:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
-    header = parse_header(path, metadata)
-    if metadata.get("crc", "") not in ("", header_crc(metadata)):
+    header = parse_header(found)
+    if HEADER_NOTE not in found.notes:
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
     strokes = with_their_stills(found)
-    notes = {name: values for name, values in found.notes.items() if name != HEADER_METADATA}
+    notes = {name: values for name, values in found.notes.items() if name != HEADER_NOTE}
     files = {attachment.name: attachment.data for attachment in found.attachments()}
     kept, counts = replace_damaged(path, header, notes, files, strokes.messages())
     why = "; ".join(finding.what for finding in verdict.findings)
@@ -164,8 +163,8 @@ def repair_file(path: Path) -> Report:
         report.lost.append("anything else behind the damage: without its index its amount is unknown")
     if found.index is None:
         return report
-    noted = {one.name for one in found.index.metadata_indexes} - {HEADER_METADATA}
-    if len(files) < len(found.index.attachment_indexes) or len(found.notes) < len(noted):
+    noted = {one.name for one in found.index.metadata_indexes} - {HEADER_NOTE, *found.notes}
+    if len(files) < len(found.index.attachment_indexes) or noted:
         report.lost.append("an attached file, or a note of what was done to the recording")
     return report
 

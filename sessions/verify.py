@@ -21,7 +21,7 @@ from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import HEADER_METADATA, Stroke, Topic
+from brushloop.sessions.records import HEADER_NOTE, Stroke, Topic
 from brushloop.sessions.show import details, step_words
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -141,8 +141,8 @@ def content_problems(found: McapFile, progress: Progress = unseen) -> list[str]:
 def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
     verdict = Verdict(name, "recording", files=1)
     found = scan(path)
-    if found.index is not None and HEADER_METADATA not in (one.name for one in found.index.metadata_indexes):
-        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_METADATA}")
+    if found.index is not None and HEADER_NOTE not in (one.name for one in found.index.metadata_indexes):
+        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}")
     verdict.find(path.name, *found.damage, *content_problems(found, progress))
     if verdict.sound:
         try:

@@ -7,7 +7,7 @@ from mcap.writer import Writer
 
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import HEADER_METADATA, header_metadata
+from brushloop.sessions.records import HEADER_NOTE, note
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_an_mcap_file_that_is_not_ours_is_refused(path):
     ids=lambda damaged: next(iter(damaged)),
 )
 def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damaged):
-    foreign(path, metadata={HEADER_METADATA: header_metadata(make.header) | damaged})
+    foreign(path, metadata={HEADER_NOTE: note(make.header.model_dump(mode="json")) | damaged})
     with pytest.raises(SessionDamaged) as caught:
         Recording(path)
     assert "\n" not in str(caught.value)
@@ -128,7 +128,7 @@ def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damage
     ],
 )
 def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, message):
-    foreign(path, metadata={HEADER_METADATA: header_metadata(make.header)}, messages=[(topic, "json", data)])
+    foreign(path, metadata={HEADER_NOTE: note(make.header.model_dump(mode="json"))}, messages=[(topic, "json", data)])
     recording = Recording(path)
     with pytest.raises(SessionDamaged, match=message) as caught:
         list(recording.captures())
@@ -137,7 +137,7 @@ def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, 
 
 
 def test_messages_outside_chunks_are_refused_because_no_crc_protects_them(make, path):
-    ours = {HEADER_METADATA: header_metadata(make.header)}
+    ours = {HEADER_NOTE: note(make.header.model_dump(mode="json"))}
     foreign(path, metadata=ours, use_chunking=False, messages=[("/stroke", "json", b"{}")])
     with pytest.raises(SessionDamaged, match="outside chunks"):
         Recording(path)
