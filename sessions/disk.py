@@ -6,13 +6,14 @@ files. Every name that is read from a session is checked by `bare_name`, and eve
 
 from __future__ import annotations
 
+import filecmp
 import hashlib
 import itertools
 import os
 import re
 import shutil
 import stat
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -23,7 +24,6 @@ SPARE_BYTES = 16 * 1024 * 1024
 """Space that is always kept free, so that the journal's last lines fit."""
 MAX_SNAPSHOT_BYTES = 64 * 1024 * 1024
 """Limit of a file of a session that holds its configuration, with the rows of its tables."""
-_PIECE_BYTES = 1 << 20
 SESSION_ID = re.compile(r"[0-9A-Za-z][0-9A-Za-z._-]{0,99}")
 SEGMENT_NAME = re.compile(r"(\d{4,})-([a-z_]+)-([0-9A-Za-z_.-]+?)\.mcap(\.part)?")
 """File of a step: serial, kind, start of the key, and `.part` while unfinished."""
@@ -42,20 +42,15 @@ COMPANIONS = (
 """Files and folders that belong to a recording whose folder may also hold unrelated files."""
 
 
-def free_bytes(folder: Path) -> int:
-    """Room left for this user on the disk of `folder`. Raises `SessionError`."""
+def check_room(folder: Path, need_bytes: int) -> None:
+    """Raise `DiskFull` unless `need_bytes` plus `SPARE_BYTES` are free for this user on the disk of `folder`."""
     try:
-        return shutil.disk_usage(folder).free
+        free = shutil.disk_usage(folder).free
     except OSError as error:
         raise SessionError(folder, f"cannot be read: {in_one_line(error)}") from error
-
-
-def check_room(folder: Path, need_bytes: int) -> None:
-    """Raise `DiskFull` unless `need_bytes` plus `SPARE_BYTES` are free."""
-    free = free_bytes(folder)
     if free < need_bytes + SPARE_BYTES:
         need_mb, free_mb = (need_bytes + SPARE_BYTES) / 1e6, free / 1e6
-        raise DiskFull(folder, f"the disk has {free_mb:.0f} MB left, {need_mb:.0f} MB are needed; make room", free)
+        raise DiskFull(folder, f"the disk has {free_mb:.0f} MB left, {need_mb:.0f} MB are needed; make room")
 
 
 def read_bounded(path: Path, max_bytes: int) -> bytes:
@@ -104,15 +99,6 @@ def write_durably(path: Path, data: bytes) -> None:
         sync(file)
 
 
-def _folders(top: Path) -> Iterator[Path]:
-    """The folder and all within it, without a list of their files, of which there may be many."""
-    yield top
-    with os.scandir(top) as entries:
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=False):
-                yield from _folders(Path(entry.path))
-
-
 @contextmanager
 def staged_folder(out: Path) -> Generator[Path]:
     """Yield a folder beside `out` to write into; it is renamed to `out` at the end, and removed after an exception.
@@ -124,8 +110,8 @@ def staged_folder(out: Path) -> Generator[Path]:
         shutil.rmtree(stage, ignore_errors=True)  # left by a killed process: only a copy
         stage.mkdir(parents=True)
         yield stage
-        for path in _folders(stage):
-            fsync_folder(path)
+        for inside, _folders, _files in os.walk(stage):
+            fsync_folder(Path(inside))
         stage.rename(out)
         fsync_folder(out.parent)
     finally:
@@ -143,24 +129,11 @@ def set_aside(path: Path, tag: str) -> Path:
             if not kept.exists():
                 _link(path, kept)
                 return kept
-            if same_bytes(path, kept):
+            if filecmp.cmp(path, kept, shallow=False):
                 return kept
     except OSError as error:
         raise disk_error(path, "cannot keep a copy", error) from error
     raise AssertionError
-
-
-def same_bytes(one: Path, other: Path) -> bool:
-    """Whether two files have the same content. Raises `OSError`."""
-    if one.samefile(other):
-        return True
-    if one.stat().st_size != other.stat().st_size:
-        return False
-    with one.open("rb") as first, other.open("rb") as second:
-        while piece := first.read(_PIECE_BYTES):
-            if piece != second.read(_PIECE_BYTES):
-                return False
-    return True
 
 
 def _link(path: Path, kept: Path) -> None:
@@ -213,22 +186,17 @@ def bare_name(value: object) -> str:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise `InputError` where anything in a session's folder is a link, a device or a pipe.
+    """Raise `InputError` where anything in a session's folder is a link, a device or a pipe, or cannot be read.
 
     The folder itself may be given by the user through a link.
     """
-    waiting = [folder]
-    while waiting:
-        inside = waiting.pop()
-        try:
-            with os.scandir(inside) as entries:
-                found = [(Path(entry.path), entry.stat(follow_symlinks=False).st_mode) for entry in entries]
-        except OSError as error:
-            raise InputError(inside, f"cannot be read: {in_one_line(error)}") from None
-        for path, mode in found:
-            _check_mode(path, mode)
-            if stat.S_ISDIR(mode):
-                waiting.append(path)
+
+    def refuse(error: OSError) -> None:
+        raise InputError(error.filename, f"cannot be read: {in_one_line(error)}") from None
+
+    for inside, folders, files in os.walk(folder, onerror=refuse):
+        for name in (*folders, *files):
+            check_file(Path(inside, name))
 
 
 def check_companions(folder: Path) -> None:
@@ -245,12 +213,8 @@ def check_file(path: Path) -> bool:
         mode = path.lstat().st_mode
     except OSError:
         return False
-    _check_mode(path, mode)
-    return True
-
-
-def _check_mode(path: Path, mode: int) -> None:
     if stat.S_ISLNK(mode):
         raise InputError(path, "is a link, which nothing in a session's folder may be: put the file itself there")
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
         raise InputError(path, "is neither a file nor a folder; nothing else may be in a session's folder")
+    return True

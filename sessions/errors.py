@@ -46,10 +46,6 @@ class SessionDamaged(SessionError):
 class DiskFull(SessionError):
     """The disk is full. Nothing finished is lost; the current attempt was not finished."""
 
-    def __init__(self, path: Path | str, what: str, free_bytes: int | None = None) -> None:
-        self.free_bytes = free_bytes
-        super().__init__(path, what)
-
 
 def disk_error(path: Path | str, what: str, error: BaseException) -> SessionError:
     """Make the error for a failed write: `DiskFull` where there was no room, `SessionError` otherwise."""

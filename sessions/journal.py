@@ -30,8 +30,8 @@ JOURNAL_NAME = "journal.jsonl"
 MAX_JOURNAL_BYTES = 256 * 1024 * 1024
 """Several times the journal of 20,000 strokes."""
 Line = dict[str, Any]
-_TAIL = re.compile(rb',"crc":"([0-9a-f]{8})"\}\Z')
-_WHOLE = re.compile(rb'\{"seq":.*?,"crc":"[0-9a-f]{8}"\}', re.DOTALL)
+_END = re.compile(rb',"crc":"([0-9a-f]{8})"\}')
+_TAIL = re.compile(_END.pattern + rb"\Z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +80,6 @@ class Reading:
     """Number of the next line."""
 
 
-class BadLine(Exception):
-    """A line cannot be used; the message says why."""
-
-
 def encode_line(t_ns: int, line: Line, seq: int, session: str) -> bytes:
     """One line with its CRC and newline. Raises `ValueError` for values that JSON cannot hold."""
     values = {"seq": seq, "session": session, "t_ns": t_ns, **line}
@@ -92,24 +88,24 @@ def encode_line(t_ns: int, line: Line, seq: int, session: str) -> bytes:
 
 
 def decode_line(raw: bytes, number: int) -> Entry:
-    """Decode a line without its newline. Raises `BadLine`."""
+    """Decode a line without its newline. Raises `ValueError`."""
     tail = _TAIL.search(raw)
     if tail is None or zlib.crc32(raw[: tail.start()] + b"}") != int(tail[1], 16):
-        raise BadLine("does not match its CRC")
+        raise ValueError("does not match its CRC")
     try:
         line = cast("Line", json.loads(raw))
     except (ValueError, RecursionError):
-        raise BadLine("is not JSON") from None
+        raise ValueError("is not JSON") from None
     match line:
         case {"seq": int(seq), "session": str(session), "event": str()} if seq > 0 and not isinstance(seq, bool):
             for name in ("seq", "session", "crc"):
                 del line[name]
         case _:
-            raise BadLine("has no number, session or event")
+            raise ValueError("has no number, session or event")
     try:
         return Entry(number, seq, session, raw, parse_event(line))
     except ValueError as error:
-        raise BadLine(f"makes no sense: {error}") from None
+        raise ValueError(f"makes no sense: {error}") from None
 
 
 def read_journal(path: Path) -> bytes:
@@ -178,35 +174,20 @@ def _without_collection() -> Generator[None]:
 
 
 def _decoded(reading: Reading, data: bytes) -> list[Entry]:
-    """Lines that match their CRC, even if the newline between two of them is damaged."""
+    """Lines that can be used; the others are reported."""
     *pieces, tail = data.split(b"\n")
     entries: list[Entry] = []
     for number, raw in enumerate([*pieces, tail] if tail else pieces, start=1):
         try:
             entries.append(decode_line(raw, number))
-        except BadLine as error:
-            within, left = _lines_within(raw, number)
-            entries += within
-            if number > len(pieces) and not within:
+        except ValueError as error:
+            if number > len(pieces) and _END.search(raw) is None:
                 reading.torn = tail
-                continue
-            reading.faults.append(Fault(number, "has a damaged end" if within and not left else str(error)))
-            reading.damaged += [number] * left
+            else:
+                reading.faults.append(Fault(number, str(error)))
+                # Lines between which the newline is damaged stand as one.
+                reading.damaged += [number] * max(1, raw.count(b'{"seq":'))
     return entries
-
-
-def _lines_within(raw: bytes, number: int) -> tuple[list[Entry], int]:
-    """The lines in a span with a damaged newline, and the number of damaged lines between them."""
-    entries: list[Entry] = []
-    at = left = 0
-    for match in _WHOLE.finditer(raw):
-        try:
-            entries.append(decode_line(match[0], number))
-        except BadLine:
-            continue
-        left += match.start() - at > 1  # a single byte was the newline
-        at = match.end()
-    return entries, left + (len(raw) - at > 1 or not entries)
 
 
 def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entry]:
@@ -238,12 +219,11 @@ def _one_of(lines: list[Entry], what: str) -> Fault:
 
 def _missing(reading: Reading, entries: list[Entry]) -> None:
     """Report numbers that no line has, except those of lines that cannot be read."""
-    unreadable = set(reading.damaged)
     seq = at = 0
     for entry in entries:
         gone = entry.seq - seq - 1
         if gone > 0:
-            gone -= sum(at < number < entry.number for number in unreadable)
+            gone -= sum(at < number < entry.number for number in reading.damaged)
         if gone > 0:
             lines = "a line that is" if gone == 1 else f"{gone} lines that are"
             reading.faults.append(Fault(entry.number, f"comes after {lines} missing"))

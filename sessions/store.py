@@ -14,7 +14,6 @@ from brushloop.sessions.disk import (
     check_folder,
     check_room,
     file_sha256,
-    free_bytes,
     fsync_folder,
     write_durably,
 )
@@ -107,14 +106,6 @@ class SessionStore:
             raise disk_error(folder, "cannot create", error) from error
         return cls(folder, header, now_ns, snapshots)
 
-    def free_bytes(self) -> int:
-        """Room left on the session's disk. Raises `SessionError`."""
-        return free_bytes(self.folder)
-
-    def check_room(self, need_bytes: int = STEP_BYTES) -> None:
-        """Raise `DiskFull` unless the disk has that much room. `begin` checks this before it journals anything."""
-        check_room(self.folder, need_bytes)
-
     def begin(
         self,
         key: str,
@@ -129,7 +120,7 @@ class SessionStore:
         `patch` and `more_patches` are those that it marks. Raises `DiskFull`, or `SessionError` for a press on a sheet
         that may hold an unrecorded one, before anything is written.
         """
-        self.check_room()
+        check_room(self.folder, STEP_BYTES)
         state = self.state
         if patch is not None and state.sheet in state.doubtful_sheets:
             raise SessionError(
@@ -198,7 +189,7 @@ class SessionStore:
         Raises `SessionDamaged`, or `DiskFull` before anything is written; the session then stays open.
         """
         self.verify()
-        self.check_room(sum((self.folder / file).stat().st_size for file in self.state.files))
+        check_room(self.folder, sum((self.folder / file).stat().st_size for file in self.state.files))
         final = merge_session(self.folder, self.state, self.header)
         self._log(closed(final, self.state.counts(), self._now_ns()))
         return final
