@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from brushloop.collect.start import collect_session
     from brushloop.drivers.loopback import LoopbackRig, simulate
     from brushloop.model.brush import Brush, DomainError
-    from brushloop.sessions.condition import Condition
     from brushloop.sessions.errors import SessionDamaged, SessionError
+    from brushloop.sessions.records import Condition
 
 _NAMES = {
     "brushloop.calibrate.calibrated": ("Calibrated",),
@@ -44,7 +44,7 @@ _NAMES = {
     "brushloop.collect.start": ("collect_session",),
     "brushloop.drivers.loopback": ("LoopbackRig", "simulate"),
     "brushloop.model.brush": ("Brush", "DomainError"),
-    "brushloop.sessions.condition": ("Condition",),
+    "brushloop.sessions.records": ("Condition",),
     "brushloop.sessions.errors": ("SessionDamaged", "SessionError"),
 }
 

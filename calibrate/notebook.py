@@ -32,10 +32,9 @@ from brushloop.calibrate.validate.main import Request, ValidationOutput, check
 from brushloop.calibrate.validate.main import validate as run_validation
 from brushloop.calibrate.validate.sources import local_path
 from brushloop.model.brush import Brush
-from brushloop.sessions.condition import Condition
 from brushloop.sessions.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.sessions.recording import Capture, Recording
-from brushloop.sessions.records import Header
+from brushloop.sessions.records import Condition, Header
 
 if TYPE_CHECKING:
     from brushloop.calibrate.invert.command import Recovered

@@ -11,9 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from brushloop.sessions.condition import Condition
 from brushloop.sessions.disk import bare_name
-from brushloop.sessions.records import Check, Header
+from brushloop.sessions.records import Check, Condition, Header
 
 MAX_NUMBER = 10**9
 _SERIAL = re.compile(r"\d{1,9}(?=-)")

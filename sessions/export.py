@@ -36,9 +36,8 @@ from pydantic import ValidationError
 from brushloop.sessions.cells import CsvWriter
 from brushloop.sessions.disk import check_room, staged_folder, sync, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
-from brushloop.sessions.history import unlike
 from brushloop.sessions.messages import PNG_START, decode_gray
-from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.recording import Capture, Recording, unlike
 from brushloop.sessions.records import Quality, StepEvent, Stroke, Topic, Wrench
 from brushloop.sessions.terminal import Progress, counted, plain, unseen
 

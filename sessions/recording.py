@@ -1,12 +1,15 @@
-"""A session's one MCAP file: reading its header and its strokes with their stills, and merging the steps into it.
+"""A session's recording: its header, its strokes with their stills, and what is known of each capture besides.
 
-Photographs are read one at a time.
+Remarks (bad, good again, a note) are added to captures afterwards. `remarks.jsonl` holds one line per remark, with a
+CRC as in the journal; the latest remark on a still counts. The recording itself is never changed, so that a closed
+session stays byte for byte as recorded. Photographs are read one at a time.
 """
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator
+import statistics
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -14,23 +17,14 @@ from typing import TYPE_CHECKING, TypeVar
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import (
-    MAX_SNAPSHOT_BYTES,
-    SNAPSHOT_NAMES,
-    check_companions,
-    file_sha256,
-    fsync_folder,
-    read_bounded,
-    set_aside,
-)
-from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error, in_one_line
+from brushloop.sessions.disk import check_companions, file_sha256
+from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
+from brushloop.sessions.events import CaptureResult, DipResult, Remark, ZeroTouchResult, line_of
 from brushloop.sessions.folders import check_name, not_a_session
-from brushloop.sessions.history import remarks_of
-from brushloop.sessions.journal import JOURNAL_NAME, replay
-from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap, scan
-from brushloop.sessions.mcap_writer import new_mcap
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, replay, undamaged
+from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.records import REPAIRS_NOTE, Event, Header, StepEvent, Stroke, Topic
+from brushloop.sessions.records import Event, Header, StepEvent, Stroke, Topic
 from brushloop.sessions.run_state import RunState
 
 if TYPE_CHECKING:
@@ -38,6 +32,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _E = TypeVar("_E", bound=Event)
+_K = TypeVar("_K")
+REMARKS_NAME = "remarks.jsonl"
+LEAST_S = 2.0
+"""Smallest difference between waits that can be visible in the ink, s."""
+SPREADS = 3.0
+"""Median absolute deviations within which waits count as alike."""
+LEAST_STROKES = 4
+"""Number of strokes below which no wait can be called an outlier."""
+
 MAX_ATTACHMENT_BYTES = 1024 * 1024
 STILLS_KEPT = 8
 """Stills kept in memory: a stroke refers to one shortly before it, so older ones can be dropped."""
@@ -197,51 +200,90 @@ def _first_error(kind: type[Event], error: ValidationError) -> str:
     return " ".join(f"{kind.__name__}.{field}: {first['msg']}".split())
 
 
-def count_messages(path: Path) -> dict[str, int]:
-    """Number of messages by topic in a file whose every CRC is right. Raises `SessionDamaged`."""
-    found = scan(path)
-    if found.damage:
-        raise SessionDamaged(path, "; ".join(found.damage))
-    return dict(found.counts)
+@dataclass(frozen=True, slots=True)
+class History:
+    """Takes and paper heights of one session, from its journal."""
+
+    photographed: int
+    """Marks that were photographed and judged."""
+    pressed_again: tuple[str, ...]
+    """Strokes of takes that did not count and were repeated on another patch."""
+    left_out: tuple[str, ...]
+    """Strokes that were given up, or skipped by the operator."""
+    touches: tuple[ZeroTouchResult, ...]
+    """Zero touches in order of time."""
+
+    @property
+    def moved_mm(self) -> float:
+        """Difference between the highest and the lowest paper found, mm."""
+        heights = [touch.touch_z_mm for touch in self.touches]
+        return max(heights) - min(heights) if heights else 0.0
 
 
-def merge_session(folder: Path, state: RunState, header: Header, tag: str = "superseded") -> Path:
-    """Merge the finished steps of a session into its one MCAP file, in the order of the journal.
+def history_of(folder: Path) -> History | None:
+    """Read the journal; None for a recording without one. Raises `SessionDamaged`."""
+    journal = folder / JOURNAL_NAME
+    if not journal.is_file():
+        return None
+    state = replay(journal)
+    captures = state.results(CaptureResult)
+    rejected = [capture for capture in captures if not capture.kept]
+    skipped = [dip.skipped for dip in state.results(DipResult) if dip.skipped is not None]
+    left_out = [*(capture.press for capture in rejected if not capture.retake), *skipped]
+    return History(
+        len(captures),
+        tuple(capture.press.stroke_id for capture in rejected if capture.retake),
+        tuple(press.stroke_id for press in left_out),
+        tuple(state.results(ZeroTouchResult)),
+    )
 
-    The file includes the configuration and a note of any repairs, so that it can be shared alone. It gets its name
-    once it was read back with correct CRCs and the journal's counts. A file of that name, left by an interrupted close,
-    is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts, and
-    for a sound file of that name with messages that the steps do not have.
-    """
-    final = folder / f"{folder.name}.mcap"
-    if final.exists():
-        _check_not_emptier(final, state, header)
-        set_aside(final, tag)
-    part = final.with_name(final.name + ".part")
-    expected = state.counts()
+
+def waits_of(state: RunState) -> dict[int, float]:
+    """Seconds from dip to touch, by number of the still that shows the stroke; of those that were measured."""
+    captures = state.results(CaptureResult)
+    return {one.still: one.press.dip_to_touch_s for one in captures if one.press.dip_to_touch_s is not None}
+
+
+def limit_s(waits: Iterable[float]) -> tuple[float, float] | None:
+    """Median of a session's waits and the distance from it that counts as alike; None for too few waits."""
+    known = list(waits)
+    if len(known) < LEAST_STROKES:
+        return None
+    median = statistics.median(known)
+    return median, max(LEAST_S, SPREADS * statistics.median(abs(wait - median) for wait in known))
+
+
+def unlike(waits: Mapping[_K, float]) -> dict[_K, str]:
+    """Reason for each stroke whose wait differs from the others'."""
+    if (limit := limit_s(waits.values())) is None:
+        return {}
+    median, most_s = limit
+    return {
+        key: f"touched the paper {wait:.1f} s after its dip, the others after {median:.1f} s"
+        for key, wait in waits.items()
+        if abs(wait - median) > most_s
+    }
+
+
+def add_remark(folder: Path, remark: Remark) -> None:
+    """Append a remark and wait until it is on disk. Raises `SessionError` where that fails."""
+    journal = Journal(folder / REMARKS_NAME, remark.t_ns)
     try:
-        part.unlink(missing_ok=True)  # only a copy of steps that still exist
-        repairs = [repair.model_dump(mode="json") for repair in state.repairs]
-        notes = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
-        snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
-        attachments = {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES) for path in snapshots}
-        with new_mcap(part, header, notes, attachments) as writer:
-            for file in state.files:
-                writer.copy_file(folder / file)
-        counts = count_messages(part)
-        if counts != expected:
-            raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
-        part.rename(final)
-        fsync_folder(final.parent)
-    except OSError as error:
-        raise disk_error(part, "cannot write", error) from error
-    return final
+        journal.append(remark.t_ns, line_of(remark))
+    finally:
+        journal.close()
 
 
-def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
-    try:
-        more = Counter(count_messages(final)) - Counter(state.counts())
-    except SessionError:
-        return
-    if more and McapFile(final).session == header.session_id:
-        raise SessionDamaged(final, f"holds {more.total()} messages that the steps in the journal do not have")
+def mark_bad_or_good(folder: Path, still: int, stroke_id: str, t_ns: int) -> bool:
+    """Switch a capture between bad and good, keep its note, and return whether it is bad now. Raises `SessionError`."""
+    known = remarks_of(folder).get(still)
+    bad, note = (True, "") if known is None else (not known.bad, known.note)
+    add_remark(folder, Remark(t_ns=t_ns, still=still, stroke_id=stroke_id, bad=bad, note=note))
+    return bad
+
+
+def remarks_of(folder: Path) -> dict[int, Remark]:
+    """Latest remark for each still; empty where there is none. Raises `SessionDamaged`."""
+    path = folder / REMARKS_NAME
+    remarks = [entry.event for entry in undamaged(path).entries] if path.is_file() else []
+    return {remark.still: remark for remark in remarks if isinstance(remark, Remark)}

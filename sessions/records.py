@@ -213,6 +213,15 @@ class Header(Event):
 
 
 @dataclass(frozen=True, slots=True)
+class Condition:
+    """Depth H below the paper, tilt alpha of the brush axis from the vertical, and heading of the mark."""
+
+    depth_mm: float
+    tilt_deg: float
+    heading_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Recorded:
     """Number of messages by topic, and the digest of the file that holds them."""
 

@@ -34,7 +34,6 @@ from brushloop.sessions.evidence import Evidence, event_words, gather, is_collec
 from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
-from brushloop.sessions.recording import merge_session
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE, StepEvent, Topic
 from brushloop.sessions.salvage import (
     Report,
@@ -47,7 +46,7 @@ from brushloop.sessions.salvage import (
     write_anew,
 )
 from brushloop.sessions.show import step_words
-from brushloop.sessions.store import closed, lock
+from brushloop.sessions.store import closed, lock, merge_session
 from brushloop.sessions.verify import judge
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))

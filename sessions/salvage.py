@@ -18,10 +18,10 @@ from pydantic import ValidationError
 from brushloop.sessions.disk import fsync_folder, set_aside, sync
 from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.journal import Line
-from brushloop.sessions.mcap_file import McapFile, Record, scan
+from brushloop.sessions.mcap_file import McapFile, Record, count_messages, scan
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_still
-from brushloop.sessions.recording import count_messages, parse_header
+from brushloop.sessions.recording import parse_header
 from brushloop.sessions.records import HEADER_NOTE, Header, StepEvent, Stroke, Topic
 from brushloop.sessions.verify import verify_session
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,16 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from brushloop.sessions.disk import (
+    MAX_SNAPSHOT_BYTES,
     SEGMENT_NAME,
+    SNAPSHOT_NAMES,
     check_digest,
     check_folder,
     check_room,
     file_sha256,
     fsync_folder,
+    read_bounded,
+    set_aside,
     write_durably,
 )
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
@@ -35,9 +40,9 @@ from brushloop.sessions.events import (
     line_of,
 )
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, read_header, replay
-from brushloop.sessions.mcap_writer import SegmentWriter
-from brushloop.sessions.recording import merge_session
-from brushloop.sessions.records import Header
+from brushloop.sessions.mcap_file import McapFile, count_messages
+from brushloop.sessions.mcap_writer import SegmentWriter, new_mcap
+from brushloop.sessions.records import REPAIRS_NOTE, Header
 from brushloop.sessions.run_state import RunState
 
 STEP_BYTES = 64 * 1024 * 1024
@@ -219,6 +224,48 @@ class SessionStore:
             serial = SEGMENT_NAME.fullmatch(path.name)
             if serial and int(serial[1]) >= self.state.begun:
                 raise SessionDamaged(self.folder / JOURNAL_NAME, f"does not mention {path.name}: lines are missing")
+
+
+def merge_session(folder: Path, state: RunState, header: Header, tag: str = "superseded") -> Path:
+    """Merge the finished steps of a session into its one MCAP file, in the order of the journal.
+
+    The file includes the configuration and a note of any repairs, so that it can be shared alone. It gets its name
+    once it was read back with correct CRCs and the journal's counts. A file of that name, left by an interrupted close,
+    is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts, and
+    for a sound file of that name with messages that the steps do not have.
+    """
+    final = folder / f"{folder.name}.mcap"
+    if final.exists():
+        _check_not_emptier(final, state, header)
+        set_aside(final, tag)
+    part = final.with_name(final.name + ".part")
+    expected = state.counts()
+    try:
+        part.unlink(missing_ok=True)  # only a copy of steps that still exist
+        repairs = [repair.model_dump(mode="json") for repair in state.repairs]
+        notes = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
+        snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
+        attachments = {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES) for path in snapshots}
+        with new_mcap(part, header, notes, attachments) as writer:
+            for file in state.files:
+                writer.copy_file(folder / file)
+        counts = count_messages(part)
+        if counts != expected:
+            raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
+        part.rename(final)
+        fsync_folder(final.parent)
+    except OSError as error:
+        raise disk_error(part, "cannot write", error) from error
+    return final
+
+
+def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
+    try:
+        more = Counter(count_messages(final)) - Counter(state.counts())
+    except SessionError:
+        return
+    if more and McapFile(final).session == header.session_id:
+        raise SessionDamaged(final, f"holds {more.total()} messages that the steps in the journal do not have")
 
 
 def lock(folder: Path) -> FileLock:

@@ -24,10 +24,10 @@ from brushloop.collect.tui.large import LargeCapture, title_of
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import CaptureResult, Remark
-from brushloop.sessions.history import remarks_of, unlike, waits_of
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
+from brushloop.sessions.recording import remarks_of, unlike, waits_of
 from brushloop.sessions.records import Check, Quality, Stroke, Topic
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain
 from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.events import Remark
-from brushloop.sessions.history import add_remark
+from brushloop.sessions.recording import add_remark
 
 KEYS = (
     ("escape", "back"),

@@ -24,7 +24,7 @@ from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.text import plain
 from brushloop.collect.tui.widgets import HelpScreen
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.history import mark_bad_or_good
+from brushloop.sessions.recording import mark_bad_or_good
 
 
 class RunApp(PlainApp):

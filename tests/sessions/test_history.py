@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from brushloop.sessions.events import DipResult, StepResult, ZeroTouchResult
-from brushloop.sessions.history import history_of
+from brushloop.sessions.recording import history_of
 
 
 def did(store, *results: StepResult) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Remark
-from brushloop.sessions.history import REMARKS_NAME, add_remark, remarks_of
+from brushloop.sessions.recording import REMARKS_NAME, add_remark, remarks_of
 
 
 def test_the_latest_remark_on_a_capture_holds_and_the_earlier_ones_stay(tmp_path: Path) -> None:

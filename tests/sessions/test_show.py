@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
-from brushloop.sessions.history import mark_bad_or_good
+from brushloop.sessions.recording import mark_bad_or_good
 from brushloop.sessions.show import GridCell, Sheet, details, ranges
 from brushloop.sessions.store import SessionStore
 

@@ -8,7 +8,7 @@ import pytest
 
 from brushloop.sessions.events import CaptureResult, StepKind
 from brushloop.sessions.export import export
-from brushloop.sessions.history import unlike, waits_of
+from brushloop.sessions.recording import unlike, waits_of
 
 
 def test_a_wait_belongs_to_the_take_that_the_photograph_shows(make, store):

@@ -33,7 +33,7 @@ from brushloop.calibrate.validate.rows import Cell, Rows
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Outcome
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
 from brushloop.model.brush import DomainError
-from brushloop.sessions.history import history_of
+from brushloop.sessions.recording import history_of
 from brushloop.sessions.show import details
 
 MEASURES = ("csim", "ssim")

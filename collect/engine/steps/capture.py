@@ -24,7 +24,7 @@ from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.samples import Frame
 from brushloop.sessions import records
 from brushloop.sessions.events import BoardResult, CaptureResult, Press
-from brushloop.sessions.history import limit_s, unlike, waits_of
+from brushloop.sessions.recording import limit_s, unlike, waits_of
 
 MOVED_MM = 1.0
 """Distance by which the sheet may seem to have moved in the picture since the first mark of the session."""

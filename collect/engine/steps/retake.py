@@ -13,7 +13,7 @@ from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.collect.rig.paper import Patch
 from brushloop.sessions.events import Again, CaptureResult, Press, ReviewResult
-from brushloop.sessions.history import remarks_of
+from brushloop.sessions.recording import remarks_of
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40

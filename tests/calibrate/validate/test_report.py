@@ -25,8 +25,7 @@ from brushloop.calibrate.validate.report.outputs import COLUMNS, score_rows
 from brushloop.calibrate.validate.report.page import _of_session
 from brushloop.calibrate.validate.run import Outcome
 from brushloop.sessions.events import Remark
-from brushloop.sessions.history import add_remark
-from brushloop.sessions.recording import Recording
+from brushloop.sessions.recording import Recording, add_remark
 from brushloop.sessions.records import Source
 from tests.browser import BROWSER, content_widths_px
 

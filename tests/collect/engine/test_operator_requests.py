@@ -16,8 +16,7 @@ from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorR
 from brushloop.collect.protocols.steps import Step, StepKind, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.events import StepResult
-from brushloop.sessions.history import mark_bad_or_good
-from brushloop.sessions.recording import Recording
+from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.collect.conftest import Lab
 from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines

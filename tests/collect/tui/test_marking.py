@@ -10,7 +10,7 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.sessions.history import remarks_of
+from brushloop.sessions.recording import remarks_of
 from tests.collect.tui.fake import FakeEngine, full_picture
 
 

@@ -24,8 +24,7 @@ from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.start_screen import StartScreen
-from brushloop.sessions.history import remarks_of
-from brushloop.sessions.recording import Recording
+from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
 from tests.collect.tui.screen_text import has_picture, shown
 from tests.collect.until import wait_for_end

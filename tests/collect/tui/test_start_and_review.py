@@ -25,7 +25,7 @@ from brushloop.collect.tui.levels import Coloured
 from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.start_screen import StartScreen
-from brushloop.sessions.history import remarks_of
+from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.verify import Finding, Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
