@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, TypeVar
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import check_companions, file_sha256
-from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
+from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
+from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
 from brushloop.sessions.events import CaptureResult, DipResult, Remark, ZeroTouchResult, line_of
-from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, replay, undamaged
 from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
@@ -153,6 +152,54 @@ class Recording:
                 )
             where = f"{self.path} stroke {stroke.stroke_id}"
             yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
+
+
+def check_name(folder: Path) -> None:
+    """Raise `InputError`, with advice, for a folder that was renamed or holds links, and for an unfinished file."""
+    if folder.suffix == ".part" and folder.is_file():
+        what = "was never finished, because a step or a merge was cut: it is kept as evidence and is not a recording"
+        raise InputError(folder, f"{what}. Give the session's folder, {folder.parent}")
+    if folder.is_dir():
+        check_folder(folder)
+    recording = recording_of_renamed(folder)
+    if recording is not None:
+        raise InputError(
+            folder,
+            f"was renamed: its recording is called {recording.name}. Nothing is damaged by that. Rename the folder "
+            f"back to {recording.stem}, or give the file {recording} itself",
+        )
+
+
+def recording_of_renamed(folder: Path) -> Path | None:
+    """Return the only recording in a folder if its name differs from the folder's; None otherwise.
+
+    Also None for an open session, which may be renamed: the files of its steps do not carry its name.
+    """
+    name = folder.resolve().name
+    recordings = [path for path in folder.glob("*.mcap") if not SEGMENT_NAME.fullmatch(path.name)]
+    if (folder / f"{name}.mcap").exists() or len(recordings) != 1 or _is_open(folder):
+        return None
+    return recordings[0]
+
+
+def not_a_session(folder: Path) -> InputError:
+    """Make the error for a path without a recording; the message says what to give instead."""
+    if not folder.is_dir():
+        return InputError(folder, "no such session: give a session's folder or its .mcap file")
+    name = f"{folder.resolve().name}.mcap"
+    if (folder / JOURNAL_NAME).is_file():
+        return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")
+    inside = sorted(path for path in folder.iterdir() if (path / JOURNAL_NAME).is_file() or any(path.glob("*.mcap")))
+    if inside:
+        return InputError(folder, f"is not a session but holds {len(inside)} of them: give one, such as {inside[0]}")
+    return InputError(folder, f"is not a session: it holds neither {JOURNAL_NAME} nor a recording {name}")
+
+
+def _is_open(folder: Path) -> bool:
+    try:
+        return (folder / JOURNAL_NAME).is_file() and replay(folder / JOURNAL_NAME).is_open
+    except SessionError:
+        return False
 
 
 def _find_mcap(path: Path) -> Path:

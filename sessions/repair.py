@@ -31,9 +31,9 @@ from brushloop.sessions.events import (
     line_of,
 )
 from brushloop.sessions.evidence import Evidence, event_words, gather, is_collected
-from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
+from brushloop.sessions.recording import check_name, not_a_session
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE, StepEvent, Topic
 from brushloop.sessions.salvage import (
     Report,

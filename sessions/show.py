@@ -21,9 +21,8 @@ from rich.text import Text
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import Begin, CaptureResult, DipResult, Done, DrawResult, PressResult
-from brushloop.sessions.folders import check_name, recording_of_renamed
 from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
-from brushloop.sessions.recording import Recording, remarks_of
+from brushloop.sessions.recording import Recording, check_name, recording_of_renamed, remarks_of
 from brushloop.sessions.records import Header
 from brushloop.sessions.run_state import KILLED, RunState
 

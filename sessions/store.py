@@ -1,7 +1,11 @@
-"""A session's folder open for writing: created, locked, resumed, closed. The engine writes only through this."""
+"""A session's folder: named, found, and opened for writing; created, locked, resumed, closed.
+
+The engine writes only through this.
+"""
 
 from __future__ import annotations
 
+import datetime as dt
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -266,6 +270,31 @@ def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
         return
     if more and McapFile(final).session == header.session_id:
         raise SessionDamaged(final, f"holds {more.total()} messages that the steps in the journal do not have")
+
+
+def next_session_id(root: Path, label: str, today: dt.date) -> str:
+    """Return `2026-11-21-grid-01` with the first number that is free under `root`."""
+    for number in range(1, 1000):
+        session_id = f"{today.isoformat()}-{label}-{number:02d}"
+        if not (root / session_id).exists():
+            return session_id
+    raise InputError(root, f"has 999 sessions of {today.isoformat()}-{label}")
+
+
+def open_sessions(root: Path) -> list[Path]:
+    """Folders under `root` whose journal was opened and has no `closed` event, oldest first.
+
+    A session that is damaged or holds links is left out, so that it stands in no other's way.
+    """
+    found: list[Path] = []
+    for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")):
+        try:
+            check_folder(journal.parent)
+            if replay(journal).is_open:
+                found.append(journal.parent)
+        except SessionError:
+            continue
+    return found
 
 
 def lock(folder: Path) -> FileLock:

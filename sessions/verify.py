@@ -16,11 +16,10 @@ from brushloop.sessions.disk import check_digest, holds
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import Begin, Closed, Done, Lost, Open, Repaired
 from brushloop.sessions.evidence import Evidence, gather, is_collected
-from brushloop.sessions.folders import check_name, not_a_session
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.recording import Recording
+from brushloop.sessions.recording import Recording, check_name, not_a_session
 from brushloop.sessions.records import HEADER_NOTE, Stroke, Topic
 from brushloop.sessions.show import details, step_words
 from brushloop.sessions.terminal import Progress, counted, unseen

@@ -9,10 +9,11 @@ from __future__ import annotations
 import datetime as dt
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, cast
 
 from brushloop.collect.engine.dry_run import lifted
 from brushloop.collect.errors import ConfigError
@@ -21,13 +22,11 @@ from brushloop.collect.rig.config import RigConfig, load_rig, overrides
 from brushloop.collect.rig.devices import Rig
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.samples import Identity
-from brushloop.sessions.difference import ABSENT, Difference, differences
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unwritable
-from brushloop.sessions.errors import SessionError
-from brushloop.sessions.folders import next_session_id, open_sessions
+from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Header, Source
-from brushloop.sessions.store import SessionStore, Snapshots
+from brushloop.sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
 COMPARED = (RIG_EFFECTIVE, PROTOCOL_EFFECTIVE)
@@ -44,6 +43,8 @@ MACHINE_NAMES = {
     "ink": {"device": {"port"}},
 }
 """Fields that may differ between two runs of one session: where the devices are, not what they do."""
+ABSENT = object()
+"""Placeholder for the value of a field that one of the two configurations does not have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +155,67 @@ def check_fresh_sheet(root: Path, sheet: int | None) -> None:
         )
     if sheet not in (None, 1):
         raise ConfigError("--sheet", "", f"{sheet}: a new session begins with sheet 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One changed field, or a whole list if its length changed; `field` is empty if the file cannot be compared."""
+
+    file: str
+    field: tuple[str, ...]
+    """Path of the field in the file: names, and indices of list items from 0."""
+    old: Any
+    new: Any
+
+    def __str__(self) -> str:
+        """Text such as `paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`."""
+        if not self.field:
+            return "its earlier content is missing or damaged"
+        return f"{'.'.join(self.field)}: {_short(self.old)} -> {_short(self.new)}"
+
+
+def differences(folder: Path, snapshots: Mapping[str, str]) -> list[Difference]:
+    """Compare the session's JSON files with `snapshots` (file name -> text); empty if nothing changed."""
+    found: list[Difference] = []
+    for name, text in snapshots.items():
+        try:
+            old = json.loads(read_bounded(folder / name, MAX_SNAPSHOT_BYTES))
+        except (InputError, ValueError, RecursionError):
+            found.append(Difference(name, (), ABSENT, ABSENT))
+        else:
+            found += _compared(name, (), old, json.loads(text))
+    return found
+
+
+def _compared(file: str, at: tuple[str, ...], old: Any, new: Any) -> Iterator[Difference]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        before, after = cast("dict[str, Any]", old), cast("dict[str, Any]", new)
+        for name in {**after, **before}:
+            yield from _compared(file, (*at, name), before.get(name, ABSENT), after.get(name, ABSENT))
+    elif len(before := _tables(old)) == len(after := _tables(new)) > 0:
+        for number, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from _compared(file, (*at, str(number)), one, other)
+    elif old != new:
+        yield Difference(file, at, old, new)
+
+
+def _tables(value: Any) -> list[Any]:
+    """Items of a list of tables; an empty list for any other value."""
+    items = cast("list[Any]", value) if isinstance(value, list) else []
+    return items if any(isinstance(item, dict) for item in items) else []
+
+
+def _short(value: Any) -> str:
+    if value is ABSENT:
+        return "missing"
+    if value is None:
+        return "left out"
+    if items := _tables(value):
+        return f"{len(items)} items" if len(items) > 1 else "1 item"
+    if isinstance(value, dict):
+        return "given"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], texts: dict[str, str]) -> ConfigError:

@@ -5,9 +5,9 @@ import os
 import pytest
 import zstandard
 
-from brushloop.sessions.folders import open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.repair import repair_session
+from brushloop.sessions.store import open_sessions
 from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 

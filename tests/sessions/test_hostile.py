@@ -14,9 +14,8 @@ from typer.main import get_command
 from brushloop.__main__ import app
 from brushloop.sessions.disk import bare_name
 from brushloop.sessions.errors import InputError
-from brushloop.sessions.folders import open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.store import SessionStore
+from brushloop.sessions.store import SessionStore, open_sessions
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"

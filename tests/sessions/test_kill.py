@@ -9,8 +9,8 @@ from collections import Counter
 
 import pytest
 
-from brushloop.sessions.folders import open_sessions
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.store import open_sessions
 
 KEYS = [f"step-{number:02d}" for number in range(12)]
 KILLS = 10

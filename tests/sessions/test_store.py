@@ -11,11 +11,10 @@ from mcap.reader import make_reader
 
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
 from brushloop.sessions.events import PressResult, StepKind
-from brushloop.sessions.folders import next_session_id, open_sessions
 from brushloop.sessions.journal import JOURNAL_NAME, Journal
 from brushloop.sessions.mcap_file import count_messages, open_mcap
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.store import SessionStore
+from brushloop.sessions.store import SessionStore, next_session_id, open_sessions
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from brushloop.collect.engine.open_or_resume import Opening, find_resumable, put_in_sheet
+from brushloop.collect.engine.open_or_resume import Difference, Opening, find_resumable, put_in_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.planning.limit_check import distinct_steps
@@ -19,7 +19,6 @@ from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
-from brushloop.sessions.difference import Difference
 from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.run_state import RunState
