@@ -14,7 +14,7 @@ import re
 import shutil
 import stat
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -106,6 +106,7 @@ def staged_folder(out: Path) -> Generator[Path]:
     An existing `out` is replaced only if it is an empty folder. Raises `OSError`.
     """
     stage = out.with_name(f".{out.name}.partial")
+    missing = [parent for parent in out.parents if not parent.exists()]
     try:
         shutil.rmtree(stage, ignore_errors=True)  # left by a killed process: only a copy
         stage.mkdir(parents=True)
@@ -116,6 +117,9 @@ def staged_folder(out: Path) -> Generator[Path]:
         fsync_folder(out.parent)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+        with suppress(OSError):  # after a success they are not empty
+            for parent in missing:
+                parent.rmdir()
 
 
 def set_aside(path: Path, tag: str) -> Path:

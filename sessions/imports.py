@@ -1,13 +1,12 @@
 """Import photographs: a folder of images and a table of what was commanded become a session.
 
-The table has one line per photograph and columns named `quantity_unit`. Everything is read and checked before anything
-is written; a refused import leaves nothing behind.
+The table has one line per photograph and columns named `quantity_unit`. It is checked before a photograph is read; a
+refused import leaves nothing behind.
 """
 
 from __future__ import annotations
 
 import csv
-import hashlib
 import math
 import re
 from collections.abc import Callable
@@ -18,7 +17,14 @@ from brushloop.sessions.cells import as_text, number
 from brushloop.sessions.disk import SESSION_ID, read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.mcap_writer import Outgoing, new_mcap
-from brushloop.sessions.messages import MAX_IMAGE_BYTES, PNG_START, decode_gray, image_message, upright
+from brushloop.sessions.messages import (
+    MAX_IMAGE_BYTES,
+    PNG_START,
+    CompressedImage,
+    decode_gray,
+    image_message,
+    upright,
+)
 from brushloop.sessions.records import MAX_PX_PER_MM, MIN_PX_PER_MM, Header, Source, Stroke, Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -75,8 +81,6 @@ def import_photographs(
     """Import into the new session folder `out`; return its MCAP file. Raises `InputError`, leaving nothing behind."""
     _check_target(folder, table, out, options)
     rows = _read_table(folder.resolve(), table, options)
-    checked = counted(rows, "photographs checked", len(rows), progress)
-    digests = [_check(row.image) for row in checked]
     header = Header(
         session_id=out.name,
         source=Source.IMPORT_SIMULATED if options.simulated else Source.IMPORT,
@@ -89,8 +93,11 @@ def import_photographs(
         origin=options.origin or f"{folder.resolve().name}, {table.name}",
     )
     try:
-        with staged_folder(out) as stage:
-            _write(rows, digests, stage / f"{out.name}.mcap", header, now_ns, progress)
+        with staged_folder(out) as stage, new_mcap(stage / f"{out.name}.mcap", header, {}, {}) as writer:
+            for row in counted(rows, "photographs imported", len(rows), progress):
+                t_ns, still = now_ns(), row.stroke.still
+                writer.record(Outgoing(Topic.STILL, t_ns, t_ns, still, _photograph(row.image, t_ns)))
+                writer.record(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke))
     except OSError as error:
         raise InputError(out, f"cannot write: {in_one_line(error)}") from error
     return out / f"{out.name}.mcap"
@@ -108,35 +115,15 @@ def _check_target(folder: Path, table: Path, out: Path, options: ImportOptions) 
         raise InputError(table, f"--kind is {options.kind!r}, allowed: press, drag")
 
 
-def _write(
-    rows: list[_Row],
-    digests: list[bytes],
-    final: Path,
-    header: Header,
-    now_ns: Callable[[], int],
-    progress: Progress,
-) -> None:
-    with new_mcap(final, header, {}, {}) as writer:
-        pairs = zip(rows, digests, strict=True)
-        for row, digest in counted(pairs, "photographs written", len(rows), progress):
-            data, still = read_bounded(row.image, MAX_IMAGE_BYTES), row.stroke.still
-            if hashlib.sha256(data).digest() != digest:
-                raise InputError(row.image, "changed while it was imported")
-            data = upright(data)
-            image_kind = "png" if data.startswith(PNG_START) else "jpeg"
-            t_ns = now_ns()
-            writer.record(Outgoing(Topic.STILL, t_ns, t_ns, still, image_message(t_ns, data, image_kind)))
-            writer.record(Outgoing(Topic.STROKE, t_ns, t_ns, still, row.stroke))
-
-
-def _check(photograph: Path) -> bytes:
-    """Check that a photograph can be decoded, and return its digest for later checks. Raises `InputError`."""
-    data = read_bounded(photograph, MAX_IMAGE_BYTES)
+def _photograph(path: Path, t_ns: int) -> CompressedImage:
+    """A photograph that can be decoded, as it is recorded. Raises `InputError`."""
+    data = read_bounded(path, MAX_IMAGE_BYTES)
     try:
-        decode_gray(data, str(photograph))
+        decode_gray(data, str(path))
     except SessionDamaged as error:
-        raise InputError(photograph, error.what) from None
-    return hashlib.sha256(data).digest()
+        raise InputError(path, error.what) from None
+    data = upright(data)
+    return image_message(t_ns, data, "png" if data.startswith(PNG_START) else "jpeg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,152 +134,141 @@ class _Row:
     stroke: Stroke
 
 
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    """Header line of the table, and what holds for every line."""
-
-    table: Path
-    folder: Path
-    """Of the photographs, with links resolved."""
-    options: ImportOptions
-    names: list[str]
-    commanded: dict[str, tuple[str, float]]
-    """Stored name and unit factor of each column that is not in `SPECIAL`."""
-
-
-def _read_table(folder: Path, table: Path, options: ImportOptions) -> list[_Row]:
+def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[_Row]:
     """Read and check every line of the table, without opening a photograph. Raises `InputError` for line and column."""
-    if not table.is_file():
-        raise InputError(table, "no such table")
+    if not path.is_file():
+        raise InputError(path, "no such table")
     try:
-        text = read_bounded(table, MAX_TABLE_BYTES).decode("utf-8-sig")
+        text = read_bounded(path, MAX_TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(table, "is not UTF-8 text") from None
+        raise InputError(path, "is not UTF-8 text") from None
     lines = csv.reader((found[0] for found in LINE.finditer(text)), strict=True)
     rows: dict[str, _Row] = {}
     try:
-        names = [EARLIER_NAMES.get(name.strip(), name.strip()) for name in next(lines, list[str]())]
-        columns = _Columns(table, folder, options, names, _checked_names(table, options, names))
+        table = _Table(folder, path, options, next(lines, list[str]()))
         for cells in filter(any, lines):
             if len(rows) == MAX_ROWS:
-                raise InputError(table, f"has more than {MAX_ROWS} rows")
-            row = _row(columns, lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
+                raise InputError(path, f"has more than {MAX_ROWS} rows")
+            row = table.row(lines.line_num, [as_text(cell.strip()) for cell in cells], still=len(rows))
             if rows.setdefault(row.stroke.stroke_id, row) is not row:
-                raise InputError(table, f"line {lines.line_num}: stroke {row.stroke.stroke_id} appears twice")
+                raise InputError(path, f"line {lines.line_num}: stroke {row.stroke.stroke_id} appears twice")
     except csv.Error as error:
-        raise InputError(table, f"line {lines.line_num}: {error}") from None
+        raise InputError(path, f"line {lines.line_num}: {error}") from None
     if not rows:
-        raise InputError(table, "has no rows")
+        raise InputError(path, "has no rows")
     return list(rows.values())
 
 
-def _checked_names(table: Path, options: ImportOptions, names: list[str]) -> dict[str, tuple[str, float]]:
-    """Check the header line; return stored name and unit factor of each column that is not in `SPECIAL`."""
-    if not all(name.isprintable() for name in names):
-        raise InputError(table, "line 1 holds control characters: the names of the columns are expected there")
-    if "file" not in names:
-        raise InputError(table, f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
-    if "px_per_mm" not in names and "px_per_mm_x" not in names and options.px_per_mm is None:
-        raise InputError(table, "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm")
-    pressed = options.kind == "press"
-    required = [(name, "presses need it") for name in ("depth_mm", "tilt_deg", "start_x_px") if pressed]
-    for first, second in PAIRS:
-        required += [(b, f"`{a}` needs it") for a, b in ((first, second), (second, first)) if a in names]
-    for name, why in required:
-        if name not in names:
-            raise InputError(table, f"column `{name}` is missing; {why}")
-    commanded = {name: _unit(table, name) for name in names if name not in SPECIAL}
-    stored = [name for name in names if name in SPECIAL] + [commanded[name][0] for name in names if name in commanded]
-    for name in stored:
-        if stored.count(name) > 1:
-            raise InputError(table, f"column `{name}` occurs twice, perhaps in two units")
-    return commanded
+class _Table:
+    """The header line of a table, by which its lines are read."""
 
+    def __init__(self, folder: Path, path: Path, options: ImportOptions, names: list[str]) -> None:
+        """`folder` is that of the photographs, with links resolved. Raises `InputError`."""
+        self._folder, self._path, self._options = folder, path, options
+        self._names = [EARLIER_NAMES.get(name.strip(), name.strip()) for name in names]
+        self._check_names()
+        self._commanded = {name: self._unit(name) for name in self._names if name not in SPECIAL}
+        """Stored name and unit factor of each column that is not in `SPECIAL`."""
+        stored = [self._commanded[name][0] if name in self._commanded else name for name in self._names]
+        for name in stored:
+            if stored.count(name) > 1:
+                raise InputError(path, f"column `{name}` occurs twice, perhaps in two units")
 
-def _unit(table: Path, column: str) -> tuple[str, float]:
-    """Stored name and unit factor of a column `quantity_unit`; lengths are stored in mm and angles in deg."""
-    stem, _, suffix = column.rpartition("_")
-    if suffix in LENGTH_UNITS and stem:
-        return f"{stem}_mm", LENGTH_UNITS[suffix]
-    if suffix in ANGLE_UNITS and stem:
-        return f"{stem}_deg", ANGLE_UNITS[suffix]
-    if any(part in FRACTIONS for part in column.split("_")):
-        return column, 1.0
-    allowed = ", ".join([*LENGTH_UNITS, *ANGLE_UNITS, *FRACTIONS])
-    raise InputError(table, f"column `{column}` has no known unit; its name must end in one of: {allowed}")
+    def row(self, line: int, cells: list[str], still: int) -> _Row:
+        """One line of the table. Raises `InputError`."""
+        if len(cells) != len(self._names):
+            raise InputError(self._path, f"line {line} has {len(cells)} fields, expected {len(self._names)}")
+        fields = dict(zip(self._names, cells, strict=True))
 
+        def value(name: str, factor: float = 1.0) -> float:
+            return self._number(line, name, fields[name], factor)
 
-def _row(columns: _Columns, line: int, cells: list[str], still: int) -> _Row:
-    table = columns.table
-    if len(cells) != len(columns.names):
-        raise InputError(table, f"line {line} has {len(cells)} fields, expected {len(columns.names)}")
-    fields = dict(zip(columns.names, cells, strict=True))
+        def pair(first: str, second: str) -> tuple[float, float] | None:
+            return (value(first), value(second)) if first in fields else None
 
-    def value(name: str, factor: float = 1.0) -> float:
+        image = self._image(line, fields["file"])
+        scale = pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0])
+        if scale is None and self._options.px_per_mm is not None:
+            scale = (self._options.px_per_mm, self._options.px_per_mm)
+        if scale is None or not all(MIN_PX_PER_MM <= s <= MAX_PX_PER_MM for s in scale):
+            raise InputError(
+                self._path, f"line {line}: px_per_mm = {scale}, allowed: {MIN_PX_PER_MM} to {MAX_PX_PER_MM}"
+            )
+        name = fields.get("name", image.relative_to(self._folder).with_suffix("").as_posix())
+        if "name" in fields and (not name or not name.isprintable() or len(name) > MAX_NAME_CHARS):
+            allowed = f"allowed are 1 to {MAX_NAME_CHARS} printable characters"
+            raise self._wrong(line, "name", f"{name[:80]!r} is not a valid name; {allowed}")
+        stroke = Stroke(
+            stroke_id=name,
+            kind="press" if self._options.kind == "press" else "drag",
+            still=still,
+            depth_mm=value("depth_mm") if "depth_mm" in fields else None,
+            tilt_deg=value("tilt_deg") if "tilt_deg" in fields else None,
+            anchor_px=pair(*PAIRS[1]),
+            px_per_mm=scale,
+            commanded={stored: value(column, factor) for column, (stored, factor) in self._commanded.items()},
+        )
+        return _Row(image, stroke)
+
+    def _check_names(self) -> None:
+        names, pressed = self._names, self._options.kind == "press"
+        if not all(name.isprintable() for name in names):
+            raise InputError(self._path, "line 1 holds control characters: the names of the columns are expected there")
+        if "file" not in names:
+            raise InputError(self._path, f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
+        if "px_per_mm" not in names and "px_per_mm_x" not in names and self._options.px_per_mm is None:
+            what = "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing; or give --px-per-mm"
+            raise InputError(self._path, what)
+        required = [(name, "presses need it") for name in ("depth_mm", "tilt_deg", "start_x_px") if pressed]
+        for first, second in PAIRS:
+            required += [(b, f"`{a}` needs it") for a, b in ((first, second), (second, first)) if a in names]
+        for name, why in required:
+            if name not in names:
+                raise InputError(self._path, f"column `{name}` is missing; {why}")
+
+    def _unit(self, column: str) -> tuple[str, float]:
+        """Stored name and unit factor of a column `quantity_unit`; lengths are stored in mm and angles in deg."""
+        stem, _, suffix = column.rpartition("_")
+        if suffix in LENGTH_UNITS and stem:
+            return f"{stem}_mm", LENGTH_UNITS[suffix]
+        if suffix in ANGLE_UNITS and stem:
+            return f"{stem}_deg", ANGLE_UNITS[suffix]
+        if any(part in FRACTIONS for part in column.split("_")):
+            return column, 1.0
+        allowed = ", ".join([*LENGTH_UNITS, *ANGLE_UNITS, *FRACTIONS])
+        raise InputError(self._path, f"column `{column}` has no known unit; its name must end in one of: {allowed}")
+
+    def _number(self, line: int, column: str, text: str, factor: float) -> float:
+        """A number in its stored unit, within its range; a drag may lean to either side of its path."""
+        least, most = -MOST, MOST
+        if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
+            least, most = 0.0, DEEPEST_MM
+        elif column == "tilt_deg":
+            least, most = (0.0 if self._options.kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
         try:
-            parsed = number(fields[name]) * factor
+            stored = number(text) * factor
         except ValueError:
-            parsed = math.nan
-        if not math.isfinite(parsed):
-            raise InputError(table, f"line {line}, column `{name}`: {fields[name][:80]!r} is not a finite number")
-        least, most = _range(name, columns.options.kind)
-        if not least <= parsed <= most:
-            wrong = f"{fields[name][:80]!r}, allowed: {least / factor:g} to {most / factor:g}"
-            raise InputError(table, f"line {line}, column `{name}`: {wrong}")
-        return parsed
+            stored = math.nan
+        if not math.isfinite(stored):
+            raise self._wrong(line, column, f"{text[:80]!r} is not a finite number")
+        if not least <= stored <= most:
+            raise self._wrong(line, column, f"{text[:80]!r}, allowed: {least / factor:g} to {most / factor:g}")
+        return stored
 
-    def pair(first: str, second: str) -> tuple[float, float] | None:
-        return (value(first), value(second)) if first in fields else None
+    def _image(self, line: int, name: str) -> Path:
+        """Path of the photograph, with links resolved. Raises `InputError` where it is not in the folder."""
+        if not name.isprintable():
+            raise self._wrong(line, "file", f"{name[:80]!r} holds control characters")
+        image = self._folder / name
+        try:
+            image = image.resolve()
+            inside, there = image.is_relative_to(self._folder), image.is_file()
+        except (OSError, RuntimeError):
+            inside = there = False  # the name is too long, or links form a loop
+        if not (inside and there):
+            where = "is not in" if inside else "lies outside"
+            raise InputError(self._path, f"line {line}: file {name[:80]!r} {where} {self._folder.name}/")
+        return image
 
-    image = _image(columns, line, fields["file"])
-    scale = pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0])
-    if scale is None and columns.options.px_per_mm is not None:
-        scale = (columns.options.px_per_mm, columns.options.px_per_mm)
-    if scale is None or not all(MIN_PX_PER_MM <= s <= MAX_PX_PER_MM for s in scale):
-        raise InputError(table, f"line {line}: px_per_mm = {scale}, allowed: {MIN_PX_PER_MM} to {MAX_PX_PER_MM}")
-    stroke = Stroke(
-        stroke_id=_name(columns, line, fields["name"])
-        if "name" in fields
-        else image.relative_to(columns.folder).with_suffix("").as_posix(),
-        kind="press" if columns.options.kind == "press" else "drag",
-        still=still,
-        depth_mm=value("depth_mm") if "depth_mm" in fields else None,
-        tilt_deg=value("tilt_deg") if "tilt_deg" in fields else None,
-        anchor_px=pair(*PAIRS[1]),
-        px_per_mm=scale,
-        commanded={stored: value(name, factor) for name, (stored, factor) in columns.commanded.items()},
-    )
-    return _Row(image, stroke)
-
-
-def _range(column: str, kind: str) -> tuple[float, float]:
-    """Allowed range of a column, in its stored unit; a drag may lean to either side of its path."""
-    if column.startswith(DEPTHS) and column.rpartition("_")[2] in LENGTH_UNITS:
-        return 0.0, DEEPEST_MM
-    if column == "tilt_deg":
-        return (0.0 if kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
-    return -MOST, MOST
-
-
-def _name(columns: _Columns, line: int, name: str) -> str:
-    if not name or not name.isprintable() or len(name) > MAX_NAME_CHARS:
-        allowed = f"allowed are 1 to {MAX_NAME_CHARS} printable characters"
-        raise InputError(columns.table, f"line {line}, column `name`: {name[:80]!r} is not a valid name; {allowed}")
-    return name
-
-
-def _image(columns: _Columns, line: int, name: str) -> Path:
-    """Path of the photograph, with links resolved. Raises `InputError` where it is not in the folder."""
-    if not name.isprintable():
-        raise InputError(columns.table, f"line {line}, column `file`: {name[:80]!r} holds control characters")
-    image = columns.folder / name
-    try:
-        image = image.resolve()
-        inside, there = image.is_relative_to(columns.folder), image.is_file()
-    except (OSError, RuntimeError):
-        inside = there = False  # the name is too long, or links form a loop
-    if not inside:
-        raise InputError(columns.table, f"line {line}: file {name[:80]!r} lies outside {columns.folder.name}/")
-    if not there:
-        raise InputError(columns.table, f"line {line}: file {name[:80]!r} is not in {columns.folder.name}/")
-    return image
+    def _wrong(self, line: int, column: str, what: str) -> InputError:
+        return InputError(self._path, f"line {line}, column `{column}`: {what}")

@@ -236,19 +236,6 @@ def test_a_name_that_is_no_session_id_is_refused(rows, photos, tmp_path):
         imports.import_photographs(photos, rows, tmp_path / "-x y", ImportOptions(), "", lambda: 0)
 
 
-def test_a_photograph_that_changes_under_the_import_is_refused(rows, photos, refusal, monkeypatch):
-    (photos.parent / "sessions").mkdir()
-    read = imports.read_bounded
-    seen = []
-
-    def change(path, max_bytes):
-        seen.append(path)
-        return read(path, max_bytes) + b"x" * (len(seen) > 3)
-
-    monkeypatch.setattr(imports, "read_bounded", change)
-    assert refusal() == "photos/a.png: changed while it was imported"
-
-
 @pytest.mark.parametrize("call", ["mkdir", "fsync"])
 def test_a_disk_without_room_is_refused(rows, photos, refusal, monkeypatch, call):
     (photos.parent / "sessions").mkdir()
