@@ -52,7 +52,6 @@ from brushloop.sessions.records import (
     HEADER_NOTE,
     Event,
     Header,
-    Recorded,
     Topic,
     note,
 )
@@ -359,21 +358,22 @@ class SegmentWriter:
             raise SessionError(self._part, f"{QUEUE_LIMIT} messages wait: the disk does not keep up")
         self._queue.put(outgoing)
 
-    def finish(self, finished: dict[str, Any] | None = None) -> Recorded:
-        """Drain, finish, fsync, rename, fsync the folder. Raises `SessionError`; the part file then stays.
+    def finish(self, finished: dict[str, Any] | None = None) -> str:
+        """Drain, finish, fsync, rename, fsync the folder, and return the file's digest.
 
-        `finished` is stored inside as metadata, with the counts of messages.
+        `finished` is stored inside as metadata, with the counts of messages. Raises `SessionError`; the part file then
+        stays.
         """
         self._finished = finished
         self._join()
         self._raise_error()
         try:
-            recorded = Recorded(dict(self.counts), file_sha256(self._part), self._part.stat().st_size)
+            sha256 = file_sha256(self._part)
             self._part.rename(self.final)
             fsync_folder(self.final.parent)
         except OSError as error:
             raise disk_error(self._part, "cannot finish", error) from error
-        return recorded
+        return sha256
 
     def abandon(self) -> None:
         """End the thread and keep the part file as evidence of an interrupted step."""

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
-from brushloop.sessions.events import CaptureResult, DipResult, Remark, ZeroTouchResult, line_of
+from brushloop.sessions.events import CaptureResult, Remark, line_of
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, replay, undamaged
 from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
@@ -245,44 +245,6 @@ def _first_error(kind: type[Event], error: ValidationError) -> str:
     first = error.errors()[0]
     field = ".".join(str(part) for part in first["loc"])
     return " ".join(f"{kind.__name__}.{field}: {first['msg']}".split())
-
-
-@dataclass(frozen=True, slots=True)
-class History:
-    """Takes and paper heights of one session, from its journal."""
-
-    photographed: int
-    """Marks that were photographed and judged."""
-    pressed_again: tuple[str, ...]
-    """Strokes of takes that did not count and were repeated on another patch."""
-    left_out: tuple[str, ...]
-    """Strokes that were given up, or skipped by the operator."""
-    touches: tuple[ZeroTouchResult, ...]
-    """Zero touches in order of time."""
-
-    @property
-    def moved_mm(self) -> float:
-        """Difference between the highest and the lowest paper found, mm."""
-        heights = [touch.touch_z_mm for touch in self.touches]
-        return max(heights) - min(heights) if heights else 0.0
-
-
-def history_of(folder: Path) -> History | None:
-    """Read the journal; None for a recording without one. Raises `SessionDamaged`."""
-    journal = folder / JOURNAL_NAME
-    if not journal.is_file():
-        return None
-    state = replay(journal)
-    captures = state.results(CaptureResult)
-    rejected = [capture for capture in captures if not capture.kept]
-    skipped = [dip.skipped for dip in state.results(DipResult) if dip.skipped is not None]
-    left_out = [*(capture.press for capture in rejected if not capture.retake), *skipped]
-    return History(
-        len(captures),
-        tuple(capture.press.stroke_id for capture in rejected if capture.retake),
-        tuple(press.stroke_id for press in left_out),
-        tuple(state.results(ZeroTouchResult)),
-    )
 
 
 def waits_of(state: RunState) -> dict[int, float]:

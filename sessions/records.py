@@ -221,15 +221,6 @@ class Condition:
     heading_deg: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Recorded:
-    """Number of messages by topic, and the digest of the file that holds them."""
-
-    counts: dict[str, int]
-    sha256: str
-    size_bytes: int
-
-
 def note(values: Mapping[str, Any]) -> dict[str, str]:
     """Values as MCAP metadata: each as JSON, so that it reads back unchanged, and a CRC, which MCAP lacks."""
     texts = {name: json.dumps(value, separators=(",", ":"), allow_nan=False) for name, value in values.items()}

@@ -158,14 +158,14 @@ class SessionStore:
         begin, t_ns = attempt.begin, self._now_ns()
         identity = {"t_ns": t_ns, "key": begin.key, "attempt": begin.attempt}
         noted = {**identity, "result": result.model_dump(mode="json", exclude_none=True)}
-        recorded = attempt.writer.finish(noted)
+        sha256 = attempt.writer.finish(noted)
         done = Done(
             t_ns=t_ns,
             key=begin.key,
             attempt=begin.attempt,
             file=begin.file,
-            sha256=recorded.sha256,
-            counts=recorded.counts,
+            sha256=sha256,
+            counts=dict(attempt.writer.counts),
             result=result,
         )
         self._log(done)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ from brushloop.calibrate.validate.rows import Cell, Rows
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Outcome
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
 from brushloop.model.brush import DomainError
-from brushloop.sessions.recording import history_of
+from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.show import details
 
 MEASURES = ("csim", "ssim")
@@ -239,7 +241,7 @@ def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
         length_ratio=length,
         width_ratio=width,
         deepest_miss=_deepest_miss(one, [outcome.rows[int(k)].press for k in mine]),
-        collected=_collected(one),
+        collected=collected_in(one.recording.path.parent),
     )
 
 
@@ -251,18 +253,23 @@ def _deepest_miss(one: LoadedSession, presses: list[Press]) -> DepthMiss | None:
     return DepthMiss(stroke_id=press.stroke_id, depth_mm=press.depth_mm, reached_mm=round(reached, 3))
 
 
-def _collected(one: LoadedSession) -> Collected | None:
-    folder = one.recording.path.parent
-    history = history_of(folder)
-    if history is None:
+def collected_in(folder: Path) -> Collected | None:
+    """How the strokes of a folder were collected; None for a recording without a journal. Raises `SessionDamaged`."""
+    if not (folder / JOURNAL_NAME).is_file():
         return None
+    state = replay(folder / JOURNAL_NAME)
+    captures, touches = state.results(CaptureResult), state.results(ZeroTouchResult)
+    rejected = [capture for capture in captures if not capture.kept]
+    skipped = [dip.skipped for dip in state.results(DipResult) if dip.skipped is not None]
+    left_out = [*(capture.press for capture in rejected if not capture.retake), *skipped]
+    heights_mm = [touch.touch_z_mm for touch in touches] or [0.0]
     return Collected(
         planned=details(folder).planned,
-        photographed=history.photographed,
-        pressed_again=history.pressed_again,
-        left_out=history.left_out,
-        touches=tuple(f"{found.method} {found.touch_z_mm:.2f} mm" for found in history.touches),
-        moved_mm=_round(history.moved_mm),
+        photographed=len(captures),
+        pressed_again=tuple(capture.press.stroke_id for capture in rejected if capture.retake),
+        left_out=tuple(press.stroke_id for press in left_out),
+        touches=tuple(f"{touch.method} {touch.touch_z_mm:.2f} mm" for touch in touches),
+        moved_mm=_round(max(heights_mm) - min(heights_mm)),
     )
 
 
