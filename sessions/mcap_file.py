@@ -11,7 +11,8 @@ import os
 import struct
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -133,44 +134,35 @@ class McapFile:
         Without `parts`, all chunks are read but those that `check` found damaged. Raises `SessionDamaged`.
         """
         wanted = None if topics is None else frozenset(topics)
-        with opened(self.path) as file:
-            try:
-                for part in self.parts if parts is None else parts:
-                    if not part.sound or (wanted is not None and not self.may_hold(part, wanted)):
-                        continue
-                    for message in _messages(_chunk(file, part.offset), self.channels):
-                        schema, channel = self.channels[message.channel_id]
-                        if wanted is None or channel.topic in wanted:
-                            yield schema, channel, message
-            except UNREADABLE as error:
-                raise self._unreadable(error) from None
+        with self._reading() as file:
+            for part in self.parts if parts is None else parts:
+                if not part.sound or (wanted is not None and not self.may_hold(part, wanted)):
+                    continue
+                for message in _messages(_chunk(file, part.offset), self.channels):
+                    schema, channel = self.channels[message.channel_id]
+                    if wanted is None or channel.topic in wanted:
+                        yield schema, channel, message
 
     def packed_chunks(self) -> Iterator[tuple[bytes, ChunkIndex, Counter[int]]]:
         """Every chunk as its bytes, with the indexes of its messages, and its messages by channel; CRCs are checked.
 
         Raises `SessionDamaged`.
         """
-        with opened(self.path) as file:
-            try:
-                for part in self.parts:
-                    counts, _records = _counted(_chunk(file, part.offset))
-                    index = part.index
-                    size = 0 if index is None else index.chunk_length + index.message_index_length
-                    if index is None or not counts.keys() <= self.channels.keys() or size > _size(file):
-                        raise McapError("a chunk is not as the index states")
-                    file.seek(part.offset)
-                    yield file.read(size), index, counts
-            except UNREADABLE as error:
-                raise self._unreadable(error) from None
+        with self._reading() as file:
+            for part in self.parts:
+                counts, _records = _counted(_chunk(file, part.offset))
+                index = part.index
+                size = 0 if index is None else index.chunk_length + index.message_index_length
+                if index is None or not counts.keys() <= self.channels.keys() or size > _size(file):
+                    raise McapError("a chunk is not as the index states")
+                file.seek(part.offset)
+                yield file.read(size), index, counts
 
     def attachments(self) -> Iterator[Attachment]:
         """Attached files, byte for byte, but those that `check` found damaged. Raises `SessionDamaged`."""
-        with opened(self.path) as file:
-            try:
-                for offset in self._attached:
-                    yield _attachment(file, offset)
-            except UNREADABLE as error:
-                raise self._unreadable(error) from None
+        with self._reading() as file:
+            for offset in self._attached:
+                yield _attachment(file, offset)
 
     def check(self) -> None:
         """Check every CRC in the file and count its messages; none is decoded."""
@@ -270,8 +262,14 @@ class McapFile:
     def _add_damage(self, name: str, offset: int, error: Exception) -> None:
         self.damage.append(f"the {name} at byte {offset} cannot be read ({in_one_line(error)})")
 
-    def _unreadable(self, error: Exception) -> SessionDamaged:
-        return SessionDamaged(self.path, f"cannot read: {in_one_line(error)}")
+    @contextmanager
+    def _reading(self) -> Generator[IO[bytes]]:
+        """The file, open within the block; what cannot be read in it is `SessionDamaged`."""
+        with opened(self.path) as file:
+            try:
+                yield file
+            except UNREADABLE as error:
+                raise SessionDamaged(self.path, f"cannot read: {in_one_line(error)}") from None
 
 
 def open_mcap(path: Path) -> McapFile:
