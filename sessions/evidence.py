@@ -37,7 +37,7 @@ from brushloop.sessions.events import (
 )
 from brushloop.sessions.journal import JOURNAL_NAME, Fault, Reading, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
-from brushloop.sessions.recording import parse_header
+from brushloop.sessions.recording import merged_file, parse_header
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, Header, Topic
 from brushloop.sessions.run_state import DoneTwice, RunState
 from brushloop.sessions.show import step_words
@@ -52,6 +52,8 @@ class Evidence:
     """A session's folder as it is, and as it must have been."""
 
     folder: Path
+    final: Path
+    """The merged file."""
     has_journal: bool
     reading: Reading
     files: dict[str, McapFile]
@@ -68,11 +70,6 @@ class Evidence:
     """Files that are not of the steps that the journal lists, and what they are."""
     state: RunState = field(default_factory=RunState)
     """State after all events."""
-
-    @property
-    def final(self) -> Path:
-        """The merged file."""
-        return self.folder / f"{self.folder.name}.mcap"
 
     @property
     def intact(self) -> bool:
@@ -135,22 +132,22 @@ def _place(event: Event) -> float:
 
 def _read(folder: Path) -> Evidence:
     """Read the journal and the files, and find out whose they are."""
-    path = folder / JOURNAL_NAME
-    too_large: list[Fault] = []
-    has_journal = check_file(path)
+    data, too_large = b"", list[Fault]()
+    has_journal = check_file(folder / JOURNAL_NAME)
     try:
-        data = read_journal(path) if has_journal else b""
+        data = read_journal(folder / JOURNAL_NAME) if has_journal else data
     except SessionDamaged as error:
-        data, too_large = b"", [Fault(1, error.what)]
-    final = folder / f"{folder.name}.mcap"
-    files = {path.name: scan(path) for path in [*_step_files(folder), *([final] if final.is_file() else [])]}
+        too_large = [Fault(1, error.what)]
     reading = read(data)
+    # A damaged journal may have lost the name of the merged file.
+    final = merged_file(folder, reading.state if has_journal and not reading.faults else None)
+    files = {path.name: scan(path) for path in [*_step_files(folder), *([final] if final.is_file() else [])]}
     named = "" if reading.state.opened is None else reading.state.opened.header.session_id
     session = _session(folder.name, named, Counter(found.session for found in files.values() if found.session))
     if session not in ("", named):
         reading = read(data, session)
     reading.faults[:0] = too_large
-    return Evidence(folder, has_journal, reading, files, session)
+    return Evidence(folder, final, has_journal, reading, files, session)
 
 
 def _session(folder: str, named: str, files: Counter[str]) -> str:
@@ -270,7 +267,7 @@ def _rebuild_closed(evidence: Evidence) -> None:
     It holds more where the files of steps are lost with their lines: it is then the only copy.
     """
     found, state = evidence.files.get(evidence.final.name), evidence.state
-    if state.closed is not None or found is None or found.damage or evidence.foreign(found):
+    if state.closed is not None or found is None or found.damage or found.session != evidence.session:
         return
     if found.counts and found.counts >= Counter(state.counts()):
         event = closed(evidence.final, dict(found.counts), state.last_ns)

@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
-from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, in_one_line
+from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.events import CaptureResult, Remark, line_of
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, replay, undamaged
 from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap
@@ -64,7 +64,7 @@ class Recording:
     """One finished recording, opened by its folder or its MCAP file."""
 
     def __init__(self, path: Path) -> None:
-        self.path = _find_mcap(path)
+        self.path = _finished(path)
         self._file = open_mcap(self.path)
         self.header = parse_header(self._file)
 
@@ -154,35 +154,39 @@ class Recording:
             yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
 
 
-def check_name(folder: Path) -> None:
-    """Raise `InputError`, with advice, for a folder that was renamed or holds links, and for an unfinished file."""
-    if folder.suffix == ".part" and folder.is_file():
-        what = "was never finished, because a step or a merge was cut: it is kept as evidence and is not a recording"
-        raise InputError(folder, f"{what}. Give the session's folder, {folder.parent}")
-    if folder.is_dir():
-        check_folder(folder)
-    recording = recording_of_renamed(folder)
-    if recording is not None:
-        raise InputError(
-            folder,
-            f"was renamed: its recording is called {recording.name}. Nothing is damaged by that. Rename the folder "
-            f"back to {recording.stem}, or give the file {recording} itself",
-        )
+def merged_file(folder: Path, state: RunState | None = None) -> Path:
+    """Where a session's one recording is: under the folder's name, or, if the folder was renamed, under its old one.
 
-
-def recording_of_renamed(folder: Path) -> Path | None:
-    """Return the only recording in a folder if its name differs from the folder's; None otherwise.
-
-    Also None for an open session, which may be renamed: the files of its steps do not carry its name.
+    `state` is that of its journal; without one, the only recording in the folder is the session's.
     """
-    name = folder.resolve().name
+    own = folder / f"{folder.resolve().name}.mcap"
+    if own.exists():
+        return own
+    if state is not None:
+        return own if state.closed is None else folder / state.closed.file
     recordings = [path for path in folder.glob("*.mcap") if not SEGMENT_NAME.fullmatch(path.name)]
-    if (folder / f"{name}.mcap").exists() or len(recordings) != 1 or _is_open(folder):
-        return None
-    return recordings[0]
+    return recordings[0] if len(recordings) == 1 else own
 
 
-def not_a_session(folder: Path) -> InputError:
+def find_recording(path: Path, state: RunState | None = None) -> Path:
+    """The MCAP file that a path names, or that of a session's folder. Raises `InputError` where there is none."""
+    check_path(path)
+    found = merged_file(path, state) if path.is_dir() else path
+    if not found.is_file():
+        raise _no_recording(path)
+    return found
+
+
+def check_path(path: Path) -> None:
+    """Raise `InputError` for a folder that holds links, and, with advice, for an unfinished file."""
+    if path.suffix == ".part" and path.is_file():
+        what = "was never finished, because a step or a merge was cut: it is kept as evidence and is not a recording"
+        raise InputError(path, f"{what}. Give the session's folder, {path.parent}")
+    if path.is_dir():
+        check_folder(path)
+
+
+def _no_recording(folder: Path) -> InputError:
     """Make the error for a path without a recording; the message says what to give instead."""
     if not folder.is_dir():
         return InputError(folder, "no such session: give a session's folder or its .mcap file")
@@ -195,26 +199,14 @@ def not_a_session(folder: Path) -> InputError:
     return InputError(folder, f"is not a session: it holds neither {JOURNAL_NAME} nor a recording {name}")
 
 
-def _is_open(folder: Path) -> bool:
-    try:
-        return (folder / JOURNAL_NAME).is_file() and replay(folder / JOURNAL_NAME).is_open
-    except SessionError:
-        return False
-
-
-def _find_mcap(path: Path) -> Path:
-    check_name(path)
+def _finished(path: Path) -> Path:
+    check_path(path)
     if path.is_file():
         check_companions(path.parent)
-        return path
-    if not path.is_dir():
-        raise not_a_session(path)
-    merged = path / f"{path.resolve().name}.mcap"
-    if (path / JOURNAL_NAME).is_file() and replay(path / JOURNAL_NAME).is_open:
+    state = replay(path / JOURNAL_NAME) if (path / JOURNAL_NAME).is_file() else None
+    if state is not None and state.is_open:
         raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
-    if not merged.is_file():
-        raise not_a_session(path)
-    return merged
+    return find_recording(path, state)
 
 
 def parse_header(file: McapFile) -> Header:

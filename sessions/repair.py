@@ -33,7 +33,7 @@ from brushloop.sessions.events import (
 from brushloop.sessions.evidence import Evidence, event_words, gather, is_collected
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
-from brushloop.sessions.recording import check_name, not_a_session
+from brushloop.sessions.recording import check_path, find_recording
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE, StepEvent, Topic
 from brushloop.sessions.salvage import (
     Report,
@@ -58,21 +58,14 @@ Step = tuple[str, int]
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` if nothing can be rebuilt.
 
-    `InputError` for anything that is not a session, and for a renamed folder, which needs no repair.
-    `SessionLocked` while another process has the session open, `DiskFull` and `SessionError` if the disk fails.
+    `InputError` for anything that is not a session, `SessionLocked` while another process has the session open,
+    `DiskFull` and `SessionError` if the disk fails.
     """
     target = path.resolve()
-    if not target.exists():
-        raise not_a_session(path)
     try:
-        check_name(path)
-        if target.is_file():
-            return repair_file(target)
+        check_path(path)
         if not is_collected(target):
-            final = target / f"{target.name}.mcap"
-            if not final.is_file():
-                raise not_a_session(path)
-            return repair_file(final)
+            return repair_file(find_recording(path).resolve())
         held = lock(target)
         try:
             return _FolderRepair(gather(target), now_ns).run()

@@ -22,7 +22,7 @@ from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import Begin, CaptureResult, DipResult, Done, DrawResult, PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
-from brushloop.sessions.recording import Recording, check_name, recording_of_renamed, remarks_of
+from brushloop.sessions.recording import Recording, check_path, merged_file, remarks_of
 from brushloop.sessions.records import Header
 from brushloop.sessions.run_state import KILLED, RunState
 
@@ -95,7 +95,7 @@ class Details:
 def details(path: Path) -> Details:
     """Describe a session's folder or an MCAP file. Raises `InputError`, `SessionDamaged`."""
     if (path / JOURNAL_NAME).is_file():
-        check_name(path)
+        check_path(path)
         return _of_journal(path.resolve())
     recording = Recording(path)
     shown = _of_header(recording.header, "recording")
@@ -135,7 +135,7 @@ def _of_journal(folder: Path) -> Details:
     shown.grid = _grid(((condition.depth_mm, condition.tilt_deg) for condition in counted), planned)
     shown.planned = sum(planned.values()) if planned else None
     shown.repairs = [f"{repair.event} {repair.file}: {repair.why}" for repair in state.repairs]
-    final = folder / f"{folder.name}.mcap"
+    final = merged_file(folder, state)
     if state.closed is not None and final.is_file():
         shown.file, shown.size_bytes = final.name, final.stat().st_size
     return shown
@@ -220,18 +220,14 @@ def summaries(root: Path) -> Iterator[Summary]:
 
 def _summary(folder: Path) -> Summary | None:
     check_folder(folder)
-    collected = (folder / JOURNAL_NAME).is_file()
-    if collected and (state := replay(folder / JOURNAL_NAME)).is_open:
+    state = replay(folder / JOURNAL_NAME) if (folder / JOURNAL_NAME).is_file() else None
+    if state is not None and state.is_open:
         return Summary(folder.name, "open", "", state.strokes(), "")
-    merged = folder / f"{folder.name}.mcap"
-    renamed = None if merged.is_file() else recording_of_renamed(folder)
-    if renamed is None and not merged.is_file():
+    if not merged_file(folder, state).is_file():
         return None
-    recording = Recording(renamed or merged)
+    recording = Recording(folder)
     state_name = "imported" if recording.header.source.imported else "closed"
-    if renamed is not None:
-        return Summary(folder.name, "renamed", recording.header.source, recording.strokes(), renamed.name)
-    return Summary(folder.name, state_name, recording.header.source, recording.strokes(), merged.name)
+    return Summary(folder.name, state_name, recording.header.source, recording.strokes(), recording.path.name)
 
 
 def renderables(details: Details, *, files: bool = False) -> Iterator[RenderableType]:

@@ -46,6 +46,7 @@ from brushloop.sessions.events import (
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, read_header, replay
 from brushloop.sessions.mcap_file import McapFile, count_messages
 from brushloop.sessions.mcap_writer import SegmentWriter, new_mcap
+from brushloop.sessions.recording import merged_file
 from brushloop.sessions.records import REPAIRS_NOTE, Header
 from brushloop.sessions.run_state import RunState
 
@@ -238,7 +239,7 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
     is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts, and
     for a sound file of that name with messages that the steps do not have.
     """
-    final = folder / f"{folder.name}.mcap"
+    final = merged_file(folder, state)
     if final.exists():
         _check_not_emptier(final, state, header)
         set_aside(final, tag)

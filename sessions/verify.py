@@ -19,7 +19,7 @@ from brushloop.sessions.evidence import Evidence, gather, is_collected
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.recording import Recording, check_name, not_a_session
+from brushloop.sessions.recording import Recording, check_path, find_recording
 from brushloop.sessions.records import HEADER_NOTE, Stroke, Topic
 from brushloop.sessions.show import details, step_words
 from brushloop.sessions.terminal import Progress, counted, unseen
@@ -67,18 +67,11 @@ class Verdict:
 def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
     """Check a session's folder, or one MCAP file.
 
-    Raises `InputError` where it is neither, is of another program, was renamed, or holds links.
+    Raises `InputError` where it is neither, is of another program, or holds links.
     """
-    check_name(path)
-    if path.is_file():
-        return _verify_file(path, path.name, progress)
-    if not path.is_dir():
-        raise not_a_session(path)
+    check_path(path)
     if not is_collected(path):
-        final = path / f"{path.resolve().name}.mcap"
-        if not final.is_file():
-            raise not_a_session(path)
-        return _verify_file(final, final.stem, progress)
+        return _verify_file(find_recording(path), path.resolve().name, progress)
     try:
         evidence = gather(path.resolve())
     except SessionDamaged as error:

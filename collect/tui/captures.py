@@ -27,7 +27,7 @@ from brushloop.sessions.events import CaptureResult, Remark
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.recording import remarks_of, unlike, waits_of
+from brushloop.sessions.recording import merged_file, remarks_of, unlike, waits_of
 from brushloop.sessions.records import Check, Quality, Stroke, Topic
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class Review:
 
     def _make_pictures(self, capture: ReviewCapture) -> CapturePictures:
         path = self.folder / capture.file
-        path = path if path.is_file() else self.folder / f"{self.folder.name}.mcap"
+        path = path if path.is_file() else merged_file(self.folder)
         image, log_ns, stroke = None, 0, None
         checks: tuple[Check, ...] = ()
         for _schema, channel, message in open_mcap(path).messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):

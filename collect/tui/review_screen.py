@@ -25,7 +25,7 @@ from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain
 from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.events import Remark
-from brushloop.sessions.recording import add_remark
+from brushloop.sessions.recording import add_remark, merged_file
 
 KEYS = (
     ("escape", "back"),
@@ -274,7 +274,7 @@ def _words(
 
 
 def _where(capture: ReviewCapture, pictures: CapturePictures | None, folder: Path) -> str:
-    file = capture.file if (folder / capture.file).is_file() else f"{folder.name}.mcap"
+    file = capture.file if (folder / capture.file).is_file() else merged_file(folder).name
     return f"{file}  still {capture.still}" + ("" if pictures is None else f"  at {pictures.log_ns / 1e9:.3f} s")
 
 

@@ -42,7 +42,6 @@ AGE_S = 5.0
 SIGNS = {
     "open": ("▶", "bold $text-warning"),
     "damaged": ("!", "bold $text-error"),
-    "renamed": ("!", "bold $text-warning"),
 }
 FRESH = "A new session: is a blank sheet in as its sheet 1?"
 
