@@ -37,12 +37,12 @@ from brushloop.sessions.recording import check_path, find_recording
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE, StepEvent, Topic
 from brushloop.sessions.salvage import (
     Report,
+    Strokes,
     kept_words,
     lost_words,
     parsed,
     repair_file,
     replace_damaged,
-    with_their_stills,
     write_anew,
 )
 from brushloop.sessions.show import step_words
@@ -273,7 +273,7 @@ class _FolderRepair:
     def _merge_again(self) -> None:
         """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
         found, strokes = self._evidence.files.get(self._final.name), self._state.counts().get(Topic.STROKE, 0)
-        if found is not None and not self._evidence.foreign(found) and len(with_their_stills(found).kept) > strokes:
+        if found is not None and not self._evidence.foreign(found) and len(Strokes(found).kept) > strokes:
             self._lost_steps = self._rewrite_final(found)
             return
         why = "; ".join(self._final_problems)
@@ -284,7 +284,7 @@ class _FolderRepair:
 
     def _rewrite_final(self, found: McapFile) -> list[str]:
         """Rewrite the merged file, and return descriptions of what was lost."""
-        strokes = with_their_stills(found)
+        strokes = Strokes(found)
         names = {} if self._state.opened is None else self._state.opened.snapshots
         files = {a.name: a.data for a in found.attachments()} | {name: text.encode() for name, text in names.items()}
         repairs = [line_of(repair) for repair in self._state.repairs]

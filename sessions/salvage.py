@@ -56,11 +56,15 @@ def parsed(kind: type[_E], message: Message) -> _E | None:
 
 def write_anew(path: Path, data: bytes) -> str:
     """Replace a file; return the name under which the old one is kept, or an empty string. Raises `OSError`."""
-    kept = set_aside(path, "damaged").name if path.exists() else ""
     fresh = path.with_name(path.name + ".repair")
     with fresh.open("wb") as file:
         file.write(data)
         sync(file)
+    return _put_in_place(fresh, path)
+
+
+def _put_in_place(fresh: Path, path: Path) -> str:
+    kept = set_aside(path, "damaged").name if path.exists() else ""
     fresh.replace(path)
     fsync_folder(path.parent)
     return kept
@@ -86,46 +90,39 @@ def replace_damaged(
             for record in messages:
                 writer.copy(*record)
         counts = count_messages(fresh)
-        kept = set_aside(path, "damaged").name if path.exists() else ""
-        fresh.replace(path)
-        fsync_folder(path.parent)
+        kept = _put_in_place(fresh, path)
     except OSError as error:
         raise disk_error(path, "cannot write its repaired copy", error) from error
     return kept, counts
 
 
-@dataclass(frozen=True, slots=True)
 class Strokes:
     """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
 
-    found: McapFile
-    kept: tuple[str, ...]
-    photograph_lost: tuple[str, ...]
-    """Strokes whose still cannot be read."""
+    def __init__(self, found: McapFile) -> None:
+        self._found = found
+        self.kept: dict[str, int] = {}
+        """Number of the still that shows it, by name of the stroke."""
+        stills, named = set[int](), dict[str, None]()
+        for _schema, channel, message in found.messages((Topic.STILL, Topic.STROKE)):
+            if channel.topic == Topic.STILL and _shows(message):
+                stills.add(message.sequence)
+            elif channel.topic == Topic.STROKE and (stroke := parsed(Stroke, message)) is not None:
+                named[stroke.stroke_id] = None
+                if stroke.still in stills:
+                    self.kept.setdefault(stroke.stroke_id, stroke.still)
+        self.photograph_lost = [name for name in named if name not in self.kept]
 
     def messages(self) -> Iterator[Record]:
         """Everything readable, except strokes without a photograph and strokes that were read before."""
-        gone, seen = set(self.photograph_lost), set[str]()
-        for schema, channel, message in self.found.messages():
+        waiting = dict(self.kept)
+        for schema, channel, message in self._found.messages():
             stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
             if stroke is not None:
-                if stroke.stroke_id in gone | seen:
+                if waiting.get(stroke.stroke_id) != stroke.still:
                     continue
-                seen.add(stroke.stroke_id)
+                del waiting[stroke.stroke_id]
             yield schema, channel, message
-
-
-def with_their_stills(found: McapFile) -> Strokes:
-    """Sort the strokes of a damaged file into those with their stills and those that are lost."""
-    there = {m.sequence for _, channel, m in found.messages() if channel.topic == Topic.STILL and _shows(m)}
-    names: dict[str, bool] = {}
-    for _schema, channel, message in found.messages():
-        stroke = parsed(Stroke, message) if channel.topic == Topic.STROKE else None
-        if stroke is not None:
-            names[stroke.stroke_id] = names.get(stroke.stroke_id, False) or stroke.still in there
-    kept = tuple(name for name, whole in names.items() if whole)
-    lost = tuple(name for name, whole in names.items() if not whole)
-    return Strokes(found, kept, lost)
 
 
 def lost_words(strokes: Strokes, before: Counter[str], now: dict[str, int]) -> list[str]:
@@ -151,7 +148,7 @@ def repair_file(path: Path) -> Report:
     header = parse_header(found)
     if HEADER_NOTE not in found.notes:
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
-    strokes = with_their_stills(found)
+    strokes = Strokes(found)
     notes = {name: values for name, values in found.notes.items() if name != HEADER_NOTE}
     files = {attachment.name: attachment.data for attachment in found.attachments()}
     kept, counts = replace_damaged(path, header, notes, files, strokes.messages())
