@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from brushloop.sessions.disk import (
     MAX_SNAPSHOT_BYTES,
     SEGMENT_NAME,
@@ -24,6 +22,7 @@ from brushloop.sessions.disk import (
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import (
     Begin,
+    CaptureResult,
     Closed,
     Done,
     Doubt,
@@ -35,7 +34,7 @@ from brushloop.sessions.events import (
     parse_event,
     serial_of,
 )
-from brushloop.sessions.journal import JOURNAL_NAME, Fault, Reading, read, read_journal
+from brushloop.sessions.journal import JOURNAL_NAME, Fault, Line, Reading, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.recording import merged_file, parse_header
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, Header, Topic
@@ -67,7 +66,7 @@ class Evidence:
     doubtful: list[str] = field(default_factory=list[str])
     """Files of attempts whose sheet and patch are unknown."""
     strays: dict[str, str] = field(default_factory=dict[str, str])
-    """Files that are not of the steps that the journal lists, and what they are."""
+    """Files that cannot stand where they are, and why."""
     state: RunState = field(default_factory=RunState)
     """State after all events."""
 
@@ -207,53 +206,55 @@ def _rebuild_steps(evidence: Evidence) -> None:
             evidence.rebuilt.append(begin)
         if own != begin.file:
             unlisted.append(name)
-        done = None if name != own or begin.file in finished else _done(found, begin.file)
-        if done is None or done.file in over or (done.key, done.attempt) in over:
+        over_already = begin.file in over or (begin.key, begin.attempt) in over
+        if name != own or begin.file in finished or over_already or attempts[begin.key] > begin.attempt:
             continue
-        known = evidence.reading.state.done.get(done.key)
-        stands = known is not None and Topic.STROKE in known.counts
-        if not stands and attempts.get(done.key, 0) <= done.attempt:
+        known = evidence.reading.state.done.get(begin.key)
+        if known is not None and Topic.STROKE in known.counts:
+            continue
+        done = _done(found, begin)
+        if done is not None:
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
             whole = own == begin.file and not found.damage and dict(found.counts) == done.counts
-            sha256 = file_sha256(found.path) if whole else ""
             finished.add(done.file)
-            evidence.rebuilt.append(done.model_copy(update={"sha256": sha256}))
+            evidence.rebuilt.append(done.model_copy(update={"sha256": file_sha256(found.path) if whole else ""}))
+        elif own == begin.file:
+            evidence.strays[name] = "is finished, but the result of its step cannot be read"
     words = "holds a step that the journal lists under another file"
     evidence.strays |= {name: words for name in unlisted if name.removesuffix(".part") not in begun}
 
 
 def _begin(found: McapFile) -> Begin | None:
     """The `begin` that a file notes; None where it makes no sense."""
-    try:
-        note = found.notes[BEGIN_NOTE]
-        event = parse_event({"t_ns": note["t_ns"], **note["line"]})
-    except (KeyError, TypeError, ValueError):
-        return None
+    event = _noted(found.notes.get(BEGIN_NOTE, {}))
     return event if isinstance(event, Begin) else None
 
 
-def _done(found: McapFile, file: str) -> Done | None:
-    """The `done` that a file notes, without a digest; None where it makes no sense."""
-    try:
-        event = parse_event({"event": "done", **found.notes[DONE_NOTE], "file": file, "sha256": ""})
-    except (KeyError, TypeError, ValueError):
-        return None
+def _done(found: McapFile, begin: Begin) -> Done | None:
+    """The `done` that a file notes, without a digest; that of a capture is also known from its stroke."""
+    line: Line = {"event": "done", **found.notes.get(DONE_NOTE, {}), "file": begin.file, "sha256": ""}
+    if DONE_NOTE not in found.notes and begin.press is not None and found.counts[Topic.STROKE]:
+        stills = [message.sequence for _schema, _channel, message in found.messages((Topic.STROKE,))]
+        result = CaptureResult(press=begin.press, still=stills[-1]).model_dump(exclude_none=True)
+        line |= {"t_ns": begin.t_ns, "key": begin.key, "attempt": begin.attempt, "counts": found.counts}
+        line |= {"result": result}
+    event = _noted(line)
     return event if isinstance(event, Done) else None
 
 
+def _noted(line: Line) -> Event | None:
+    try:
+        return parse_event(line)
+    except ValueError:
+        return None
+
+
 def _header(evidence: Evidence) -> Header:
-    """Header of the session in a file of a step, or in the merged file. Raises `SessionDamaged`."""
-    for found in evidence.files.values():
-        try:
-            header = Header.model_validate(found.notes.get(BEGIN_NOTE, {}).get("header"))
-        except ValidationError:
-            continue
-        if header.session_id == evidence.session:
-            return header
-    final = evidence.files.get(evidence.final.name)
-    if final is None or final.header is None:
+    """Header of the session in one of its files, preferably where it matches its CRC. Raises `SessionDamaged`."""
+    ours = [found for found in evidence.files.values() if found.header is not None and not evidence.foreign(found)]
+    if not ours:
         raise SessionDamaged(evidence.folder / JOURNAL_NAME, "has no `open` event, and no file holds its header")
-    return parse_header(final)
+    return parse_header(max(ours, key=lambda found: found.session == evidence.session))
 
 
 def _snapshots(folder: Path) -> dict[str, str]:

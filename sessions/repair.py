@@ -83,6 +83,7 @@ class _FolderRepair:
         self._final_problems = self._verdict.problems(evidence.final.name)
         self._folder, self._final, self._state = evidence.folder, evidence.final, evidence.state
         self._now_ns = now_ns
+        self._final_sound = evidence.state.closed is not None and not self._final_problems
         self._header = read_header(evidence.folder, evidence.state)
         self._report = Report(evidence.folder.name)
         self._lost_steps: list[str] = []
@@ -105,10 +106,12 @@ class _FolderRepair:
             for name, what in self._evidence.strays.items():
                 kept = self._move_aside(self._folder / name)
                 report.did.append(f"put {name} aside: it {what}{kept_words(kept)}")
+                if name in self._begins and not self._final_sound:
+                    self._lost_steps.append(f"{step_words(self._begins[name])}, whose file {what}")
             if state.closed is None and self._final_problems:
                 kept = self._move_aside(self._final)
                 report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}")
-            elif state.closed is not None and self._final_problems:
+            elif state.closed is not None and not self._final_sound:
                 self._merge_again()
         finally:
             self._journal.close()
@@ -212,7 +215,7 @@ class _FolderRepair:
             sheet=self._state.sheet,
             file=step.file,
         )
-        begun = {"t_ns": begin.t_ns, "header": self._header.model_dump(mode="json"), "line": line_of(begin)}
+        begun = {"t_ns": begin.t_ns, **line_of(begin)}
         done = {name: value for name, value in line_of(step).items() if name in ("key", "attempt", "result")}
         counts = dict(_count(records))
         notes: dict[str, Line] = {BEGIN_NOTE: begun, DONE_NOTE: {"t_ns": step.t_ns, **done, "counts": counts}}
@@ -307,7 +310,7 @@ def _count(records: list[Record]) -> Counter[str]:
 
 def _step_of(found: McapFile) -> Step | None:
     """Key and attempt of the step recorded in a file, from its content, whatever its name."""
-    for values in (found.notes.get(BEGIN_NOTE, {}).get("line"), found.notes.get(DONE_NOTE)):
+    for values in (found.notes.get(BEGIN_NOTE), found.notes.get(DONE_NOTE)):
         match values:
             case {"key": str(key), "attempt": int(attempt)}:
                 return key, attempt

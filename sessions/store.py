@@ -151,7 +151,7 @@ class SessionStore:
             file=f"{serial:04d}-{kind}-{key[:8]}.mcap",
         )
         self._log(begin)
-        begun = {"t_ns": begin.t_ns, "header": self.header.model_dump(mode="json"), "line": line_of(begin)}
+        begun = {"t_ns": begin.t_ns, **line_of(begin)}
         return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, begun))
 
     def done(self, attempt: Attempt, result: StepResult) -> None:

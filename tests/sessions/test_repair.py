@@ -110,7 +110,7 @@ def test_a_photograph_lost_with_its_sheet_gone_has_the_stroke_pressed_again(make
 def test_a_press_that_lost_some_poses_stays_done_and_reports_the_gap(make, folder, repair, go_on):
     cut(file_of(folder, "H13-a05-r00 press"), 0.3)
     report = repair(folder)
-    assert report.lost == ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 2 of /step, 5 of /robot/tcp"]
+    assert report.lost == ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 1 of /step, 5 of /robot/tcp"]
     final = go_on(folder).close()
     assert make.stroke_names(final) == ["H13-a05-r00", "H13-a05-r01"]
     [note] = [note for note in verify_session(folder).notes if "missing" in note]
@@ -159,6 +159,25 @@ def test_a_step_finished_but_not_journalled_is_given_back(make, folder, repair, 
     assert repair(folder).did == [
         "journalled 'done' of capture H13-a05-r01, which 0005-capture-H13-a05-.mcap shows",
     ]
+    assert make.stroke_names(go_on(folder).close()) == ["H13-a05-r00", "H13-a05-r01"]
+
+
+@pytest.mark.parametrize(("kind", "lossless"), [("capture", True), ("press", False)])
+def test_a_step_whose_end_neither_journal_nor_file_tells_is_not_passed_over(
+    make, folder, repair, go_on, kind, lossless
+):
+    path = file_of(folder, f"H13-a05-r01 {kind}")
+    lines = (folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+    done = next(n for n, line in enumerate(lines) if b'"done"' in line and path.name.encode() in line)
+    (folder / JOURNAL_NAME).write_bytes(b"".join(lines[:done]))
+    data = bytearray(path.read_bytes())
+    data[data.index(b"brushloop.done") + 40] ^= 1
+    path.write_bytes(data)
+    assert not verify_session(folder).sound
+    report = repair(folder)
+    assert report.lossless == lossless
+    assert lossless or "press H13-a05-r01" in report.lost[0]
+    assert verify_session(folder).sound
     assert make.stroke_names(go_on(folder).close()) == ["H13-a05-r00", "H13-a05-r01"]
 
 
