@@ -365,7 +365,7 @@ class SegmentWriter:
         stays.
         """
         self._finished = finished
-        self._join()
+        self.abandon()
         self._raise_error()
         try:
             sha256 = file_sha256(self._part)
@@ -376,17 +376,14 @@ class SegmentWriter:
         return sha256
 
     def abandon(self) -> None:
-        """End the thread and keep the part file as evidence of an interrupted step."""
-        self._join()
+        """End the thread; without `finish` the part file is kept as evidence of an interrupted step."""
+        if self._thread.is_alive():
+            self._queue.put(None)
+            self._thread.join()
 
     def _raise_error(self) -> None:
         if self._error is not None:
             raise disk_error(self._part, "cannot write", self._error) from self._error
-
-    def _join(self) -> None:
-        if self._thread.is_alive():
-            self._queue.put(None)
-            self._thread.join()
 
     def _run(self) -> None:
         try:
