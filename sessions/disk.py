@@ -143,8 +143,6 @@ def set_aside(path: Path, tag: str) -> Path:
 def _link(path: Path, kept: Path) -> None:
     try:
         os.link(path, kept)
-    except FileExistsError:
-        raise
     except OSError:
         with path.open("rb") as source, kept.open("xb") as target:
             shutil.copyfileobj(source, target)

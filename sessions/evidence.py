@@ -39,7 +39,6 @@ from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.recording import merged_file, parse_header
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, Header, Topic
 from brushloop.sessions.run_state import DoneTwice, RunState
-from brushloop.sessions.show import step_words
 from brushloop.sessions.store import closed
 
 MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
@@ -106,11 +105,6 @@ def gather(folder: Path) -> Evidence:
 def is_collected(folder: Path) -> bool:
     """Whether a folder holds a journal or files of steps."""
     return (folder / JOURNAL_NAME).exists() or any(_step_files(folder))
-
-
-def event_words(event: Event) -> str:
-    """Name of the step of an event, for people."""
-    return step_words(event) if isinstance(event, Begin | Done) else "the session"
 
 
 def _step_files(folder: Path) -> list[Path]:

@@ -30,7 +30,7 @@ from brushloop.sessions.events import (
     Repaired,
     line_of,
 )
-from brushloop.sessions.evidence import Evidence, event_words, gather, is_collected
+from brushloop.sessions.evidence import Evidence, gather, is_collected
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
 from brushloop.sessions.recording import check_path, find_recording
@@ -141,8 +141,9 @@ class _FolderRepair:
     def _add_lines(self) -> None:
         for event in self._evidence.rebuilt if self._evidence.intact else ():
             self._journal.append(event.t_ns, line_of(event))
+            what = step_words(event) if isinstance(event, Begin | Done) else "the session"
             shown = getattr(event, "file", "the header")
-            self._report.did.append(f"journalled {event.event!r} of {event_words(event)}, which {shown} shows")
+            self._report.did.append(f"journalled {event.event!r} of {what}, which {shown} shows")
         sheet = self._state.sheet
         if sheet in self._state.doubtful_sheets:
             return
