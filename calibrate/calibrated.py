@@ -15,6 +15,15 @@ from brushloop.sessions.terminal import Progress, unseen
 
 
 @dataclass(frozen=True, slots=True)
+class CalibrateRequest:
+    """What is calibrated."""
+
+    session: Path
+    lens: Path | None = None
+    """Lens file; None is the session's own."""
+
+
+@dataclass(frozen=True, slots=True)
 class Calibrated:
     """The calibration that a session uses from now on."""
 
@@ -38,7 +47,8 @@ class Calibrated:
         return framed(self.page)
 
 
-def calibrate_session(session: Path, lens: Path | None = None, progress: Progress = unseen) -> Calibrated:
+def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) -> Calibrated:
     """Calibrate a session and write the page. Raises what `calibrate.session.calibrate_session` raises."""
-    path = calibrate(session, lens, progress)
-    return Calibrated(load_artefact(path, Calibration), path, write_calibration_page(Recording(session), path))
+    path = calibrate(request.session, request.lens, progress)
+    page = write_calibration_page(Recording(request.session), path)
+    return Calibrated(load_artefact(path, Calibration), path, page)

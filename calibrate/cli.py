@@ -25,13 +25,10 @@ def calibrate(
     ] = None,
 ) -> None:
     """Fit scale and paper plane from the board in view; writes an immutable calibration/<hash>.json and its page."""
+    from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
+    from brushloop.sessions.terminal import show_work
 
-    from brushloop.calibrate.calibrated import calibrate_session
-    from brushloop.sessions.terminal import shown
-
-    with shown() as progress:
-        found = calibrate_session(session, lens, progress)
-    say(*found.lines())
+    show_work(calibrate_session, CalibrateRequest(session, lens))
 
 
 app = typer.Typer(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.calibrated import Calibrated
+from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Alignment, Field, Tone, covered
@@ -265,7 +265,7 @@ Place = Session | str | os.PathLike[str]
 
 def calibrate_session(session: Place, *, lens: Path | None = None) -> Calibrated:
     """Fit scale and paper plane of a session from the board in view, as `brushloop calibrate` does."""
-    return calibrate(_path(session), lens)
+    return calibrate(CalibrateRequest(_path(session), lens))
 
 
 def fit(session: Place, **options: Any) -> FitResult:

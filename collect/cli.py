@@ -57,24 +57,26 @@ def collect(
         return
     if config is None or protocol is None:
         ctx.fail(f"Missing option '{'--config' if config is None else '--protocol'}'.")
-    import sys
-
     from brushloop.collect import start
     from brushloop.collect.engine.live import LiveView
-    from brushloop.collect.engine.open_or_resume import Opening
 
-    on_screen = tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()
+    on_screen = _on_screen(tui)
     if dry_run is not None:
         start.dry_run(config, protocol, dry_run, armed=arm, on_screen=on_screen)
         return
-    opening = Opening.load(out, config, protocol, new=new, sheet=sheet, armed=arm)
-    given_up = start.start(
-        opening,
+    request = start.CollectRequest(
+        config,
+        protocol,
+        out,
+        new=new,
+        sheet=sheet,
+        armed=arm,
         on_screen=on_screen,
-        live=LiveView(live_port) if live else None,
         guided=set_up and on_screen,
         preview=preview,
+        live=LiveView(live_port) if live else None,
     )
+    given_up = start.collect(request).given_up
     if given_up:
         say(f"finished; {given_up} strokes failed every time and were left out", err=True)
         raise typer.Exit(3)
@@ -213,16 +215,23 @@ def loop(
     tui: Tui = None,
 ) -> None:
     """Recover every press from its image, press it again and compare both. Run the same command again to resume."""
-    from brushloop.collect.chains.commands import CommandFailed
     from brushloop.collect.chains.loop import LoopRequest, run_loop
     from brushloop.sessions.recording import Recording
 
-    options = _collect_options(arm=arm, tui=tui)
     folder = out if out is not None else Recording(session).path.parent / "loop"
-    try:
-        run_loop(LoopRequest(session, config, folder, fit, presses, repeats, seed, sheet, tuple(options)), say)
-    except CommandFailed as error:
-        raise typer.Exit(error.exit_code) from None  # the command has printed why
+    request = LoopRequest(
+        session,
+        config,
+        folder,
+        fit=fit,
+        presses=presses,
+        repeats=repeats,
+        seed=seed,
+        sheet=sheet,
+        armed=arm,
+        on_screen=_on_screen(tui),
+    )
+    run_loop(request, say)
 
 
 def write(
@@ -245,11 +254,8 @@ def write(
     tui: Tui = None,
 ) -> None:
     """Plan characters, write them on the rig, compare with simulation and reference. Run it again to resume."""
-    from brushloop.collect.chains.commands import CommandFailed
     from brushloop.collect.chains.writing import Writing, WritingRequest
 
-    plan_options = ["--cell-mm", str(cell_mm), "--speed-mm-s", str(speed_mm_s)]
-    plan_options += [] if data is None else ["--data", str(data)]
     request = WritingRequest(
         what=what,
         config=config,
@@ -260,16 +266,18 @@ def write(
         learn_count=learn_count,
         practice=practice,
         sheet=sheet,
-        plan_options=tuple(plan_options),
+        data=data,
+        cell_mm=cell_mm,
+        speed_mm_s=speed_mm_s,
         references=tuple(reference or ()),
-        collect_options=tuple(_collect_options(arm=arm, tui=tui)),
+        armed=arm,
+        on_screen=_on_screen(tui),
     )
-    try:
-        Writing(request, say).run()
-    except CommandFailed as error:
-        raise typer.Exit(error.exit_code) from None  # the command has printed why
+    Writing(request, say).run()
 
 
-def _collect_options(*, arm: bool, tui: bool | None) -> list[str]:
-    """Return the options of a chain that are passed on to `brushloop collect`."""
-    return ["--arm"] * arm + ([] if tui is None else ["--tui" if tui else "--no-tui"])
+def _on_screen(tui: bool | None) -> bool:
+    """Whether a collection has a screen: as asked for, else if there is a terminal."""
+    import sys
+
+    return tui if tui is not None else sys.stdin.isatty() and sys.stdout.isatty()

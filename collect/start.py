@@ -6,11 +6,11 @@ import contextlib
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, NamedTuple
 
-from brushloop.collect.chains.commands import ending
 from brushloop.collect.engine.dry_run import DryRunEngine
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.live import LiveView
@@ -24,12 +24,36 @@ if TYPE_CHECKING:
     from brushloop.collect.tui.pictures import Preview
 
 
-class Settings(TypedDict):
-    """Options of an engine that stay the same when the session is resumed on the screen."""
+PRESSES = frozenset({"grid", "few-strokes", "list"})
+"""Protocols whose recording can be calibrated and validated by itself; after others, no single next command exists."""
 
-    live: LiveView | None
-    guided: bool
-    preview: bool
+
+@dataclass(frozen=True, slots=True)
+class CollectRequest:
+    """What is collected, and how."""
+
+    config: Path
+    protocol: Path
+    out: Path = Path("sessions")
+    """Folder that holds sessions."""
+    new: bool = False
+    """Start a new session although one is open."""
+    sheet: int | None = None
+    """Number of the sheet that the operator has put in."""
+    armed: bool = False
+    """Whether real hardware may move."""
+    on_screen: bool = False
+    guided: bool = False
+    """Whether the operator accepts on the screen what each set-up step measured."""
+    preview: Preview = "auto"
+    live: LiveView | None = None
+
+
+class Collected(NamedTuple):
+    """A finished session, and how many strokes it left out."""
+
+    folder: Path
+    given_up: int
 
 
 def engine_for(
@@ -62,26 +86,31 @@ def engine_for(
     )
 
 
-def start(
-    opening: Opening, *, on_screen: bool, live: LiveView | None = None, guided: bool = False, preview: Preview = "auto"
-) -> int:
-    """Run to the end and print where the recording lies and what comes next; return how many strokes were left out.
-
-    Raises the error that ended the run.
-    """
-    settings: Settings = {"live": live, "guided": guided, "preview": on_screen and preview != "off"}
-    engine = engine_for(opening, watched=on_screen, **settings)
+def collect(request: CollectRequest) -> Collected:
+    """Run to the end and print where the recording lies and what comes next. Raises the error that ended the run."""
+    opening = Opening.load(
+        request.out, request.config, request.protocol, new=request.new, sheet=request.sheet, armed=request.armed
+    )
+    make = partial(
+        engine_for,
+        watched=request.on_screen,
+        live=request.live,
+        guided=request.guided,
+        preview=request.on_screen and request.preview != "off",
+    )
+    engine = make(opening)
 
     def again(session_id: str) -> Engine:
-        return engine_for(replace(opening, new=False, resume=session_id), watched=True, **settings)
+        return make(replace(opening, new=False, resume=session_id))
 
     with contextlib.ExitStack() as stack:
-        if live is not None:
-            live.start()
-            stack.callback(live.close)
-        now = _run(engine, preview, again, on_screen=on_screen).snapshot()
-    _say(ending(Path(now.folder), opening.protocol.kind))
-    return now.given_up
+        if request.live is not None:
+            request.live.start()
+            stack.callback(request.live.close)
+        now = _run(engine, request.preview, again, on_screen=request.on_screen).snapshot()
+    folder = Path(now.folder)
+    _say(ending(folder, opening.protocol.kind))
+    return Collected(folder, now.given_up)
 
 
 def collect_session(
@@ -92,10 +121,7 @@ def collect_session(
     `sheet` confirms that this sheet is in, `armed` lets real hardware move. An open session of the same files is
     resumed. Raises `ConfigError`, `CollectAborted`, `SessionError` and what the devices raise.
     """
-    opening = Opening.load(Path(out), Path(config), Path(protocol), sheet=sheet, armed=armed)
-    engine = engine_for(opening, watched=False)
-    run_headless(engine)
-    return Path(engine.snapshot().folder)
+    return collect(CollectRequest(Path(config), Path(protocol), Path(out), sheet=sheet, armed=armed)).folder
 
 
 def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_screen: bool) -> None:
@@ -109,6 +135,16 @@ def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_sc
             on_screen=on_screen,
         )
     _say("dry run done; nothing was kept\n")
+
+
+def ending(folder: Path, kind: str) -> str:
+    """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
+    lines = [f"recorded: {folder / folder.name}.mcap"]
+    if kind in PRESSES:
+        # It may have been calibrated on the screen already.
+        command = "validate" if (folder / "calibration").is_dir() else "calibrate"
+        lines.append(f"next:     brushloop {command} {folder}")
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _run(

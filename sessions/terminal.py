@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import typer
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, int, int], None]
 """Called with a description of the work, the number done and the total."""
 T = TypeVar("T")
+Request = TypeVar("Request")
 QUIET_S = 2.0
 """Without a terminal, shorter work prints nothing."""
 _ACTED_ON = re.compile(
@@ -60,10 +61,18 @@ def narrow() -> bool:
     return plain_console().width < 80
 
 
-def plain_console(*, stderr: bool = False) -> Console:
+def text_of(parts: Iterable[object], columns: int) -> str:
+    """Lay lines and tables out as plain text, for a page of that width."""
+    with (console := plain_console(columns=columns)).capture() as captured:
+        for part in parts:
+            console.print(part, soft_wrap=isinstance(part, str))
+    return captured.get()
+
+
+def plain_console(*, stderr: bool = False, columns: int | None = None) -> Console:
     """Make a rich console for tables and progress bars: no markup, and no control character but the console's own.
 
-    A colour is given as a style. Rich is imported here because `--help` does without it.
+    A colour is given as a style; with `columns` there is none. Rich is imported here because `--help` does without it.
     """
     from rich.console import Console  # noqa: TID251 - the one place
     from rich.segment import Segment
@@ -83,7 +92,8 @@ def plain_console(*, stderr: bool = False) -> Console:
                 part if part.control else Segment(plain(part.text, keep="\n"), part.style) for part in buffer
             )
 
-    return PlainConsole(stderr=stderr, markup=False, emoji=False)
+    colours = None if columns is None else False
+    return PlainConsole(stderr=stderr, markup=False, emoji=False, width=columns, force_terminal=colours)
 
 
 def _escaped(char: str) -> str:
@@ -121,6 +131,25 @@ def shown() -> Generator[Progress]:
             bar.update(tasks[what], completed=done)
 
         yield update
+
+
+class Printable(Protocol):
+    """The result of a command."""
+
+    def lines(self) -> Iterable[object]:
+        """What the command prints: lines and tables."""
+        ...
+
+
+Result = TypeVar("Result", bound=Printable)
+
+
+def show_work(work: Callable[[Request, Progress], Result], request: Request) -> Result:
+    """Do the work of a command, show its progress, and print and return its result."""
+    with shown() as progress:
+        result = work(request, progress)
+    say(*result.lines())
+    return result
 
 
 class Lines:

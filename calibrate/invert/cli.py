@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.sessions.terminal import say
 
 
 def invert(
@@ -39,7 +38,7 @@ def invert(
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
 
     from brushloop.calibrate.invert.command import RecoverRequest, recover
-    from brushloop.sessions.terminal import shown
+    from brushloop.sessions.terminal import show_work
 
     request = RecoverRequest(
         session=session,
@@ -56,6 +55,4 @@ def invert(
         repeats=repeats,
         seed=seed,
     )
-    with shown() as progress:
-        recovered = recover(request, progress)
-    say(*recovered.lines())
+    show_work(recover, request)

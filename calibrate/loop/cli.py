@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.sessions.terminal import say
 
 
 def compare(
@@ -23,16 +22,8 @@ def compare(
     """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
     import sys
 
-    from brushloop.calibrate.compare.field import Field
-    from brushloop.calibrate.files import check_folder
-    from brushloop.calibrate.loop.compare import compare_sessions
-    from brushloop.calibrate.loop.report import PICTURE, summary, write_loop
-    from brushloop.sessions.terminal import shown
+    from brushloop.calibrate.loop.command import CompareRequest
+    from brushloop.calibrate.loop.command import compare as run
+    from brushloop.sessions.terminal import show_work
 
-    check_folder(out)
-    with shown() as progress:
-        loop = compare_sessions(original, again, fit, Field(mm_per_px=mm_per_px), progress)
-    report = write_loop(loop, out, " ".join(["brushloop", *sys.argv[1:]]))
-    for line in summary(loop):
-        say(line)
-    say(f"Picture: {out / PICTURE}", f"Report:  {report}")
+    show_work(run, CompareRequest(original, again, out, " ".join(["brushloop", *sys.argv[1:]]), fit, mm_per_px))

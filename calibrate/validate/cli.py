@@ -57,11 +57,9 @@ def validate(
     import sys
 
     from brushloop.calibrate.compare.field import Field
-    from brushloop.calibrate.drags.report import summary as drag_summary
     from brushloop.calibrate.validate.extras import ExtrasRequest
     from brushloop.calibrate.validate.main import Request, check
     from brushloop.calibrate.validate.main import validate as run
-    from brushloop.calibrate.validate.report.outputs import summary
     from brushloop.sessions.terminal import shown
 
     request = Request(
@@ -90,13 +88,7 @@ def validate(
         for text in [output.report.to_json()] if output.report is not None else [one.to_json() for one in predicted]:
             say(*text.rstrip("\n").split("\n"))
     else:
-        for drags in output.drags:
-            say(*drag_summary(drags))
-        if output.report is not None:
-            say(*summary(output.report))
-        for note in output.notes:
-            say(note)
-        say(f"Report: {output.folder / 'report.html'}")
+        say(*output.lines())
     check(output, request)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +14,7 @@ from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.drags.measure import validate_drags
 from brushloop.calibrate.drags.predicted import predict_session
 from brushloop.calibrate.drags.report import DragValidation, write_drags
+from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import csv_text, framed, write_files
@@ -25,7 +26,7 @@ from brushloop.calibrate.validate.gates import check_gates, parse_gate
 from brushloop.calibrate.validate.pool import Dask, Threads
 from brushloop.calibrate.validate.report.data import Report
 from brushloop.calibrate.validate.report.figures import read_curve
-from brushloop.calibrate.validate.report.outputs import summary_csv, table_3_csv, write_csv, write_parquet
+from brushloop.calibrate.validate.report.outputs import summary, summary_csv, table_3_csv, write_csv, write_parquet
 from brushloop.calibrate.validate.report.page import page_of, pages_beside
 from brushloop.calibrate.validate.report.summary import report_of
 from brushloop.calibrate.validate.run import Options, Outcome, validate_presses
@@ -43,6 +44,7 @@ class Request:
 
     places: tuple[str, ...]
     command: str
+    """Named by the report as what made it."""
     models: tuple[str, ...] = ()
     view: Field = field(default_factory=Field)
     calibration: Path | None = None
@@ -75,6 +77,15 @@ class ValidationOutput:
         """The report; of several sessions of drags, the first one."""
         several = f"{self.drags[0].header.session_id}/" if len(self.drags) > 1 else ""
         return self.folder / f"{several}report.html"
+
+    def lines(self) -> Iterator[object]:
+        """What the command prints: lines and tables."""
+        for drags in self.drags:
+            yield from drag_summary(drags)
+        if self.report is not None:
+            yield from summary(self.report)
+        yield from self.notes
+        yield f"Report: {self.folder / 'report.html'}"
 
     def _repr_html_(self) -> str:
         return framed(self.page)

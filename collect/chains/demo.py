@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.calibrate.writing.plan_record import PROTOCOL as WRITE
-from brushloop.collect.chains.commands import GIVEN_UP, calibrated, finished_session, fitted, run_command
+from brushloop.collect.chains.commands import calibrated, collected, finished_session, fitted
 from brushloop.collect.chains.demo_rig import DemoRig
 from brushloop.collect.chains.loop import PAGE as LOOP_PAGE
 from brushloop.collect.chains.loop import PROTOCOL as REPLAY
@@ -20,9 +20,10 @@ from brushloop.collect.chains.loop import LoopRequest, run_loop
 from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
 from brushloop.collect.chains.writing import Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
+from brushloop.collect.start import CollectRequest
 from brushloop.model.train import SHIPPED_GENERATOR
 from brushloop.sessions.store import open_sessions
-from brushloop.sessions.terminal import say
+from brushloop.sessions.terminal import say, show_work
 
 CHARACTER = "字"
 
@@ -83,7 +84,7 @@ class Demo:
         """Run every step, and print the paths of the report and of the recording.
 
         Returns the exit code, 3 if the collection left strokes out. A session without a report is continued; a new one
-        is started only when the last one has its report. Raises `ConfigError`, `SessionError`, `CommandFailed`.
+        is started only when the last one has its report. Raises `ConfigError`, `SessionError`, `CollectAborted`.
         """
         self._out.mkdir(parents=True, exist_ok=True)
         self._write_protocol()
@@ -143,9 +144,8 @@ class Demo:
             self._rig.start()
         else:
             self._rig.ready()
-        sheet = ("--sheet", "1") if earlier else ()
-        files = ("--config", self._rig.config, "--protocol", self._protocol, "--out", self._sessions)
-        self._collect_code = run_command(say, "collect", *files, "--no-tui", *sheet, accepts=(0, GIVEN_UP))
+        wanted = CollectRequest(self._rig.config, self._protocol, self._sessions, sheet=1 if earlier else None)
+        self._collect_code = collected(say, wanted)
         self._session = finished_session(self._sessions, self._rig.config, self._protocol)
 
     def _fit(self) -> None:
@@ -166,7 +166,6 @@ class Demo:
             presses=self._size.again,
             seed=self._seed,
             sheet=1,
-            collect_options=("--no-tui",),
         )
         run_loop(request, say)
 
@@ -182,12 +181,16 @@ class Demo:
             sessions=self._sessions,
             count=self._size.writings,
             sheet=1,
-            collect_options=("--no-tui",),
         )
         Writing(request, say).run()
 
     def _validate(self) -> None:
-        run_command(say, "validate", self._finished(), "--generator", SHIPPED_GENERATOR)
+        from brushloop.calibrate.validate.main import Request, validate  # slow to import
+
+        session = self._finished()
+        command = f"brushloop validate {session} --generator {SHIPPED_GENERATOR}"
+        say(f"$ {command}")
+        show_work(validate, Request((str(session),), command, generators=(SHIPPED_GENERATOR,)))
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""
@@ -195,7 +198,7 @@ class Demo:
             return
         self._rig.ready()
         if not open_sessions(self._sessions):
-            self._rig.fresh_sheet(say)
+            self._rig.fresh_sheet()
 
     def _finished(self) -> Path:
         if self._session is None:

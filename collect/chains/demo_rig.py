@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
-import sys
-import time
 from pathlib import Path
 
-from brushloop.collect.chains.commands import Say, run_command
-from brushloop.collect.errors import CollectAborted, ConfigError
+from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.drivers.loopback import LoopbackRig, start
+from brushloop.drivers.sim.fault_client import ask
 
-START_S = 60.0
 IDLE_EXIT_S = 180.0
 """Longer than the evaluation between two collections takes on a busy computer."""
 FPS = 12
@@ -33,16 +30,16 @@ class DemoRig:
         self._rate = rate
         self._seed = seed
         self._brush = brush
-        self._process: subprocess.Popen[bytes] | None = None
+        self._started: LoopbackRig | None = None
 
     def start(self) -> None:
-        """Start a rig with a blank sheet, on new ports. Raises `CollectAborted`, `ConfigError`."""
+        """Start a rig with a blank sheet, on new ports. Raises `RigDidNotStart`, `ConfigError`."""
         self._serve(_free_port(), _free_port())
 
     def ready(self) -> None:
         """Go on with the rig that `rig.toml` names; start it on the same ports, with a blank sheet, if it has ended.
 
-        Raises `CollectAborted` and `ConfigError`.
+        Raises `RigDidNotStart` and `ConfigError`.
         """
         if not self.config.exists():
             self.start()
@@ -52,32 +49,24 @@ class DemoRig:
         if not all(map(_listens, ports)):
             self._serve(*ports)
 
-    def fresh_sheet(self, say: Say) -> None:
-        """Put a blank sheet in. Raises `CommandFailed`."""
-        run_command(say, "fault", self._control(load_rig(self.config).robot.port), "fresh-sheet")
+    def fresh_sheet(self) -> None:
+        """Put a blank sheet in. Raises `FaultRefused`."""
+        ask(self._control(load_rig(self.config).robot.port), {"do": "fresh-sheet"})
 
     def end(self) -> None:
         """End the rig if this process started it; one that an earlier demo started ends by itself when idle."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.wait()
+        if self._started is not None:
+            self._started.end()
 
     def _serve(self, arcs_port: int, camera_port: int) -> None:
-        log = self._folder / "rig.log"
-        command: list[str | Path] = [sys.executable, "-m", "brushloop", "sim", "--write-rig", self.config]
-        command += ["--rate", str(self._rate), "--fps", str(FPS), "--seed", str(self._seed), "--brush", self._brush]
-        command += ["--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
-        command += ["--control", self._control(arcs_port), "--idle-exit", str(IDLE_EXIT_S)]
-        # In a process session of its own: Ctrl-C at the demo must not end the rig under the arm.
-        with log.open("ab") as file:
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
-            )
-        deadline = time.monotonic() + START_S
-        while not (_listens(arcs_port) and _listens(camera_port) and _names(self.config, arcs_port)):
-            if self._process.poll() is not None or time.monotonic() > deadline:
-                raise CollectAborted(f"the loopback rig did not start; see {log}")
-            time.sleep(0.1)
+        options = ["--rate", str(self._rate), "--fps", str(FPS), "--seed", str(self._seed), "--brush", str(self._brush)]
+        options += ["--arcs-port", str(arcs_port), "--camera-port", str(camera_port)]
+        options += ["--control", str(self._control(arcs_port)), "--idle-exit", str(IDLE_EXIT_S)]
+
+        def serves() -> bool:
+            return _listens(arcs_port) and _listens(camera_port) and _names(self.config, arcs_port)
+
+        self._started = start(self.config, self._folder / "rig.log", *options, serves=serves, detached=True)
 
     def _control(self, arcs_port: int) -> Path:
         """The control socket of the rig on that port. Raises `ConfigError` where its path would be too long."""

@@ -15,15 +15,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.collect.chains.commands import Say, calibrated, collected_session, fitted, run_command
+from brushloop.collect.chains.commands import Say, calibrated, collected_session, fitted
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.config_file import read_text
+from brushloop.collect.start import CollectRequest
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import BareName, Header
-from brushloop.sessions.terminal import say as print_lines
-from brushloop.sessions.terminal import shown
+from brushloop.sessions.terminal import show_work
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"
@@ -47,12 +47,13 @@ class LoopRequest:
     seed: int = 1
     sheet: int | None = None
     """Number of the sheet that the operator has put in."""
-    collect_options: tuple[str, ...] = ()
-    """Passed on to `brushloop collect`: `--arm`, `--no-tui`."""
+    armed: bool = False
+    """Whether real hardware may move."""
+    on_screen: bool = False
 
 
 def run_loop(request: LoopRequest, say: Say) -> Path:
-    """Run the unfinished stages; return the report's path. Raises `ConfigError`, `SessionError`, `CommandFailed`."""
+    """Run the unfinished stages; return the report's path. Raises `ConfigError`, `SessionError`, `CollectAborted`."""
     recording = Recording(request.session)
     folder, root = recording.path.parent, recording.path.parent.parent
     rig = load_rig(request.config)
@@ -72,10 +73,16 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
     )
     keep_settings(settings, request.out)
     protocol = _recover(request, folder, fit, settings, say)
-    sheet = () if request.sheet is None else ("--sheet", str(request.sheet))
-    again = collected_session(say, request.config, protocol, root, (*request.collect_options, *sheet))
-    run_command(say, "loop", "compare", folder, again, "--fit", fit, "--out", request.out)
-    return request.out / PAGE
+    wanted = CollectRequest(
+        request.config, protocol, root, sheet=request.sheet, armed=request.armed, on_screen=request.on_screen
+    )
+    again = collected_session(say, wanted)
+
+    from brushloop.calibrate.loop.command import CompareRequest, compare  # slow to import
+
+    command = f"brushloop loop compare {folder} {again} --fit {fit} --out {request.out}"
+    say(f"$ {command}")
+    return show_work(compare, CompareRequest(folder, again, request.out, command, fit)).path
 
 
 def _check_rig(path: Path, rig: RigConfig, header: Header) -> None:
@@ -116,8 +123,7 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, 
             seed=settings.seed,
         )
         say(f"invert {folder}")
-        with shown() as progress:
-            print_lines(*recover(wanted, progress).lines())
+        show_work(recover, wanted)
     check_recovered(request.out / RECOVERED)
     return protocol
 

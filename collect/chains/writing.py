@@ -11,12 +11,14 @@ from pathlib import Path
 
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.writing.plan_record import PROTOCOL, load_plan
-from brushloop.collect.chains.commands import Say, collected_session, finished_session, run_command
+from brushloop.collect.chains.commands import Say, collected_session, finished_session
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import load_rig
+from brushloop.collect.start import CollectRequest
+from brushloop.sessions.terminal import show_work
 
 PAGE = "written.html"
 FOOTPRINT = "footprint"
@@ -41,11 +43,15 @@ class WritingRequest:
     """Whether a practice sheet comes first."""
     sheet: int | None = None
     """Number of the sheet that the operator has put in; valid for one collection, as the next needs a fresh sheet."""
-    plan_options: tuple[str, ...] = ()
-    """Passed on to `brushloop write plan`."""
+    data: Path | None = None
+    """Folder of hanzi-writer files, or makemeahanzi's graphics.txt."""
+    cell_mm: float = 70.0
+    speed_mm_s: float = 15.0
     references: tuple[str, ...] = ()
-    collect_options: tuple[str, ...] = ()
-    """Passed on to `brushloop collect`: `--arm`, `--no-tui`."""
+    """Pictures to compare with instead of the plan's font, as `CHARACTER=FILE`."""
+    armed: bool = False
+    """Whether real hardware may move."""
+    on_screen: bool = False
 
 
 class Writing:
@@ -59,7 +65,7 @@ class Writing:
     def run(self) -> Path:
         """Run what is not done yet; return the report's path.
 
-        Raises `ConfigError`, `CalibrationError`, `SessionError`, `CommandFailed`.
+        Raises `ConfigError`, `CalibrationError`, `SessionError`, `CollectAborted`.
         """
         request = self._request
         plan = self._first_plan()
@@ -70,36 +76,45 @@ class Writing:
                 break
         _check_plan(plan / PROTOCOL, request, request.count)
         session = self._written(plan / PROTOCOL)
-        references = [word for given in request.references for word in ("--reference", given)]
-        self._do("write", "compare", session, "--plan", plan, "--out", request.out, *references)
-        return request.out / PAGE
+        return self._compare(session, plan, request.out, request.references)
 
     def _first_plan(self) -> Path:
         request, plan = self._request, self._request.out / "plan"
         if not (plan / PROTOCOL).exists():
             if not (request.out / "practice" / PROTOCOL).exists():
                 check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
+            from brushloop.calibrate.writing import command  # slow to import
+
             brush = load_rig(request.config).brush
-            options = ["--radius-mm", str(brush.radius_mm), "--length-mm", str(brush.length_mm)]
-            options += ["--repeats", str(self._repeats(1)), *request.plan_options]
-            options += ["--footprint", str(self._footprint())] if request.practice else []
-            self._do("write", "plan", "--out", plan, *options, "--", request.what)
+            wanted = command.PlanRequest(
+                request.what,
+                plan,
+                brush.radius_mm,
+                brush.length_mm,
+                data=request.data,
+                footprint=self._footprint() if request.practice else None,
+                cell_mm=request.cell_mm,
+                speed_mm_s=request.speed_mm_s,
+                repeats=self._repeats(1),
+            )
+            self._say(f"write plan {request.what} --out {plan}")
+            show_work(command.plan, wanted)
         return plan
 
     def _footprint(self) -> Path:
         """Write the practice sheet and fit the footprint of the brush to it, if that is not done; return its file."""
+        from brushloop.calibrate.writing import command  # slow to import
+
         request, folder = self._request, self._request.out / "practice"
         if not (folder / PROTOCOL).exists():
             brush = load_rig(request.config).brush
-            options = ["--radius-mm", str(brush.radius_mm), "--length-mm", str(brush.length_mm)]
-            self._do("write", "practice", "--out", folder, *options)
+            self._say(f"write practice --out {folder}")
+            show_work(command.practice, command.PracticeRequest(folder, brush.radius_mm, brush.length_mm))
         session = self._written(folder / PROTOCOL)
         found = current(session, FOOTPRINT)
         if found is None:
-            self._do("write", "fit", session)
-            found = current(session, FOOTPRINT)
-        if found is None:
-            raise ConfigError(session, "", "holds no footprint, although `write fit` ended")
+            self._say(f"write fit {session}")
+            found = show_work(command.fit, session).path
         return found
 
     def _learn(self, plan: Path, number: int) -> Path:
@@ -108,10 +123,15 @@ class Writing:
         if not (after / PROTOCOL).exists():
             _check_plan(plan / PROTOCOL, self._request, self._repeats(number))
             session = self._written(plan / PROTOCOL)
-            self._do("write", "compare", session, "--plan", plan, "--out", self._request.out / f"round-{number}")
-            repeats = str(self._repeats(number + 1))
-            options = ("--out", after, "--repeats", repeats, "--settled-repeats", str(self._request.count))
-            self._do("write", "learn", session, "--plan", plan, *options)
+            self._compare(session, plan, self._request.out / f"round-{number}")
+            from brushloop.calibrate.writing import command  # slow to import
+
+            self._say(f"write learn {session} --plan {plan} --out {after}")
+            repeats, settled = self._repeats(number + 1), self._request.count
+            show_work(
+                command.learn,
+                command.LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled),
+            )
         return after
 
     def _repeats(self, number: int) -> int:
@@ -120,14 +140,26 @@ class Writing:
 
     def _written(self, protocol: Path) -> Path:
         """The finished and calibrated session of a plan."""
-        request, options = self._request, list(self._request.collect_options)
+        request, sheet = self._request, None
         if self._sheet is not None and finished_session(request.sessions, request.config, protocol) is None:
-            options += ["--sheet", str(self._sheet)]
-            self._sheet = None  # used up: the next session asks again
-        return collected_session(self._say, request.config, protocol, request.sessions, options)
+            sheet, self._sheet = self._sheet, None  # used up: the next session asks again
+        wanted = CollectRequest(
+            request.config,
+            protocol,
+            request.sessions,
+            sheet=sheet,
+            armed=request.armed,
+            on_screen=request.on_screen,
+        )
+        return collected_session(self._say, wanted)
 
-    def _do(self, *arguments: str | Path) -> None:
-        run_command(self._say, *arguments)
+    def _compare(self, session: Path, plan: Path, out: Path, references: tuple[str, ...] = ()) -> Path:
+        from brushloop.calibrate.writing import command  # slow to import
+
+        given = "".join(f" --reference {reference}" for reference in references)
+        line = f"brushloop write compare {session} --plan {plan} --out {out}{given}"
+        self._say(f"$ {line}")
+        return show_work(command.compare, command.CompareRequest(session, plan, out, line, references)).path
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import subprocess
-import sys
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from traceback import format_exception
 from typing import TYPE_CHECKING, ClassVar
 
 from textual import work
@@ -21,6 +17,7 @@ from textual.screen import ModalScreen
 from brushloop.collect.tui.text import plain
 from brushloop.collect.tui.widgets import Line
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.terminal import Printable, Progress, text_of
 
 if TYPE_CHECKING:
     from brushloop.sessions.verify import Verdict
@@ -32,7 +29,7 @@ COLUMNS = 68
 
 
 class FinishScreen(ModalScreen[None]):
-    """Verifies the session at once; runs each further command on a key, in a process of its own."""
+    """Verifies the session at once; runs each further command on a key, in a thread."""
 
     DEFAULT_CSS = """
     FinishScreen { align: center middle; }
@@ -83,7 +80,7 @@ class FinishScreen(ModalScreen[None]):
 
     @work(exclusive=True, group="command")
     async def action_command(self, name: str) -> None:
-        """Run a command of brushloop on the session."""
+        """Do on the session what the command of that name does."""
         if self._open or self._busy:
             return
         self._busy = True
@@ -91,11 +88,11 @@ class FinishScreen(ModalScreen[None]):
 
         loop = asyncio.get_running_loop()
 
-        def on_line(line: str) -> None:
-            loop.call_soon_threadsafe(self._show_progress, name, line)
+        def progress(what: str, done: int, total: int) -> None:
+            loop.call_soon_threadsafe(self._show_progress, name, f"{what}: {done} of {total}")
 
         try:
-            code, said = await asyncio.to_thread(run_command, name, self._folder, on_line)
+            code, said = await asyncio.to_thread(run_command, name, self._folder, progress)
         finally:
             self._busy = False
         tail = "\n".join(plain(said).splitlines()[-MOST_LINES:])
@@ -130,28 +127,27 @@ def verify(folder: Path) -> Verdict:
     return verify_session(folder)
 
 
-def run_command(name: str, folder: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
-    """Run `brushloop NAME FOLDER` in a process of its own; it may take minutes.
+def run_command(name: str, folder: Path, progress: Progress) -> tuple[int, str]:
+    """Calibrate, fit or validate the session, which may take minutes; return exit code and output."""
+    try:
+        return 0, text_of(_result(name, folder, progress).lines(), COLUMNS).strip()
+    except Exception as error:  # the screen shows it, whatever it is, and stays
+        code = getattr(error, "exit_code", None)
+        return (1, "".join(format_exception(error))) if code is None else (code, str(error))
 
-    `on_line` gets each line of its progress (stderr). Returns exit code and output, with stderr if it failed.
-    """
-    command = [sys.executable, "-m", "brushloop", name, str(folder)]
-    environment = os.environ | {"COLUMNS": str(COLUMNS)}
-    lines: list[str] = []
-    with (
-        subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        ) as process,
-        ThreadPoolExecutor(1) as reader,
-    ):
-        assert process.stdout is not None
-        assert process.stderr is not None
-        output = reader.submit(process.stdout.read)
-        for line in process.stderr:
-            lines.append(line)
-            on_line(line.rstrip())
-        said = output.result()
-    return process.returncode, (said if process.returncode == 0 else said + "".join(lines)).strip()
+
+def _result(name: str, folder: Path, progress: Progress) -> Printable:
+    if name == "calibrate":
+        from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
+
+        return calibrate_session(CalibrateRequest(folder), progress)
+    if name == "fit":
+        from brushloop.calibrate.fit.command import FitRequest, fit_presses
+
+        return fit_presses(FitRequest(folder), progress)
+    from brushloop.calibrate.validate.main import Request, validate
+
+    return validate(Request((str(folder),), f"brushloop validate {folder}"), progress)
 
 
 def verdict_content(verdict: Verdict) -> Content:

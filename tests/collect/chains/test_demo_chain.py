@@ -9,15 +9,19 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.validate import main
+from brushloop.calibrate.validate.main import Request, ValidationOutput
 from brushloop.collect.chains import demo
-from brushloop.collect.chains.commands import GIVEN_UP, CommandFailed
+from brushloop.collect.chains.commands import GIVEN_UP
 from brushloop.collect.chains.demo import FULL, QUICK, Demo, Size
 from brushloop.collect.chains.demo_rig import DemoRig
 from brushloop.collect.chains.loop import LoopRequest
 from brushloop.collect.chains.writing import WritingRequest
-from brushloop.collect.errors import ConfigError
+from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
+from brushloop.collect.start import CollectRequest
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from brushloop.sessions.store import SessionStore
@@ -34,33 +38,32 @@ class Chain:
         self.collect_code = 0
         self.validate_fails = False
 
-    def __call__(self, _say: object, name: str, *arguments: str | Path, accepts: tuple[int, ...] = (0,)) -> int:
-        self.ran.append(name)
-        if name == "collect":
-            sessions, protocol = Path(arguments[5]), Path(arguments[3])
-            rig = load_rig(Path(arguments[1]))
-            header = Make.header.model_copy(
-                update={
-                    "brush": rig.brush.name,
-                    "ink": rig.ink.name,
-                    "paper": rig.paper.name,
-                    "session_id": f"grid-{1 + len(list(sessions.glob('*')))}",
-                    "protocol": load_protocol(protocol).model_dump_json(),
-                }
-            )
-            store = SessionStore.create(sessions / header.session_id, header, Make.snapshots, Make().clock())
-            Make().collect(store)
-            store.close()
-            store.release()
-            assert self.collect_code in accepts
-            return self.collect_code
-        if name == "validate":
-            if self.validate_fails:
-                raise CommandFailed([name], 1)
-            report = Path(arguments[0]) / "validation" / "report.html"
-            report.parent.mkdir()
-            report.write_text("report")
-        return 0
+    def collected(self, _say: object, request: CollectRequest) -> int:
+        self.ran.append("collect")
+        rig = load_rig(request.config)
+        header = Make.header.model_copy(
+            update={
+                "brush": rig.brush.name,
+                "ink": rig.ink.name,
+                "paper": rig.paper.name,
+                "session_id": f"grid-{1 + len(list(request.out.glob('*')))}",
+                "protocol": load_protocol(request.protocol).model_dump_json(),
+            }
+        )
+        store = SessionStore.create(request.out / header.session_id, header, Make.snapshots, Make().clock())
+        Make().collect(store)
+        store.close()
+        store.release()
+        return self.collect_code
+
+    def validated(self, request: Request, _progress: object) -> ValidationOutput:
+        self.ran.append("validate")
+        if self.validate_fails:
+            raise CalibrationError(request.places[0], "cannot be validated")
+        report = Path(request.places[0]) / "validation" / "report.html"
+        report.parent.mkdir()
+        report.write_text("report")
+        return ValidationOutput(report.parent)
 
     def loop(self, request: LoopRequest, _say: object) -> None:
         self.ran.append(f"loop {request.presses}")
@@ -79,7 +82,7 @@ class FakeRig:
         self.config.write_text(RIG)
         self.start = lambda: chain.rig("rig starts")
         self.ready = lambda: chain.rig("rig")
-        self.fresh_sheet = lambda _say: chain.rig("fresh sheet")
+        self.fresh_sheet = lambda: chain.rig("fresh sheet")
         self.end = lambda: None
 
 
@@ -99,9 +102,10 @@ class FakeWriting:
 @pytest.fixture
 def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     made = Chain()
-    monkeypatch.setattr(demo, "run_command", made)
-    monkeypatch.setattr(demo, "calibrated", lambda say, session: made(say, "calibrate", session))
-    monkeypatch.setattr(demo, "fitted", lambda say, session: made(say, "fit", session))
+    monkeypatch.setattr(demo, "collected", made.collected)
+    monkeypatch.setattr(main, "validate", made.validated)
+    monkeypatch.setattr(demo, "calibrated", lambda _say, _session: made.ran.append("calibrate"))
+    monkeypatch.setattr(demo, "fitted", lambda _say, _session: made.ran.append("fit"))
     monkeypatch.setattr(demo, "run_loop", made.loop)
     monkeypatch.setattr(demo, "DemoRig", lambda folder, **_: FakeRig(made, folder))
     monkeypatch.setattr(demo, "Writing", lambda request, _say: FakeWriting(made, request))
@@ -126,7 +130,7 @@ def test_a_demo_that_ended_after_its_collection_goes_on_there_and_begins_no_new_
     chain: Chain, tmp_path: Path
 ) -> None:
     chain.validate_fails = True
-    with pytest.raises(CommandFailed, match="resumes from there"):
+    with pytest.raises(CalibrationError, match="cannot be validated"):
         run(tmp_path)
     chain.validate_fails = False
     chain.ran.clear()
@@ -183,11 +187,11 @@ def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, t
         chain.ran.append("loop is killed")
         header = Make.header.model_copy(update={"session_id": "replay-1"})
         SessionStore.create(tmp_path / "sessions" / "replay-1", header, Make.snapshots, Make().clock()).release()
-        raise CommandFailed(["collect"], 4)
+        raise CollectAborted("the power failed")
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(demo, "run_loop", killed)
-        with pytest.raises(CommandFailed):
+        with pytest.raises(CollectAborted):
             run(tmp_path)
     chain.ran.clear()
     assert run(tmp_path) == 0

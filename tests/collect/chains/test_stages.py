@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import threading
 from pathlib import Path
 
 import pytest
 
-from brushloop.collect.chains import commands
-from brushloop.collect.chains.commands import CommandFailed, finished_session, run_command
+from brushloop.collect.chains.commands import finished_session
 from brushloop.collect.chains.loop import SETTINGS as FILE
 from brushloop.collect.chains.loop import Settings, begun_with, check_recovered, keep_settings
 from brushloop.collect.errors import ConfigError
@@ -82,43 +76,3 @@ def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path:
     assert finished_session(root, rigs["sumi"], protocol) == root / "grid-1"
     assert finished_session(root, rigs["walnut"], protocol) == root / "grid-2"
     assert finished_session(root, rigs["red"], protocol) is None
-
-
-def test_a_command_that_fails_ends_the_chain_with_its_exit_code(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    said: list[str] = []
-    with pytest.raises(CommandFailed) as caught:
-        run_command(said.append, "sessions", "list", tmp_path / "nowhere")
-    assert caught.value.exit_code == 2
-    assert said == [f"$ brushloop sessions list {tmp_path / 'nowhere'}"]
-    assert "is not a folder" in capfd.readouterr().err
-    assert run_command(said.append, "sessions", "list", tmp_path / "nowhere", accepts=(0, 2)) == 2
-
-
-COLLECT = """
-import signal, sys, time
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(4))
-print("ready", flush=True)
-time.sleep(60.0)
-"""
-"""Stands in for a collection, which stops the arm on this signal."""
-
-
-def test_a_signal_to_the_chain_stops_the_command_that_moves_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
-    def popen(_: list[str]) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen([sys.executable, "-c", COLLECT], stdout=subprocess.PIPE)
-
-        def once_ready() -> None:
-            assert process.stdout is not None
-            with process.stdout as lines:
-                lines.readline()
-            os.kill(os.getpid(), signal.SIGTERM)
-
-        threading.Thread(target=once_ready).start()
-        return process
-
-    monkeypatch.setattr(commands, "Popen", popen)
-    with pytest.raises(CommandFailed) as caught:
-        run_command(lambda _: None, "collect")
-    assert caught.value.exit_code == 4

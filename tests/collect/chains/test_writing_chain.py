@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.calibrate.report import Written
+from brushloop.calibrate.writing import command
+from brushloop.calibrate.writing.command import CompareRequest, LearnRequest, PlanRequest, PracticeRequest
 from brushloop.calibrate.writing.plan_record import FILE as PLAN
 from brushloop.calibrate.writing.plan_record import PROTOCOL, FigureRecord, PlanRecord
 from brushloop.collect.chains import writing
@@ -28,27 +31,38 @@ def plan(settled: bool) -> PlanRecord:
 class Commands:
     """Stands in for brushloop's commands: writes what each would leave."""
 
-    def __init__(self, settled_after: int) -> None:
+    def __init__(self, settled_after: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ran: list[str] = []
         self._rounds, self._settled_after = 0, settled_after
+        for name in ("plan", "compare", "learn", "practice", "fit"):
+            monkeypatch.setattr(command, name, getattr(self, name))
 
-    def __call__(self, _say: object, *words: object) -> None:
-        said = [str(word) for word in words]
-        self.ran.append(" ".join(said[:2]))
-        if said[1] == "fit":
-            place = Path(said[2]) / FOOTPRINT
-            place.mkdir(parents=True)
-            (place / "0123456789abcdef.json").write_text("{}", encoding="utf-8")
-            (place / "current").write_text("0123456789abcdef.json\n", encoding="utf-8")
-        elif said[1] in ("plan", "practice", "learn"):
-            self._rounds += said[1] == "learn"
-            settled = self._rounds >= self._settled_after
-            option = "--settled-repeats" if settled and said[1] == "learn" else "--repeats"
-            repeats = said[said.index(option) + 1] if option in said else "1"
-            folder = Path(said[said.index("--out") + 1])
-            folder.mkdir(parents=True)
-            (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
-            (folder / PLAN).write_text(plan(settled).model_dump_json(), encoding="utf-8")
+    def plan(self, request: PlanRequest, _: object) -> Written:
+        return self._planned("plan", request.out, request.repeats)
+
+    def practice(self, request: PracticeRequest, _: object) -> Written:
+        return self._planned("practice", request.out, 1)
+
+    def learn(self, request: LearnRequest, _: object) -> Written:
+        self._rounds += 1
+        settled = self._rounds >= self._settled_after
+        return self._planned("learn", request.out, (request.settled_repeats if settled else None) or request.repeats)
+
+    def fit(self, session: Path, _: object) -> Written:
+        self.ran.append("fit")
+        return Written(session / FOOTPRINT / "0123456789abcdef.json", ())
+
+    def compare(self, request: CompareRequest, _: object) -> Written:
+        self.ran.append("compare")
+        return Written(request.out / "written.html", ())
+
+    def _planned(self, name: str, folder: Path, repeats: int) -> Written:
+        self.ran.append(name)
+        folder.mkdir(parents=True)
+        (folder / PROTOCOL).write_text(CELL.format(repeats=repeats) + POINTS, encoding="utf-8")
+        settled = self._rounds >= self._settled_after
+        (folder / PLAN).write_text(plan(settled).model_dump_json(), encoding="utf-8")
+        return Written(folder / PROTOCOL, ())
 
 
 @pytest.mark.parametrize(("settled_after", "rounds"), [(1, 1), (9, 3)])
@@ -59,21 +73,18 @@ def test_practice_comes_first_and_learning_ends_when_all_is_settled(
         class brush:  # noqa: N801
             radius_mm, length_mm = 6.0, 48.0
 
-    commands = Commands(settled_after)
-    monkeypatch.setattr(writing, "run_command", commands)
+    commands = Commands(settled_after, monkeypatch)
     monkeypatch.setattr(writing, "load_rig", lambda _: Rig)
     monkeypatch.setattr(writing, "collected_session", lambda *_: tmp_path / "session")
     said: list[str] = []
     request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, count=10, learn=3, practice=True)
     assert Writing(request, said.append).run() == tmp_path / "out" / "written.html"
-    learning = ["write compare", "write learn"] * rounds
-    assert commands.ran == ["write practice", "write fit", "write plan", *learning, "write compare"]
-    assert bool(said) == (rounds < 3)
+    assert commands.ran == ["practice", "fit", "plan", *["compare", "learn"] * rounds, "compare"]
+    assert any("No character gained" in line for line in said) == (rounds < 3)
 
 
 def test_a_fresh_sheet_is_asked_for_before_anything_is_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    commands = Commands(1)
-    monkeypatch.setattr(writing, "run_command", commands)
+    commands = Commands(1, monkeypatch)
     (tmp_path / "2026-01-01-grid-01").mkdir()
     (tmp_path / "2026-01-01-grid-01" / JOURNAL_NAME).write_text("damaged\n", encoding="utf-8")
     request = WritingRequest("子", tmp_path / "rig.toml", tmp_path / "out", tmp_path, practice=True)

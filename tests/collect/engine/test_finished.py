@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.collect.chains.commands import ending
-from brushloop.collect.engine.open_or_resume import Opening
-from brushloop.collect.start import start
+from brushloop.collect.start import CollectRequest, collect, ending
 from tests.collect.until import wait_for_end
 
 if TYPE_CHECKING:
@@ -33,8 +31,12 @@ def test_it_is_printed_after_the_screen_too(
         "brushloop.collect.tui.runner.run_screen",
         lambda engine, *_options: (engine.start(), wait_for_end(engine), engine)[-1],
     )
-    opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
-    assert start(opening, on_screen=True, preview="off") == 0
-    [folder] = lab.sessions.iterdir()
+    folder, given_up = collect(
+        CollectRequest(
+            lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, on_screen=True, preview="off"
+        )
+    )
+    assert [folder] == list(lab.sessions.iterdir())
+    assert given_up == 0
     assert capsys.readouterr().out == ending(folder, "grid")
     assert (folder / f"{folder.name}.mcap").is_file()

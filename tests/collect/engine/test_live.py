@@ -24,10 +24,9 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from brushloop.collect.engine.live import HOST, QUEUE_LIMIT, LiveView
-from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.telemetry import FRAME_PERIOD_S
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.start import start
+from brushloop.collect.start import CollectRequest, collect
 from brushloop.drivers.samples import Frame, Stamp
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.mcap_writer import Outgoing
@@ -271,7 +270,7 @@ def test_without_the_extra_the_error_says_how_to_get_it(monkeypatch: pytest.Monk
 
 def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab) -> None:
     live = LiveView(port=0)
-    opening = Opening.load(lab.sessions, lab.folder / "rig.toml", lab.folder / "protocol.toml")
+    request = CollectRequest(lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, live=live)
     seen: set[str] = set()
 
     def look() -> None:
@@ -291,7 +290,7 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
 
     thread = threading.Thread(target=look)
     thread.start()
-    assert start(opening, on_screen=False, live=live) == 0
+    assert collect(request).given_up == 0
     thread.join(timeout=PATIENCE_S)
     [folder] = lab.sessions.iterdir()
     assert verify_session(folder).sound

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.sessions.recording import remarks_of
+from brushloop.sessions.terminal import Progress
 from brushloop.sessions.verify import Finding, Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
@@ -211,9 +210,9 @@ async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> No
 async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[tuple[str, Path]] = []
 
-    def command(name: str, folder: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
+    def command(name: str, folder: Path, progress: Progress) -> tuple[int, str]:
         ran.append((name, folder))
-        on_line("captures: 3 of 30, about 5 s left")
+        progress("captures", 3, 30)
         return 0, "\n".join(f"line {n}" for n in range(30))
 
     monkeypatch.setattr("brushloop.collect.tui.finish_screen.run_command", command)
@@ -233,18 +232,11 @@ async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monke
     assert "! damaged" in verdict_content(Verdict("s", "closed", findings=[Finding("a.mcap", "is cut")])).plain
 
 
-def test_a_command_shows_its_progress_and_keeps_it_where_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    program = "import sys; print('said'); print('3 of 30', file=sys.stderr); sys.exit(int(sys.argv[1] == 'fail'))"
-    lines: list[str] = []
-    popen = subprocess.Popen
-
-    def started(command: list[str], **options: Any) -> subprocess.Popen[str]:
-        return popen([sys.executable, "-c", program, command[3]], **options)
-
-    monkeypatch.setattr(subprocess, "Popen", started)
-    assert run_command("work", Path("s"), lines.append) == (0, "said")
-    assert run_command("fail", Path("s"), lines.append) == (1, "said\n3 of 30")
-    assert lines == ["3 of 30", "3 of 30"]
+def test_a_session_that_cannot_be_calibrated_fitted_or_validated_says_why_and_the_screen_stays(tmp_path: Path) -> None:
+    for name in ("calibrate", "fit", "validate"):
+        code, said = run_command(name, tmp_path / "nowhere", lambda _what, _done, _total: None)
+        assert code == 2
+        assert "nowhere" in said
 
 
 @pytest.mark.parametrize(("drawn_by", "kind"), [("SixelImage", ImagePicture), ("HalfcellImage", CellPicture)])
