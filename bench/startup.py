@@ -15,6 +15,12 @@ from bench.peak import measure
 ROOT = Path(__file__).resolve().parent.parent
 OURS = (sys.executable, "-m", "brushloop", "--help")
 PEER = (sys.executable, "-c", "import typer")
+IMPORTED = (
+    sys.executable,
+    "-c",
+    "import time; began_s = time.perf_counter(); import brushloop; print(time.perf_counter() - began_s)",
+)
+IMPORT_GOAL_S = 0.06
 GOAL_S = 0.8
 COMMANDS = {
     "collect": "collect --config no.toml --protocol no.toml --no-tui",
@@ -36,6 +42,8 @@ COMMANDS = {
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Wall seconds of `python -m brushloop --help` beside `python -c "import typer"`, and CPU seconds of each command.
 
+    `startup.import` is what `import brushloop` adds to a notebook, in wall seconds within Python.
+
     ratio = the peer's time over ours, at most about 1 for `--help`: the front door imports typer as well. `n` rounds,
     10 by default, a third of them for the commands. Nothing is drawn, so the seed changes nothing. Raises BenchError
     when a command does not end as it should.
@@ -44,7 +52,10 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     turns = interleave(lambda: _call(OURS), lambda: _call(PEER), rounds)
     ours_s, peer_s = turns.median_s
     asked = Result("startup", ours_s, "s", "import typer", peer_s / ours_s, rounds, seed, **turns.ratios())
-    return [asked, *_starts(max(1, rounds // 3), seed)]
+    import_s = statistics.median(float(_call(IMPORTED)) for _ in range(rounds))
+    goal = f"goal {IMPORT_GOAL_S:g} s at most"
+    imported = Result("startup.import", import_s, "s", goal, IMPORT_GOAL_S / import_s, rounds, seed, machine())
+    return [asked, imported, *_starts(max(1, rounds // 3), seed)]
 
 
 def _starts(rounds: int, seed: int) -> Iterator[Result]:
@@ -58,9 +69,10 @@ def _starts(rounds: int, seed: int) -> Iterator[Result]:
             yield Result(f"startup.{name}", cpu_s, "CPU-s", goal, GOAL_S / cpu_s, rounds, seed, where)
 
 
-def _call(command: tuple[str, ...]) -> None:
-    """Run one command to its end; raises BenchError with its last words when it fails."""
+def _call(command: tuple[str, ...]) -> str:
+    """Run one command to its end and return what it printed; raises BenchError with its last words when it fails."""
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise BenchError(f"`python {' '.join(command[1:])}` exited with {done.returncode}: {last}")
+    return done.stdout

@@ -83,9 +83,10 @@ class Writing:
         if not (plan / PROTOCOL).exists():
             if not (request.out / "practice" / PROTOCOL).exists():
                 check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
+            brush = load_rig(request.config).brush
+
             from brushloop.calibrate.writing import command  # slow to import
 
-            brush = load_rig(request.config).brush
             wanted = command.PlanRequest(
                 request.what,
                 plan,
