@@ -11,7 +11,7 @@ import os
 import struct
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Container, Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,15 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE, SeekingReader
-from mcap.records import (
-    Attachment,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Message,
-    Metadata,
-    Schema,
-)
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
@@ -46,7 +38,7 @@ MESSAGE_START = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; the data follow."""
 _IN_CHUNK = struct.Struct("<BQH")
 """Opcode and length of a record in a chunk, and the channel if it is a message."""
-_DATA_END_BYTES = RECORD_START.size + 4
+_NOT_MCAP = "is not an MCAP file by its first bytes"
 _OTHERS = (ValueError, RuntimeError, LookupError, ArithmeticError, EOFError, OSError)
 UNREADABLE = (McapError, struct.error, zstandard.ZstdError, *_OTHERS)
 """Everything that mcap, zstd and the system raised in tests with damaged files.
@@ -55,7 +47,6 @@ Not `MemoryError`: too little memory says nothing about a file. Lengths are boun
 """
 
 Record = tuple[Schema | None, Channel, Message]
-Channels = dict[int, tuple[Schema | None, Channel]]
 
 
 @dataclass(slots=True)
@@ -65,8 +56,8 @@ class Part:
     offset: int
     index: ChunkIndex | None = None
     """None if the index of the file is damaged."""
-    counts: Counter[str] | None = None
-    """Number of messages by topic, once `McapFile.check` has read the chunk."""
+    counts: Counter[int] | None = None
+    """Number of messages by channel, once `McapFile.check` has read the chunk."""
     sound: bool = True
     """False once `McapFile.check` found that the chunk cannot be read or does not match its CRC."""
 
@@ -83,30 +74,23 @@ class McapFile:
         """Descriptions of what is damaged, as far as it was read."""
         self.index: Summary | None = None
         """None if it is damaged."""
-        self.complete = False
-        """Whether all chunks are known: the index is intact, or the end of the data was reached."""
         self.parts: list[Part] = []
         """Known chunks, in the order in which they were written."""
         self.counts: Counter[str] = Counter()
         """Messages by topic in the sound chunks, once `check` has read them."""
-        self.channels: Channels = {}
+        self.channels: dict[int, tuple[Schema | None, Channel]] = {}
         """Channels by number, each with its schema; without an index those that `check` found."""
         self.notes: dict[str, dict[str, Any]] = {}
         """Our own notes (`brushloop.header`, ...) that match their CRC."""
         self.header: dict[str, Any] | None = None
         """Values of the header, also where they do not match their CRC; None for a file without a header."""
         self._attached: list[int] = []
-        self._data_end = 0
         with opened(path) as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                self.damage.append("does not begin as an MCAP file does")
-            try:
-                self.index, self._data_end = _summary(file)
-            except UNREADABLE as error:
-                self.damage.append(f"its index cannot be read ({in_one_line(error)})")
-                self._walk(file)
-            else:
-                self._list(file, self.index)
+                self.damage.append(_NOT_MCAP)
+            with self._noting("its index"):
+                self.index = _summary(file)
+            self._list(file)
 
     @property
     def stated(self) -> dict[str, int]:
@@ -120,11 +104,9 @@ class McapFile:
         """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
         return str(self.notes.get(HEADER_NOTE, {}).get("session_id", ""))
 
-    def may_hold(self, part: Part, topics: Container[str]) -> bool:
+    def may_hold(self, part: Part, *topics: str) -> bool:
         """Whether a chunk holds messages on any of these topics; True also where its index does not say."""
-        if part.counts is not None:
-            return any(topic in topics for topic in part.counts)
-        numbers = part.index.message_index_offsets if part.index is not None else {}
+        numbers = part.counts or (part.index.message_index_offsets if part.index is not None else {})
         return not numbers or any(n in self.channels and self.channels[n][1].topic in topics for n in numbers)
 
     def messages(self, topics: Iterable[str] | None = None, parts: Iterable[Part] | None = None) -> Iterator[Record]:
@@ -136,27 +118,25 @@ class McapFile:
         wanted = None if topics is None else frozenset(topics)
         with self._reading() as file:
             for part in self.parts if parts is None else parts:
-                if not part.sound or (wanted is not None and not self.may_hold(part, wanted)):
+                if not part.sound or (wanted is not None and not self.may_hold(part, *wanted)):
                     continue
-                for message in _messages(_chunk(file, part.offset), self.channels):
+                for message in _messages(_chunk(file, part.offset)):
                     schema, channel = self.channels[message.channel_id]
                     if wanted is None or channel.topic in wanted:
                         yield schema, channel, message
 
     def packed_chunks(self) -> Iterator[tuple[bytes, ChunkIndex, Counter[int]]]:
-        """Every chunk as its bytes, with the indexes of its messages, and its messages by channel; CRCs are checked.
+        """Every chunk as its bytes, with the indexes of its messages, and its messages by channel, as `check` read it.
 
         Raises `SessionDamaged`.
         """
         with self._reading() as file:
             for part in self.parts:
-                counts, _records = _counted(_chunk(file, part.offset))
-                index = part.index
-                size = 0 if index is None else index.chunk_length + index.message_index_length
-                if index is None or not counts.keys() <= self.channels.keys() or size > _size(file):
+                size = 0 if part.index is None else part.index.chunk_length + part.index.message_index_length
+                if part.index is None or part.counts is None or size > _size(file):
                     raise McapError("a chunk is not as the index states")
                 file.seek(part.offset)
-                yield file.read(size), index, counts
+                yield file.read(size), part.index, part.counts
 
     def attachments(self) -> Iterator[Attachment]:
         """Attached files, byte for byte, but those that `check` found damaged. Raises `SessionDamaged`."""
@@ -166,31 +146,29 @@ class McapFile:
 
     def check(self) -> None:
         """Check every CRC in the file and count its messages; none is decoded."""
+        attached, self._attached = self._attached, []
         with opened(self.path) as file:
             for part in self.parts:
-                try:
+                part.sound = False
+                with self._noting(f"the chunk at byte {part.offset}"):
                     part.counts = self._read_chunk(file, part.offset)
-                    self.counts += part.counts
-                except UNREADABLE as error:
-                    part.sound = False
-                    self._add_damage("chunk", part.offset, error)
-            for offset in list(self._attached):
-                try:
+                    self.counts += self._by_topic(part.counts)
+                    part.sound = True
+            for offset in attached:
+                with self._noting(f"the attachment at byte {offset}"):
                     _attachment(file, offset)
-                except UNREADABLE as error:
-                    self._attached.remove(offset)
-                    self._add_damage("attachment", offset, error)
-            if self.index is not None and not self.damage:
-                try:
-                    _check_data(file, self._data_end)
-                except UNREADABLE as error:
-                    self.damage.append(in_one_line(error))
+                    self._attached.append(offset)
+            if not self.damage:
+                with self._noting("its data"):
+                    _check_data(file)
         if not self.damage and self.stated != dict(self.counts):
             self.damage.append(f"holds {dict(self.counts)}, but its index says {self.stated}")
 
-    def _list(self, file: IO[bytes], index: Summary) -> None:
-        """Take over what the index lists, whose channels a lost chunk may have held."""
-        self.complete = True
+    def _list(self, file: IO[bytes]) -> None:
+        """Take over what the index lists, whose channels a lost chunk may have held; without one, look for it."""
+        if (index := self.index) is None:
+            self._walk(file)
+            return
         self.channels = {n: (index.schemas.get(one.schema_id), one) for n, one in index.channels.items()}
         chunks = {one.chunk_start_offset: one for one in index.chunk_indexes}
         self.parts = [Part(offset, chunks[offset]) for offset in sorted(chunks)]
@@ -202,42 +180,45 @@ class McapFile:
 
     def _walk(self, file: IO[bytes]) -> None:
         """Find the records up to the end of the data or to the first that cannot be read."""
-        size, at = _size(file), len(MCAP0_MAGIC)
+        at = len(MCAP0_MAGIC)
         while True:
             file.seek(at)
             start = file.read(RECORD_START.size)
-            if len(start) < RECORD_START.size:
-                self.damage.append(f"ends at byte {size} without an index")
+            opcode, length = RECORD_START.unpack(start) if len(start) == RECORD_START.size else (0, 0)
+            if opcode == Opcode.DATA_END:
                 return
-            opcode, length = RECORD_START.unpack(start)
-            if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
-                self.damage.append(f"no record can be read at byte {at}")
+            if not Opcode.HEADER <= opcode < Opcode.DATA_END or length > _size(file) - file.tell():
+                self.damage.append(f"no whole record can be read at byte {at}")
                 return
-            if at + RECORD_START.size + length > size:
-                self.damage.append(f"is cut short in the record at byte {at}")
-                return
-            match opcode:
-                case Opcode.CHUNK:
-                    self.parts.append(Part(at))
-                case Opcode.ATTACHMENT:
-                    self._attached.append(at)
-                case Opcode.METADATA:
-                    self._add_metadata(file, at)
-                case Opcode.DATA_END:
-                    self.complete = True
-                    return
-                case _:
-                    pass
+            if opcode == Opcode.CHUNK:
+                self.parts.append(Part(at))
+            elif opcode == Opcode.ATTACHMENT:
+                self._attached.append(at)
+            elif opcode == Opcode.METADATA:
+                self._add_metadata(file, at)
             at += RECORD_START.size + length
 
-    def _read_chunk(self, file: IO[bytes], offset: int) -> Counter[str]:
-        """Messages of a chunk by topic; its channels become known. Raises any of `UNREADABLE`."""
-        counts, others = _counted(_chunk(file, offset))
-        schemas = {one.id: one for one in others if isinstance(one, Schema)}
-        for one in others:
-            if isinstance(one, Channel):
-                self.channels.setdefault(one.id, (schemas.get(one.schema_id), one))
-        return self._by_topic(counts)
+    def _read_chunk(self, file: IO[bytes], offset: int) -> Counter[int]:
+        """Messages of a chunk by channel; its channels become known. Raises any of `UNREADABLE`."""
+        records = _chunk(file, offset)
+        counts: defaultdict[int, int] = defaultdict(int)
+        schemas: dict[int, Schema] = {}
+        at, size, unpack, message = 0, len(records), _IN_CHUNK.unpack_from, int(Opcode.MESSAGE)
+        while at < size:
+            opcode, length, channel_id = unpack(records, at)
+            end = at + 9 + length
+            if opcode == message:
+                counts[channel_id] += 1
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(_stream(records[at + RECORD_START.size : end]))
+                schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(_stream(records[at + RECORD_START.size : end]))
+                self.channels.setdefault(channel.id, (schemas.get(channel.schema_id), channel))
+            at = end
+        if at != size:
+            raise McapError("a record is longer than its chunk")
+        return Counter(counts)
 
     def _by_topic(self, counts: Mapping[int, int]) -> Counter[str]:
         by_topic: Counter[str] = Counter()
@@ -246,7 +227,7 @@ class McapFile:
         return by_topic
 
     def _add_metadata(self, file: IO[bytes], offset: int) -> None:
-        try:
+        with self._noting(f"the metadata at byte {offset}"):
             record = Metadata.read(_stream(_record(file, offset, Opcode.METADATA)))
             if record.name not in NOTES:
                 return
@@ -256,11 +237,14 @@ class McapFile:
             else:
                 self.damage.append(f"its note {record.name!r} does not match its CRC")
             self.header = values if record.name == HEADER_NOTE else self.header
-        except UNREADABLE as error:
-            self._add_damage("metadata", offset, error)
 
-    def _add_damage(self, name: str, offset: int, error: Exception) -> None:
-        self.damage.append(f"the {name} at byte {offset} cannot be read ({in_one_line(error)})")
+    @contextmanager
+    def _noting(self, what: str) -> Generator[None]:
+        """Within the block, what cannot be read is damage."""
+        try:
+            yield
+        except UNREADABLE as error:
+            self.damage.append(f"{what} cannot be read ({in_one_line(error)})")
 
     @contextmanager
     def _reading(self) -> Generator[IO[bytes]]:
@@ -274,13 +258,7 @@ class McapFile:
 
 def open_mcap(path: Path) -> McapFile:
     """A finished file, by its index. Raises `InputError` for any other file, `SessionDamaged` for a damaged one."""
-    with opened(path) as file:
-        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise InputError(path, "is not an MCAP file")
-    found = McapFile(path)
-    if found.damage:
-        raise SessionDamaged(path, f"cannot read: {'; '.join(found.damage)}")
-    return found
+    return _undamaged(McapFile(path))
 
 
 def scan(path: Path) -> McapFile:
@@ -290,12 +268,9 @@ def scan(path: Path) -> McapFile:
     return found
 
 
-def count_messages(path: Path) -> dict[str, int]:
-    """Number of messages by topic in a file whose every CRC is right. Raises `SessionDamaged`."""
-    found = scan(path)
-    if found.damage:
-        raise SessionDamaged(path, "; ".join(found.damage))
-    return dict(found.counts)
+def scan_sound(path: Path) -> McapFile:
+    """Like `scan`, but raises `SessionDamaged` where anything is damaged."""
+    return _undamaged(scan(path))
 
 
 def opened(path: Path) -> IO[bytes]:
@@ -306,18 +281,19 @@ def opened(path: Path) -> IO[bytes]:
         raise InputError(path, f"cannot open: {in_one_line(error)}") from None
 
 
-def _summary(file: IO[bytes]) -> tuple[Summary, int]:
-    """The index of a file and the place of the mark before it. Raises any of `UNREADABLE`.
+def _undamaged(found: McapFile) -> McapFile:
+    if found.damage:
+        kind = InputError if found.damage[0] == _NOT_MCAP else SessionDamaged
+        raise kind(found.path, f"cannot read: {'; '.join(found.damage)}")
+    return found
+
+
+def _summary(file: IO[bytes]) -> Summary:
+    """The index of a file. Raises any of `UNREADABLE`.
 
     Its CRC is checked: otherwise one wrong bit in it could silently hide strokes.
     """
-    tail = FOOTER_SIZE + len(MCAP0_MAGIC)
-    footer_at = _size(file) - tail
-    file.seek(max(footer_at, 0))
-    footer = file.read(tail)
-    start, crc = struct.unpack_from("<9xQ8xI", footer)
-    if not footer.endswith(MCAP0_MAGIC) or not 0 < start <= footer_at:
-        raise McapError("has no index: it was not finished, or is cut short")
+    start, footer_at, crc = _footer(file)
     file.seek(start)
     if zlib.crc32(file.read(min(footer_at + FOOTER_SIZE - 4 - start, MAX_RECORD_BYTES))) != crc:
         raise McapError("the index does not match its CRC")
@@ -325,7 +301,19 @@ def _summary(file: IO[bytes]) -> tuple[Summary, int]:
     summary = SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
     if summary is None or summary.statistics is None:
         raise McapError("has no index: it was not finished")
-    return summary, start - _DATA_END_BYTES
+    return summary
+
+
+def _footer(file: IO[bytes]) -> tuple[int, int, int]:
+    """Where the index and the footer begin, and the CRC of the index. Raises any of `UNREADABLE`."""
+    tail = FOOTER_SIZE + len(MCAP0_MAGIC)
+    footer_at = _size(file) - tail
+    file.seek(max(footer_at, 0))
+    footer = file.read(tail)
+    start, crc = struct.unpack_from("<9xQ8xI", footer)
+    if not footer.endswith(MCAP0_MAGIC) or not 0 < start <= footer_at:
+        raise McapError("has no index: it was not finished, or is cut short")
+    return start, footer_at, crc
 
 
 def _size(file: IO[bytes]) -> int:
@@ -373,45 +361,25 @@ def _chunk(file: IO[bytes], offset: int) -> bytes:
     return stream.read(size)
 
 
-def _counted(records: bytes) -> tuple[Counter[int], list[Schema | Channel]]:
-    """Messages of a chunk by channel, and its schemas and channels. Raises any of `UNREADABLE`."""
-    counts: defaultdict[int, int] = defaultdict(int)
-    others: list[Schema | Channel] = []
-    at, size, unpack, message = 0, len(records), _IN_CHUNK.unpack_from, int(Opcode.MESSAGE)
-    while at < size:
-        opcode, length, channel = unpack(records, at)
-        if opcode == message:
-            counts[channel] += 1
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            body = _stream(records[at + RECORD_START.size : at + RECORD_START.size + length])
-            others.append(Schema.read(body) if opcode == Opcode.SCHEMA else Channel.read(body))
-        at += 9 + length
-    if at != size:
-        raise McapError("a record is longer than its chunk")
-    return Counter(counts), others
-
-
-def _messages(records: bytes, known: Mapping[int, object]) -> Iterator[Message]:
-    """Messages of a chunk, in order. Raises any of `UNREADABLE`, also for a channel that is not `known`."""
+def _messages(records: bytes) -> Iterator[Message]:
+    """Messages of a chunk, in order. Raises any of `UNREADABLE`."""
     at = 0
     while at < len(records):
         opcode, length = RECORD_START.unpack_from(records, at)
         end = at + RECORD_START.size + length
         if opcode == Opcode.MESSAGE:
             _, _, channel, sequence, log_ns, publish_ns = MESSAGE_START.unpack_from(records, at)
-            if channel not in known:
-                raise McapError("a chunk has messages of a channel that the index does not list")
             yield Message(channel, log_ns, records[at + MESSAGE_START.size : end], publish_ns, sequence)
         at = end
 
 
-def _check_data(file: IO[bytes], end: int) -> None:
-    """Check the CRC of everything before the mark `end`, also of what no other CRC protects."""
+def _check_data(file: IO[bytes]) -> None:
+    """Check the CRC of everything before the index, also of what no other CRC protects."""
+    end = _footer(file)[0] - RECORD_START.size - 4
     expected = int.from_bytes(_record(file, end, Opcode.DATA_END), "little")
     file.seek(0)
-    crc = at = 0
-    while at < end:
-        piece = file.read(min(end - at, 1 << 20))
-        crc, at = zlib.crc32(piece, crc), at + len(piece)
+    crc = 0
+    while data := file.read(min(end - file.tell(), 1 << 20)):
+        crc = zlib.crc32(data, crc)
     if expected not in (0, crc):
         raise McapError("what is before it does not match its CRC")

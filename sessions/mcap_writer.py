@@ -20,8 +20,8 @@ import zlib
 from collections import Counter, defaultdict
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -34,6 +34,7 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
+    McapRecord,
     Message,
     Metadata,
     MetadataIndex,
@@ -44,8 +45,8 @@ from mcap.records import Header as FileHeader
 from mcap.writer import MCAP0_MAGIC
 
 from brushloop.sessions.disk import file_sha256, fsync_folder, sync
-from brushloop.sessions.errors import SessionError, disk_error
-from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, open_mcap
+from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
+from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, scan_sound
 from brushloop.sessions.records import (
     BEGIN_NOTE,
     DONE_NOTE,
@@ -64,12 +65,8 @@ FLUSH_S = 0.25
 QUEUE_LIMIT = 20_000
 """Queue size, about 200 s of poses: a full queue means that the disk does not keep up, which is an error."""
 NUMBERS = {topic: number for number, topic in enumerate(Topic, 1)}
-"""A topic has the same number in every file, so that a merge can copy chunks as they are."""
+"""A topic has the same number in every file, so that a merge can copy chunks as they are: new topics come last."""
 _INDEX_START = struct.Struct("<BQHI")
-
-
-class _Writable(Protocol):
-    def write(self, stream: RecordBuilder) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,16 +89,16 @@ def encoded(message: Event | Protobuf) -> bytes:
 
 def channel_of(outgoing: Outgoing) -> tuple[Schema, Channel]:
     """The schema of a message and the channel of its topic, both under the topic's number."""
-    message, number = outgoing.message, NUMBERS[outgoing.topic]
-    if isinstance(message, Event):
-        data = json.dumps(type(message).model_json_schema(), sort_keys=True).encode()
-        schema = Schema(id=number, name=f"brushloop.{type(message).__name__}", encoding="jsonschema", data=data)
-        return schema, Channel(number, str(outgoing.topic), "json", {}, number)
-    from mcap_protobuf.schema import build_file_descriptor_set
+    kind, number = type(outgoing.message), NUMBERS[outgoing.topic]
+    if issubclass(kind, Event):
+        encoding, data = "json", json.dumps(kind.model_json_schema(), sort_keys=True).encode()
+        schema = Schema(id=number, name=f"brushloop.{kind.__name__}", encoding="jsonschema", data=data)
+    else:
+        from mcap_protobuf.schema import build_file_descriptor_set
 
-    data = build_file_descriptor_set(type(message)).SerializeToString()
-    schema = Schema(id=number, name=message.DESCRIPTOR.full_name, encoding="protobuf", data=data)
-    return schema, Channel(number, str(outgoing.topic), "protobuf", {}, number)
+        encoding, data = "protobuf", build_file_descriptor_set(kind).SerializeToString()
+        schema = Schema(id=number, name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data)
+    return schema, Channel(number, str(outgoing.topic), encoding, {}, number)
 
 
 class McapWriter:
@@ -120,8 +117,6 @@ class McapWriter:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: Counter[int] = Counter()
-        self._numbers: dict[tuple[str, str], int] = {}
-        """Of the channels of other files that were copied, by topic and name of the schema."""
         self._crc = 0
         """Of everything written to the file so far."""
         self._write(MCAP0_MAGIC)
@@ -155,12 +150,12 @@ class McapWriter:
         self._records += _packed(channel)
         self.channels[channel.id] = channel
 
-    def add_message(self, *, channel_id: int, log_time: int, publish_time: int, sequence: int, data: bytes) -> None:
+    def add_message(self, channel_id: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
         """Add a message to the chunk in progress."""
         records = self._records
-        self._index[channel_id] += (log_time, len(records))
+        self._index[channel_id] += (log_ns, len(records))
         size = MESSAGE_START.size - RECORD_START.size + len(data)
-        records += MESSAGE_START.pack(Opcode.MESSAGE, size, channel_id, sequence, log_time, publish_time)
+        records += MESSAGE_START.pack(Opcode.MESSAGE, size, channel_id, sequence, log_ns, publish_ns)
         records += data
         if len(records) > CHUNK_BYTES:
             self._end_chunk()
@@ -171,40 +166,35 @@ class McapWriter:
         new = number not in self.channels
         if new:
             self.add_channel(*channel_of(outgoing))
-        self.add_message(
-            channel_id=number,
-            log_time=outgoing.log_ns,
-            publish_time=outgoing.publish_ns,
-            sequence=outgoing.sequence,
-            data=encoded(outgoing.message),
-        )
+        data = encoded(outgoing.message)
+        self.add_message(number, outgoing.sequence, outgoing.log_ns, outgoing.publish_ns, data)
         if new or outgoing.topic == Topic.STROKE:  # ends the chunk, so that a damaged chunk costs one stroke
             self.flush()
 
     def copy(self, schema: Schema | None, channel: Channel, message: Message) -> None:
-        """Add a message of another file as it is: times, sequence number and data stay."""
-        self.add_message(
-            channel_id=self._number(schema, channel),
-            log_time=message.log_time,
-            publish_time=message.publish_time,
-            sequence=message.sequence,
-            data=message.data,
-        )
+        """Add a message of another file as it is; all copied messages are of one file."""
+        if channel.id not in self.channels:
+            self.add_channel(schema, channel)
+        self.add_message(channel.id, message.sequence, message.log_time, message.publish_time, message.data)
         if channel.topic == Topic.STROKE:
             self.flush()
 
     def copy_file(self, path: Path) -> None:
-        """Add all messages of a file as they are, every CRC checked. Raises `SessionDamaged`.
-
-        Chunks are copied whole where the numbers of the channels agree, as they do in files of one session.
-        """
-        source = open_mcap(path)
-        if [self._number(*pair) for pair in source.channels.values()] == list(source.channels):
-            for packed in source.packed_chunks():
-                self._add_chunk(*packed)
-        else:
-            for record in source.messages():
-                self.copy(*record)
+        """Add all chunks of a file of the same session as they are, every CRC checked. Raises `SessionDamaged`."""
+        source = scan_sound(path)
+        for number, (schema, channel) in source.channels.items():
+            if number not in self.channels:
+                self.add_channel(schema, channel)
+            elif self.channels[number].topic != channel.topic:
+                raise SessionDamaged(path, f"has {channel.topic} under the number of {self.channels[number].topic}")
+        self._end_chunk()
+        for data, index, counts in source.packed_chunks():
+            shift = self._file.tell() - index.chunk_start_offset
+            self._write(data)
+            offsets = {number: at + shift for number, at in index.message_index_offsets.items()}
+            start = index.chunk_start_offset + shift
+            self._chunks.append(replace(index, chunk_start_offset=start, message_index_offsets=offsets))
+            self._counts.update(counts)
 
     def flush(self) -> None:
         """End the chunk in progress unless it has no messages, and hand everything to the operating system."""
@@ -227,36 +217,13 @@ class McapWriter:
             metadata_count=len(self._metadata),
             schema_count=len(self.schemas),
         )
-        summary: list[_Writable] = [*self.schemas.values(), *self.channels.values(), statistics]
+        summary: list[McapRecord] = [*self.schemas.values(), *self.channels.values(), statistics]
         summary += [*self._chunks, *self._attachments, *self._metadata]
         data = b"".join(map(_packed, summary))
         footer = _packed(Footer(start, 0, 0))[:-4]  # its CRC covers all but itself
         self._write(data)
         self._write(_packed(Footer(start, 0, zlib.crc32(footer, zlib.crc32(data)))))
         self._write(MCAP0_MAGIC)
-
-    def _number(self, schema: Schema | None, channel: Channel) -> int:
-        """Number of another file's channel in this one: its own where that is free or stands for the same."""
-        ident = (channel.topic, schema.name if schema else "")
-        if ident not in self._numbers:
-            known = self.channels.get(channel.id, channel), self.schemas.get(channel.schema_id, schema)
-            if known != (channel, schema):
-                number = max([*self.channels, *self.schemas]) + 1
-                schema = replace(schema, id=number) if schema else None
-                channel = replace(channel, id=number, schema_id=number if schema else 0)
-            self.add_channel(schema, channel)
-            self._numbers[ident] = channel.id
-        return self._numbers[ident]
-
-    def _add_chunk(self, data: bytes, index: ChunkIndex, counts: Mapping[int, int]) -> None:
-        """Add a chunk of another file as it is, with the indexes of its messages; `index` says where it was there."""
-        self._end_chunk()
-        shift = self._file.tell() - index.chunk_start_offset
-        self._write(data)
-        offsets = {number: at + shift for number, at in index.message_index_offsets.items()}
-        start = index.chunk_start_offset + shift
-        self._chunks.append(replace(index, chunk_start_offset=start, message_index_offsets=offsets))
-        self._counts.update(counts)
 
     def _end_chunk(self) -> None:
         if not self._index:
@@ -295,7 +262,7 @@ class McapWriter:
         return self._file.write(data)
 
 
-def _packed(record: _Writable) -> bytes:
+def _packed(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
@@ -317,8 +284,7 @@ def new_mcap(
     with path.open("xb") as file:
         writer = start_mcap(file, header, notes)
         for name, data in attachments.items():
-            media_type = {".toml": "application/toml", ".json": "application/json"}.get(PurePath(name).suffix)
-            writer.add_attachment(name, media_type or "application/octet-stream", data)
+            writer.add_attachment(name, "application/json" if name.endswith(".json") else "application/toml", data)
         yield writer
         writer.finish()
         sync(file)

@@ -111,7 +111,7 @@ class Recording:
         for part in self._file.parts:
             if before == number:
                 parts.append(part)
-            before += self._file.may_hold(part, (Topic.STROKE,))
+            before += self._file.may_hold(part, Topic.STROKE)
         found = list(self._captures(self._file.messages([Topic.STILL, Topic.STROKE], parts), bad))
         if before != self.strokes() or len(found) != 1:
             raise SessionDamaged(self.path, f"stroke number {number} cannot be read alone")

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from brushloop.sessions.disk import fsync_folder, set_aside, sync
 from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.journal import Line
-from brushloop.sessions.mcap_file import McapFile, Record, count_messages, scan
+from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.messages import decode_still
 from brushloop.sessions.recording import parse_header
@@ -89,7 +89,7 @@ def replace_damaged(
         with new_mcap(fresh, header, notes, attachments) as writer:
             for record in messages:
                 writer.copy(*record)
-        counts = count_messages(fresh)
+        counts = dict(scan_sound(fresh).counts)
         kept = _put_in_place(fresh, path)
     except OSError as error:
         raise disk_error(path, "cannot write its repaired copy", error) from error
@@ -156,7 +156,7 @@ def repair_file(path: Path) -> Report:
     report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept_words(kept)}")
     report.strokes = counts.get(Topic.STROKE, 0)
     report.lost += lost_words(strokes, Counter(found.stated), counts)
-    if found.index is None and (not found.complete or any(part.counts is None for part in found.parts)):
+    if found.index is None and len(found.damage) > 1:
         report.lost.append("anything else behind the damage: without its index its amount is unknown")
     if found.index is None:
         return report

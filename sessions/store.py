@@ -44,7 +44,7 @@ from brushloop.sessions.events import (
     line_of,
 )
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, read_header, replay
-from brushloop.sessions.mcap_file import McapFile, count_messages
+from brushloop.sessions.mcap_file import scan_sound
 from brushloop.sessions.mcap_writer import SegmentWriter, new_mcap
 from brushloop.sessions.recording import merged_file
 from brushloop.sessions.records import REPAIRS_NOTE, Header
@@ -254,7 +254,7 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
         with new_mcap(part, header, notes, attachments) as writer:
             for file in state.files:
                 writer.copy_file(folder / file)
-        counts = count_messages(part)
+        counts = dict(scan_sound(part).counts)
         if counts != expected:
             raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
         part.rename(final)
@@ -266,10 +266,11 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
 
 def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
     try:
-        more = Counter(count_messages(final)) - Counter(state.counts())
+        found = scan_sound(final)
     except SessionError:
         return
-    if more and McapFile(final).session == header.session_id:
+    more = found.counts - Counter(state.counts())
+    if more and found.session == header.session_id:
         raise SessionDamaged(final, f"holds {more.total()} messages that the steps in the journal do not have")
 
 

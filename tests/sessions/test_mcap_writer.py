@@ -9,6 +9,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import CompressionType, Writer
 
+from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.mcap_writer import CHUNK_BYTES, McapWriter
 
@@ -35,30 +36,34 @@ def theirs(file):
             writer.register_schema(schema.name, schema.encoding, schema.data)
         writer.register_channel(channel.topic, channel.message_encoding, channel.schema_id)
 
-    return writer, lambda name, media_type, data: writer.add_attachment(0, 0, name, media_type, data), add_channel
+    def add_message(channel_id, sequence, log_ns, publish_ns, data):
+        writer.add_message(channel_id, log_ns, data, publish_ns, sequence)
+
+    def attach(name, media_type, data):
+        writer.add_attachment(0, 0, name, media_type, data)
+
+    return writer, attach, add_channel, add_message
 
 
 def ours(file):
     writer = McapWriter(file, "test")
-    return writer, writer.add_attachment, writer.add_channel
+    return writer, writer.add_attachment, writer.add_channel, writer.add_message
 
 
 def written(begin):
     """A file with two topics, large and small messages, a clock that goes back, and whatever else a file may hold."""
     file = io.BytesIO()
-    writer, attach, add_channel = begin(file)
+    writer, attach, add_channel, add_message = begin(file)
     writer.add_metadata("note", {"a": "1"})
     attach("rig.toml", "application/toml", b"x = 1")
     add_channel(THING, THINGS)
     add_channel(None, BARE)
     for number in range(500):
-        writer.add_message(channel_id=THINGS.id, log_time=number, publish_time=number + 1, sequence=number, data=b"{}")
+        add_message(THINGS.id, number, number, number + 1, b"{}")
     writer.flush()
     writer.flush()  # nothing waits: no chunk is written
     for number, size in enumerate((0, CHUNK_BYTES, 10)):
-        writer.add_message(
-            channel_id=BARE.id, log_time=100 - number, publish_time=0, sequence=2**32 - 1, data=bytes(size)
-        )
+        add_message(BARE.id, 2**32 - 1, 100 - number, 0, bytes(size))
     writer.add_metadata("done", {})
     writer.finish()
     file.seek(0)
@@ -94,19 +99,20 @@ def test_the_mcap_library_finds_by_our_index_what_it_finds_by_its_own(topic):
     assert found(written(ours)) == found(written(theirs))
 
 
-@pytest.mark.parametrize(
-    "others", [(), (Channel(1, "/other", "json", {}, 0),), (Channel(2, "/things", "json", {}, 0),)]
-)
-def test_messages_of_another_file_are_copied_whatever_numbers_its_channels_have(tmp_path, others):
-    source, copy = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    source.write_bytes(written(theirs).getvalue())
-    with copy.open("xb") as file:
+def copied(path, *sources, channels=()):
+    with path.open("xb") as file:
         writer = McapWriter(file, "test")
-        for channel in others:
+        for channel in channels:
             writer.add_channel(None, channel)
-        for _ in range(2):
+        for source in sources:
             writer.copy_file(source)
         writer.finish()
+
+
+def test_the_messages_of_other_files_are_copied_as_they_are(tmp_path):
+    source, copy = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    source.write_bytes(written(theirs).getvalue())
+    copied(copy, source, source)
 
     def messages_of(path):
         return [(c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in open_mcap(path).messages()]
@@ -115,3 +121,10 @@ def test_messages_of_another_file_are_copied_whatever_numbers_its_channels_have(
     with copy.open("rb") as file:
         by_index = [m.log_time for _, _, m in make_reader(file, validate_crcs=True).iter_messages(["/bare"])]
     assert by_index == [98, 98, 99, 99, 100, 100]
+
+
+def test_a_file_that_numbers_its_topics_otherwise_is_not_merged(tmp_path):
+    source = tmp_path / "source.mcap"
+    source.write_bytes(written(theirs).getvalue())
+    with pytest.raises(SessionDamaged, match="has /things under the number of /other"):
+        copied(tmp_path / "copy.mcap", source, channels=[Channel(1, "/other", "json", {}, 0)])

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked
 from brushloop.sessions.events import PressResult, StepKind
 from brushloop.sessions.journal import JOURNAL_NAME, Journal
-from brushloop.sessions.mcap_file import count_messages, open_mcap
+from brushloop.sessions.mcap_file import open_mcap, scan_sound
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.store import SessionStore, next_session_id, open_sessions
 
@@ -134,7 +134,7 @@ def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(ma
     make.perform(store, "b")
     final = store.close()
     [closed] = make.events(store.folder, "closed")
-    assert closed["counts"] == count_messages(final) == {"/camera/still": 2, "/stroke": 2}
+    assert closed["counts"] == scan_sound(final).counts == {"/camera/still": 2, "/stroke": 2}
     with final.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         attached = {a.name: a.data.decode() for a in reader.iter_attachments()}
