@@ -275,6 +275,14 @@ class Done(_Event):
         """What the step did."""
         return self.result.kind
 
+    @property
+    def press(self) -> Press | None:
+        """The press that the step made, photographed or left out."""
+        result = self.result
+        if isinstance(result, PressResult | DrawResult | CaptureResult):
+            return result.press
+        return result.skipped if isinstance(result, DipResult) else None
+
 
 class Void(_Event):
     """An attempt was cut; its patches stay used."""
@@ -331,7 +339,6 @@ class Repaired(_Event):
     sha256: str
     counts: Counts
     missing: Counts = Field(default_factory=dict[str, int])
-    aside: str = ""
     why: str = ""
 
 
@@ -341,7 +348,6 @@ class Lost(_Event):
     event: Literal["lost"] = "lost"
     key: str
     file: StepFile
-    aside: str = ""
     why: str = ""
 
 
@@ -351,15 +357,6 @@ class Doubt(_Event):
     event: Literal["doubt"] = "doubt"
     sheet: Whole
     file: FileName
-
-
-class JournalRepaired(_Event):
-    """A repair wrote the journal again."""
-
-    event: Literal["journal"] = "journal"
-    aside: str
-    rebuilt: Whole
-    lost: Whole
 
 
 class Remark(_Event):
@@ -387,7 +384,6 @@ Event = Annotated[
     | Repaired
     | Lost
     | Doubt
-    | JournalRepaired
     | Remark,
     Field(discriminator="event"),
 ]
@@ -408,6 +404,12 @@ def parse_event(line: dict[str, Any]) -> Event:
 def line_of(event: Event) -> dict[str, Any]:
     """The line of an event, without its time."""
     return event.model_dump(mode="json", exclude={"t_ns"}, exclude_none=True)
+
+
+def step_words(step: Begin | Done) -> str:
+    """Name of a step for people: `capture H13-a05-r02`."""
+    stroke_id = "" if step.press is None else step.press.stroke_id
+    return f"{step.kind} {stroke_id}".strip().replace("_", " ")
 
 
 def serial_of(file: str) -> int | None:

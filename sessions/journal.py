@@ -14,7 +14,7 @@ import os
 import re
 import zlib
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +22,7 @@ from typing import Any, cast
 
 from brushloop.sessions.disk import check_file, fsync_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error
-from brushloop.sessions.events import Done, Event, parse_event
+from brushloop.sessions.events import Event, parse_event
 from brushloop.sessions.records import Header
 from brushloop.sessions.run_state import DoneTwice, RunState
 
@@ -43,37 +43,21 @@ class Entry:
     seq: int
     """Number of the line as it was written, from 1."""
     session: str
-    raw: bytes
     event: Event
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """Problem with one line."""
-
-    number: int
-    """Number of the line in the file as it is, from 1."""
-    what: str
-
-    def __str__(self) -> str:
-        """Text such as `line 5 does not match its CRC`."""
-        return f"line {self.number} {self.what}"
 
 
 @dataclass(slots=True)
 class Reading:
     """What a journal says, and what is wrong with it."""
 
-    entries: list[Entry] = field(default_factory=list[Entry])
-    """Lines that can be trusted, in the order in which they were written, each number once."""
+    events: list[Event] = field(default_factory=list[Event])
+    """Those of lines that can be trusted, in the order in which they were written, each once."""
     state: RunState = field(default_factory=RunState)
     """State after them."""
-    faults: list[Fault] = field(default_factory=list[Fault])
-    """All problems, in the order of the file; every command uses this list. Empty for a journal without damage."""
-    damaged: list[int] = field(default_factory=list[int])
-    """Numbers of the lines that cannot be read."""
-    twice: list[Done] = field(default_factory=list[Done])
-    """Steps that were done already."""
+    faults: list[str] = field(default_factory=list[str])
+    """All problems, such as `line 5 does not match its CRC`; every command uses this list. Empty without damage."""
+    lost: int = 0
+    """Number of lines that are missing or cannot be read."""
     torn: bytes = b""
     """Last line, cut off by a crash: the next process sets it aside."""
     next_seq: int = 1
@@ -103,7 +87,7 @@ def decode_line(raw: bytes, number: int) -> Entry:
         case _:
             raise ValueError("has no number, session or event")
     try:
-        return Entry(number, seq, session, raw, parse_event(line))
+        return Entry(number, seq, session, parse_event(line))
     except ValueError as error:
         raise ValueError(f"makes no sense: {error}") from None
 
@@ -123,20 +107,15 @@ def read(data: bytes, session: str = "") -> Reading:
 
     Lines of another session than `session` are not used; without it, those of the session with most lines are.
     """
+    reading = Reading()
     with _without_collection():
-        reading = Reading()
-        entries = _in_order(reading, _decoded(reading, data), session)
-        _missing(reading, entries)
-        for entry in entries:
+        for entry in _in_order(reading, _decoded(reading, data), session):
             try:
                 reading.state.apply(entry.event)
+                reading.events.append(entry.event)
             except DoneTwice as error:
-                reading.faults.append(Fault(entry.number, str(error)))
-                reading.twice += [entry.event] if isinstance(entry.event, Done) else []
-            else:
-                reading.entries.append(entry)
-        reading.faults.sort(key=lambda fault: fault.number)
-        return reading
+                reading.faults.append(f"line {entry.number} {error}")
+    return reading
 
 
 def replay(path: Path) -> RunState:
@@ -148,8 +127,7 @@ def undamaged(path: Path) -> Reading:
     """A journal whose every line can be trusted. Raises `SessionDamaged` for any other."""
     reading = read(read_journal(path))
     if reading.faults:
-        more = f" (and {len(reading.faults) - 1} more)" if len(reading.faults) > 1 else ""
-        raise SessionDamaged(path, f"{reading.faults[0]}{more}")
+        raise SessionDamaged(path, f"{reading.faults[0]}{_more(reading.faults)}")
     return reading
 
 
@@ -180,54 +158,47 @@ def _decoded(reading: Reading, data: bytes) -> list[Entry]:
     for number, raw in enumerate([*pieces, tail] if tail else pieces, start=1):
         try:
             entries.append(decode_line(raw, number))
+            reading.lost = 0  # those before it are missing in the numbers
         except ValueError as error:
             if number > len(pieces) and _END.search(raw) is None:
                 reading.torn = tail
             else:
-                reading.faults.append(Fault(number, str(error)))
-                # Lines between which the newline is damaged stand as one.
-                reading.damaged += [number] * max(1, raw.count(b'{"seq":'))
+                reading.faults.append(f"line {number} {error}")
+                reading.lost += 1
     return entries
 
 
 def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entry]:
-    """The lines of the session as they were written; those of others, or doubled or moved ones, are reported."""
+    """The lines of the session as they were written; those of others, or lines that stand elsewhere, are reported."""
     if entries and not session:
         session = Counter(entry.session for entry in entries).most_common(1)[0][0]
-    foreign: dict[str, list[Entry]] = {}
     by_seq: dict[int, Entry] = {}
+    foreign: list[Entry] = []
+    ahead = 0
     for entry in entries:
         if entry.session != session:
-            foreign.setdefault(entry.session, []).append(entry)
-        elif (known := by_seq.setdefault(entry.seq, entry)) is not entry:
-            how = "stands twice: it is" if known.raw == entry.raw else "stands in the place of"
-            reading.faults.append(Fault(entry.number, f"{how} line {entry.seq}"))
-    for other, lines in foreign.items():
-        reading.faults.append(_one_of(lines, f"is of another session, {other[:100]!r}"))
-    as_they_stand = list(by_seq.values())
-    as_written = [by_seq[seq] for seq in sorted(by_seq)]
-    moved = [one for one, other in zip(as_they_stand, as_written, strict=True) if one is not other]
-    if moved:
-        reading.faults.append(_one_of(moved, f"is out of place: it was written as line {moved[0].seq}"))
-    reading.next_seq = as_written[-1].seq + 1 if as_written else 1
-    return as_written
+            foreign.append(entry)
+            ahead -= 1
+        elif entry.seq in by_seq:
+            reading.faults.append(f"line {entry.number} stands twice: it is numbered {entry.seq}")
+            ahead -= 1
+        else:
+            by_seq[entry.seq] = entry
+            if entry.seq - entry.number != ahead:
+                what = f"is numbered {entry.seq}: lines before it are missing or out of place"
+                reading.faults.append(f"line {entry.number} {what}")
+            ahead = entry.seq - entry.number
+    if foreign:
+        of = f"is of another session, {foreign[0].session[:100]!r}"
+        reading.faults.append(f"line {foreign[0].number} {of}{_more(foreign)}")
+    last = max(by_seq, default=0)
+    reading.next_seq = last + 1
+    reading.lost += last - len(by_seq)
+    return [by_seq[seq] for seq in sorted(by_seq)]
 
 
-def _one_of(lines: list[Entry], what: str) -> Fault:
-    return Fault(lines[0].number, what + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""))
-
-
-def _missing(reading: Reading, entries: list[Entry]) -> None:
-    """Report numbers that no line has, except those of lines that cannot be read."""
-    seq = at = 0
-    for entry in entries:
-        gone = entry.seq - seq - 1
-        if gone > 0:
-            gone -= sum(at < number < entry.number for number in reading.damaged)
-        if gone > 0:
-            lines = "a line that is" if gone == 1 else f"{gone} lines that are"
-            reading.faults.append(Fault(entry.number, f"comes after {lines} missing"))
-        seq, at = entry.seq, max(at, entry.number)
+def _more(problems: Sequence[object]) -> str:
+    return f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
 
 
 class Journal:

@@ -286,5 +286,5 @@ def mark_bad_or_good(folder: Path, still: int, stroke_id: str, t_ns: int) -> boo
 def remarks_of(folder: Path) -> dict[int, Remark]:
     """Latest remark for each still; empty where there is none. Raises `SessionDamaged`."""
     path = folder / REMARKS_NAME
-    remarks = [entry.event for entry in undamaged(path).entries] if path.is_file() else []
+    remarks = undamaged(path).events if path.is_file() else []
     return {remark.still: remark for remark in remarks if isinstance(remark, Remark)}

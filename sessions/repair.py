@@ -2,7 +2,7 @@
 
 Order: journal, configuration, steps, merged file. The file of a step and the merged file are two copies: a damaged step
 is written again from the copy that holds most of it, and the merged file is merged again from the steps. A recording
-without its session loses only the strokes of damaged chunks.
+without its session is the only copy: it loses the strokes of its damaged chunks, and nothing else.
 
 Nothing recorded is overwritten or deleted: a damaged original is kept as `<name>.damaged-1`. A repair that is
 interrupted anywhere and started again ends with the same result.
@@ -10,12 +10,18 @@ interrupted anywhere and started again ends with the same result.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
-from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside
-from brushloop.sessions.errors import disk_error
+from google.protobuf.message import DecodeError
+from mcap.records import Message
+from pydantic import ValidationError
+
+from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside, sync
+from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.events import (
     Begin,
     BoardResult,
@@ -24,35 +30,50 @@ from brushloop.sessions.events import (
     Doubt,
     DrawResult,
     Event,
-    JournalRepaired,
     Lost,
     PressResult,
     Repaired,
     line_of,
+    step_words,
 )
-from brushloop.sessions.evidence import Evidence, gather, is_collected
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
-from brushloop.sessions.mcap_file import McapFile, Part, Record, scan
-from brushloop.sessions.recording import check_path, find_recording
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE, StepEvent, Topic
-from brushloop.sessions.salvage import (
-    Report,
-    Strokes,
-    kept_words,
-    lost_words,
-    parsed,
-    repair_file,
-    replace_damaged,
-    write_anew,
+from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
+from brushloop.sessions.mcap_writer import new_mcap
+from brushloop.sessions.messages import decode_still
+from brushloop.sessions.recording import check_path, find_recording, parse_header
+from brushloop.sessions.records import (
+    BEGIN_NOTE,
+    DONE_NOTE,
+    HEADER_NOTE,
+    REPAIRS_NOTE,
+    Header,
+    StepEvent,
+    Stroke,
+    Topic,
 )
-from brushloop.sessions.show import step_words
 from brushloop.sessions.store import closed, lock, merge_session
-from brushloop.sessions.verify import judge
+from brushloop.sessions.verify import Evidence, count_words, gather, is_collected, judge, verify_session
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 """Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""
-Step = tuple[str, int]
-"""Key and attempt of a step."""
+_E = TypeVar("_E", Stroke, StepEvent)
+
+
+@dataclass(slots=True)
+class Report:
+    """Result of a repair."""
+
+    session: str
+    did: list[str] = field(default_factory=list[str])
+    lost: list[str] = field(default_factory=list[str])
+    """Descriptions of what could not be recovered; empty for a repair without loss."""
+    strokes: int = 0
+    """Finished strokes in the session after the repair."""
+
+    @property
+    def lossless(self) -> bool:
+        """Whether everything recorded was recovered."""
+        return not self.lost
 
 
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
@@ -65,7 +86,7 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     try:
         check_path(path)
         if not is_collected(target):
-            return repair_file(find_recording(path).resolve())
+            return _repair_file(find_recording(path).resolve())
         held = lock(target)
         try:
             return _FolderRepair(gather(target), now_ns).run()
@@ -75,15 +96,42 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
         raise disk_error(target, "cannot be repaired", error) from error
 
 
+def _repair_file(path: Path) -> Report:
+    """Repair one MCAP file: an import, or a merged file without its session. Raises `SessionDamaged`."""
+    verdict = verify_session(path)
+    report = Report(path.name, strokes=verdict.strokes)
+    if verdict.sound:
+        return report
+    file = scan(path)
+    if file.header is None:
+        raise SessionDamaged(path, "has lost its header; it cannot be repaired")
+    if HEADER_NOTE not in file.notes:
+        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
+    notes = {name: values for name, values in file.notes.items() if name != HEADER_NOTE}
+    attached = {attachment.name: attachment.data for attachment in file.attachments()}
+    kept, counts, lost = _rewrite(file, parse_header(file), notes, attached, Counter(file.stated))
+    why = "; ".join(finding.what for finding in verdict.findings)
+    report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept}")
+    report.strokes = counts.get(Topic.STROKE, 0)
+    report.lost += lost
+    if file.index is None:
+        if len(file.damage) > 1:
+            report.lost.append("anything else behind the damage: without its index its amount is unknown")
+    elif len(attached) < len(file.index.attachment_indexes) or (
+        {one.name for one in file.index.metadata_indexes} - {HEADER_NOTE, *file.notes}
+    ):
+        report.lost.append("an attached file, or a note of what was done to the recording")
+    return report
+
+
 class _FolderRepair:
     """Repair of one folder while its lock is held."""
 
     def __init__(self, evidence: Evidence, now_ns: Callable[[], int]) -> None:
         self._evidence, self._verdict = evidence, judge(evidence)
-        self._final_problems = self._verdict.problems(evidence.final.name)
         self._folder, self._final, self._state = evidence.folder, evidence.final, evidence.state
+        self._final_problems = self._verdict.problems(self._final.name)
         self._now_ns = now_ns
-        self._final_sound = evidence.state.closed is not None and not self._final_problems
         self._header = read_header(evidence.folder, evidence.state)
         self._report = Report(evidence.folder.name)
         self._lost_steps: list[str] = []
@@ -93,26 +141,24 @@ class _FolderRepair:
     def run(self) -> Report:
         """Repair journal, configuration, steps and merged file."""
         report, state = self._report, self._state
-        if not self._evidence.intact:
+        if self._evidence.reading.faults:
             self._rewrite_journal()
         self._journal = Journal(self._folder / JOURNAL_NAME, self._now_ns(), self._header.session_id)
         try:
-            self._add_lines()
+            if not self._evidence.reading.faults:
+                self._add_rebuilt()
+            self._doubt()
             self._snapshots()
-            damaged = [step for step in state.files.values() if step.file in self._verdict.damaged]
-            self._copies = self._copies_by_step() if damaged else {}
-            for step in damaged:
-                self._repair_step(step, self._verdict.damaged[step.file])
+            self._repair_steps()
             for name, what in self._evidence.strays.items():
-                kept = self._move_aside(self._folder / name)
-                report.did.append(f"put {name} aside: it {what}{kept_words(kept)}")
-                if name in self._begins and not self._final_sound:
+                report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")
+                if name in self._begins:
                     self._lost_steps.append(f"{step_words(self._begins[name])}, whose file {what}")
             if state.closed is None and self._final_problems:
                 kept = self._move_aside(self._final)
-                report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept_words(kept)}")
-            elif state.closed is not None and not self._final_sound:
-                self._merge_again()
+                report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept}")
+            elif state.closed is not None:
+                self._lost_steps = self._merge_again() if self._final_problems else []
         finally:
             self._journal.close()
         report.lost += self._lost_steps
@@ -121,33 +167,28 @@ class _FolderRepair:
         return report
 
     def _rewrite_journal(self) -> None:
-        evidence, path = self._evidence, self._folder / JOURNAL_NAME
-        aside = f"{path.name}.damaged" if path.exists() else ""
-        note = JournalRepaired(t_ns=self._now_ns(), aside=aside, rebuilt=len(evidence.rebuilt), lost=evidence.lost)
-        session = self._header.session_id
-        lines = enumerate([*evidence.events(), note], 1)
-        data = b"".join(encode_line(event.t_ns, line_of(event), number, session) for number, event in lines)
-        kept = write_anew(path, data)
-        report, lines = self._report, len(evidence.reading.entries)
-        report.did.append(
-            f"wrote {JOURNAL_NAME} again: {lines} lines as they were, {len(evidence.rebuilt)} rebuilt "
-            f"from the files{kept_words(kept)}"
+        evidence, session = self._evidence, self._header.session_id
+        lines = (encode_line(event.t_ns, line_of(event), n, session) for n, event in enumerate(evidence.events(), 1))
+        kept = _write_anew(self._folder / JOURNAL_NAME, b"".join(lines))
+        self._report.did.append(
+            f"wrote {JOURNAL_NAME} again: {len(evidence.reading.events)} lines as they were, "
+            f"{len(evidence.rebuilt)} rebuilt from the files{kept}"
         )
-        report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
+        self._report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
         if evidence.lost:
             count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
-            report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
+            self._report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
 
-    def _add_lines(self) -> None:
-        for event in self._evidence.rebuilt if self._evidence.intact else ():
+    def _add_rebuilt(self) -> None:
+        for event in self._evidence.rebuilt:
             self._journal.append(event.t_ns, line_of(event))
             what = step_words(event) if isinstance(event, Begin | Done) else "the session"
             shown = getattr(event, "file", "the header")
             self._report.did.append(f"journalled {event.event!r} of {what}, which {shown} shows")
+
+    def _doubt(self) -> None:
         sheet = self._state.sheet
-        if sheet in self._state.doubtful_sheets:
-            return
-        for name in self._evidence.doubtful:
+        for name in [] if sheet in self._state.doubtful_sheets else self._evidence.doubtful:
             self._log(Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
             self._report.lost.append(
                 f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
@@ -156,57 +197,41 @@ class _FolderRepair:
 
     def _snapshots(self) -> None:
         for name, text in ({} if self._state.opened is None else self._state.opened.snapshots).items():
-            path = self._folder / name
-            data = text.encode()
-            if not holds(path, data):
-                kept = write_anew(path, data)
-                self._report.did.append(f"wrote {path.name} again from the journal{kept_words(kept)}")
+            if not holds(self._folder / name, text.encode()):
+                kept = _write_anew(self._folder / name, text.encode())
+                self._report.did.append(f"wrote {name} again from the journal{kept}")
 
-    def _repair_step(self, step: Done, why: str) -> None:
-        counts = Counter(step.counts)
-        # A photograph without a stroke (the board) is found by the event of its step.
-        needed = MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
+    def _repair_steps(self) -> None:
+        """Write each damaged step again from the copy that holds most of it, or mark it as lost."""
+        damaged = {step.file: step for step in self._state.files.values() if step.file in self._verdict.damaged}
+        best: dict[str, list[Record]] = {file: [] for file in damaged}
+        for step, records in self._copies(damaged):
+            if step.file in best and _worth(step, records) > _worth(step, best[step.file]):
+                best[step.file] = records
+                if _count(records) == Counter(step.counts):
+                    self._write_again(step, best.pop(step.file))  # one photograph in memory
+        for file, records in best.items():
+            if _worth(damaged[file], records)[0]:
+                self._write_again(damaged[file], records)
+            else:
+                self._lose(damaged[file])
 
-        def worth(records: list[Record]) -> tuple[bool, int]:
-            missing = counts - _count(records)
-            return not any(topic in missing for topic in needed), len(records)
+    def _copies(self, damaged: Mapping[str, Done]) -> Iterator[tuple[Done, list[Record]]]:
+        """What is intact of damaged steps in each file of the session, whatever its name."""
+        steps: dict[object, Done] = {}
+        for step in damaged.values():
+            steps[step.key, step.attempt] = step
+            if isinstance(step.result, CaptureResult | BoardResult):
+                steps[step.result.still] = step
+        # Those kept aside come last: what was replaced just now is among them.
+        for pattern in ("*.mcap", "*.mcap.damaged-*") if steps else ():
+            for path in sorted(self._folder.glob(pattern)):
+                file = scan(path)
+                if not self._evidence.foreign(file):
+                    yield from _in_steps(file, steps)
 
-        copies = [records for records in self._copies_of(step) if _count(records) <= counts]
-        records = max(copies, key=worth, default=list[Record]())
-        missing = counts - _count(records)
-        if any(topic in missing for topic in needed):
-            self._lose(step, why)
-        else:
-            self._write_again(step, records, dict(missing), why)
-
-    def _copies_by_step(self) -> dict[Step | int, list[tuple[McapFile, list[Part]]]]:
-        """Files that hold a step, and the chunks of each, by the step that the file names inside, whatever its name.
-
-        Of the merged file, also by the number of a still.
-        """
-        copies: dict[Step | int, list[tuple[McapFile, list[Part]]]] = defaultdict(list)
-        aside = [scan(path) for path in sorted(self._folder.glob("*.mcap*.damaged-*"))]
-        for found in [*self._evidence.files.values(), *aside]:
-            if self._evidence.foreign(found):
-                continue
-            if found.path == self._final:
-                for step, parts in _parts_by_step(found).items():
-                    copies[step].append((found, parts))
-            elif (step := _step_of(found)) is not None:
-                copies[step].append((found, found.parts))
-        return copies
-
-    def _copies_of(self, step: Done) -> Iterator[list[Record]]:
-        """What is intact of a step in each file."""
-        ident, still = (step.key, step.attempt), None
-        if isinstance(step.result, CaptureResult | BoardResult):
-            still = step.result.still
-        for found, parts in [*self._copies.get(ident, ()), *(self._copies.get(still, ()) if still is not None else ())]:
-            records = found.messages(parts=parts)
-            yield list(records) if found.path != self._final else list(_of_step(records, ident, still))
-
-    def _write_again(self, step: Done, records: list[Record], missing: dict[str, int], why: str) -> None:
-        path = self._folder / step.file
+    def _write_again(self, step: Done, records: list[Record]) -> None:
+        path, why = self._folder / step.file, self._verdict.damaged[step.file]
         # Without its `begin` in the journal, one is made from its `done`.
         begin = self._begins.get(step.file) or Begin(
             t_ns=step.t_ns,
@@ -218,140 +243,218 @@ class _FolderRepair:
         )
         begun = {"t_ns": begin.t_ns, **line_of(begin)}
         done = {name: value for name, value in line_of(step).items() if name in ("key", "attempt", "result")}
-        counts = dict(_count(records))
-        notes: dict[str, Line] = {BEGIN_NOTE: begun, DONE_NOTE: {"t_ns": step.t_ns, **done, "counts": counts}}
-        kept, counts = replace_damaged(path, self._header, notes, {}, records)
-        self._kept_as(path, kept)
+        notes: dict[str, Line] = {
+            BEGIN_NOTE: begun,
+            DONE_NOTE: {"t_ns": step.t_ns, **done, "counts": dict(_count(records))},
+        }
+        kept, counts = _replace_damaged(path, self._header, notes, {}, records)
+        missing = dict(Counter(step.counts) - Counter(counts))
         self._log(
             Repaired(
                 t_ns=self._now_ns(),
                 key=step.key,
-                file=path.name,
+                file=step.file,
                 sha256=file_sha256(path),
                 counts=counts,
                 missing=missing,
-                aside=kept,
                 why=why,
             )
         )
-        words = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
-        how = f"without {words}" if words else "whole"
-        self._report.did.append(f"wrote {path.name} ({step_words(step)}) again {how}: {why}{kept_words(kept)}")
-        if words:
-            self._lost_steps.append(f"messages in {path.name} ({step_words(step)}): {words}")
+        how = f"without {count_words(missing)}" if missing else "whole"
+        self._report.did.append(f"wrote {step.file} ({step_words(step)}) again {how}: {why}{kept}")
+        if missing:
+            self._lost_steps.append(f"messages in {step.file} ({step_words(step)}): {count_words(missing)}")
 
-    def _lose(self, step: Done, why: str) -> None:
+    def _lose(self, step: Done) -> None:
         kept = self._move_aside(self._folder / step.file)
+        self._mark_lost(step, self._verdict.damaged[step.file], kept)
         again = "" if self._state.closed is not None else "; it is done again when the session goes on"
-        self._log(Lost(t_ns=self._now_ns(), key=step.key, file=step.file, aside=kept, why=why))
-        self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}{kept_words(kept)}")
         self._lost_steps.append(f"{step_words(step)}{again}")
-        if self._state.closed is None and isinstance(step.result, CaptureResult):
-            self._lose_press(step.result.press.stroke_id)
-
-    def _lose_press(self, stroke_id: str) -> None:
-        """Mark the press of a lost photograph as lost too if its sheet was removed: it cannot be photographed again."""
-        for step in list(self._state.files.values()):
-            if not isinstance(step.result, PressResult | DrawResult) or step.result.press.stroke_id != stroke_id:
+        if self._state.closed is not None or not isinstance(step.result, CaptureResult):
+            return
+        # If its sheet was removed, the stroke cannot be photographed again: its press is lost too.
+        for done in list(self._state.files.values()):
+            press = done.press if isinstance(done.result, PressResult | DrawResult) else None
+            if press is None or press.stroke_id != step.result.press.stroke_id:
                 continue
-            sheet = step.result.press.sheet
-            if sheet is not None and sheet != self._state.sheet:
-                why = f"its photograph is lost and its sheet {sheet + 1} is no longer in"
-                self._log(Lost(t_ns=self._now_ns(), key=step.key, file=step.file, why=why))
-                self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}")
+            if press.sheet is not None and press.sheet != self._state.sheet:
+                self._mark_lost(done, f"its photograph is lost and its sheet {press.sheet + 1} is no longer in")
+
+    def _mark_lost(self, step: Done, why: str, kept: str = "") -> None:
+        self._log(Lost(t_ns=self._now_ns(), key=step.key, file=step.file, why=why))
+        self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}{kept}")
 
     def _move_aside(self, path: Path) -> str:
         if not path.exists():
             return ""
-        kept = set_aside(path, "damaged").name
+        kept = _keep(path)
         path.unlink()
         fsync_folder(self._folder)
-        self._kept_as(path, kept)
         return kept
 
-    def _kept_as(self, path: Path, kept: str) -> None:
-        """Read what a file held from where it is kept: another step may be in it."""
-        if kept and path.name in self._evidence.files:
-            self._evidence.files[path.name].path = self._folder / kept
+    def _merge_again(self) -> list[str]:
+        """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes.
 
-    def _merge_again(self) -> None:
-        """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes."""
-        found, strokes = self._evidence.files.get(self._final.name), self._state.counts().get(Topic.STROKE, 0)
-        if found is not None and not self._evidence.foreign(found) and len(Strokes(found).kept) > strokes:
-            self._lost_steps = self._rewrite_final(found)
-            return
-        why = "; ".join(self._final_problems)
-        kept = set_aside(self._final, "damaged").name if self._final.is_file() else ""
-        merge_session(self._folder, self._state, self._header, "damaged")
-        self._log(closed(self._final, self._state.counts(), self._now_ns()))
-        self._report.did.append(f"merged {self._final.name} again from the steps' files: it {why}{kept_words(kept)}")
-
-    def _rewrite_final(self, found: McapFile) -> list[str]:
-        """Rewrite the merged file, and return descriptions of what was lost."""
-        strokes = Strokes(found)
-        names = {} if self._state.opened is None else self._state.opened.snapshots
-        files = {a.name: a.data for a in found.attachments()} | {name: text.encode() for name, text in names.items()}
-        repairs = [line_of(repair) for repair in self._state.repairs]
-        notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
-        kept, counts = replace_damaged(self._final, self._header, notes, files, strokes.messages())
-        before = Counter[str]({} if self._state.closed is None else self._state.closed.counts)
+        Returns descriptions of what was lost.
+        """
+        state, file = self._state, self._evidence.files.get(self._final.name)
+        counts, lost, how = state.counts(), self._lost_steps, "from the steps' files"
+        more = file is not None and len(_Strokes(file).kept) > counts.get(Topic.STROKE, 0)
+        if file is not None and more and not self._evidence.foreign(file):
+            repairs = [line_of(repair) for repair in state.repairs]
+            notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
+            names = {} if state.opened is None else state.opened.snapshots
+            attached = {name: text.encode() for name, text in names.items()}
+            before = Counter[str]({} if state.closed is None else state.closed.counts)
+            kept, counts, lost = _rewrite(file, self._header, notes, attached, before)
+            how = "from what can be read of it"
+        else:
+            kept = _keep(self._final)
+            merge_session(self._folder, state, self._header, "damaged")
         self._log(closed(self._final, counts, self._now_ns()))
-        why = "; ".join(self._final_problems)
-        self._report.did.append(f"wrote {self._final.name} again from what can be read of it: {why}{kept_words(kept)}")
-        return lost_words(strokes, before, counts)
+        self._report.did.append(f"wrote {self._final.name} again {how}: {'; '.join(self._final_problems)}{kept}")
+        return lost
 
     def _log(self, event: Event) -> None:
         self._journal.append(event.t_ns, line_of(event))
         self._state.apply(event)
 
 
+class _Strokes:
+    """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
+
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
+        self.kept: dict[str, int] = {}
+        """Number of the still that shows it, by name of the stroke."""
+        stills, named = set[int](), dict[str, None]()
+        for _schema, channel, message in file.messages((Topic.STILL, Topic.STROKE)):
+            if channel.topic == Topic.STILL and _shows(message):
+                stills.add(message.sequence)
+            elif channel.topic == Topic.STROKE and (stroke := _parsed(Stroke, message)) is not None:
+                named[stroke.stroke_id] = None
+                if stroke.still in stills:
+                    self.kept.setdefault(stroke.stroke_id, stroke.still)
+        self.photograph_lost = [name for name in named if name not in self.kept]
+
+    def messages(self) -> Iterator[Record]:
+        """Everything readable, except strokes without a photograph and strokes that were read before."""
+        waiting = dict(self.kept)
+        for schema, channel, message in self._file.messages():
+            stroke = _parsed(Stroke, message) if channel.topic == Topic.STROKE else None
+            if stroke is not None:
+                if waiting.get(stroke.stroke_id) != stroke.still:
+                    continue
+                del waiting[stroke.stroke_id]
+            yield schema, channel, message
+
+
+def _shows(message: Message) -> bool:
+    try:
+        return bool(decode_still(message.data))
+    except DecodeError:
+        return False
+
+
+def _parsed(kind: type[_E], message: Message) -> _E | None:
+    """The event in a message; None where it does not fit its schema."""
+    try:
+        return kind.model_validate_json(message.data)
+    except ValidationError:
+        return None
+
+
+def _rewrite(
+    file: McapFile, header: Header, notes: dict[str, Line], attached: dict[str, bytes], before: Counter[str]
+) -> tuple[str, dict[str, int], list[str]]:
+    """Write a damaged recording again from what can be read of it; `before` are its messages by topic as they were.
+
+    Returns where the damaged file is kept, the messages by topic, and descriptions of what was lost.
+    """
+    strokes = _Strokes(file)
+    kept, counts = _replace_damaged(file.path, header, notes, attached, strokes.messages())
+    lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
+    gone = before - Counter(counts)
+    unknown = gone.pop(Topic.STROKE, 0) - len(lost)
+    if unknown > 0:
+        lost.append(f"strokes that cannot be read: {unknown}")
+    return kept, counts, lost + [f"messages on {topic}: {count}" for topic, count in gone.items()]
+
+
+def _in_steps(file: McapFile, steps: Mapping[object, Done]) -> Iterator[tuple[Done, list[Record]]]:
+    """What is readable of these steps in a file; they are found by their key and attempt, or by the number of a still.
+
+    The messages of a step stand between its begin and its end, one of which may be lost.
+    """
+    records, step = list[Record](), None
+    for record in file.messages():
+        _schema, channel, message = record
+        event = _parsed(StepEvent, message) if channel.topic == Topic.STEP else None
+        if event is not None and event.phase == "begin":
+            if step is not None:
+                yield step, records
+            records, step = [], None
+        records.append(record)
+        if event is not None:
+            step = step or steps.get((event.key, event.attempt))
+        elif channel.topic == Topic.STILL:
+            step = step or steps.get(message.sequence)
+        if event is not None and event.phase == "end":
+            if step is not None:
+                yield step, records
+            records, step = [], None
+    if step is not None:
+        yield step, records
+
+
+def _worth(step: Done, records: list[Record]) -> tuple[bool, int]:
+    """How good a copy of a step is: whether it will do, and how many messages it holds."""
+    counts, present = Counter(step.counts), _count(records)
+    # A photograph without a stroke (the board) is found by the event of its step.
+    needed = MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
+    return present <= counts and not any(topic in counts - present for topic in needed), len(records)
+
+
 def _count(records: list[Record]) -> Counter[str]:
     return Counter(channel.topic for _schema, channel, _message in records)
 
 
-def _step_of(found: McapFile) -> Step | None:
-    """Key and attempt of the step recorded in a file, from its content, whatever its name."""
-    for values in (found.notes.get(BEGIN_NOTE), found.notes.get(DONE_NOTE)):
-        match values:
-            case {"key": str(key), "attempt": int(attempt)}:
-                return key, attempt
-            case _:
-                pass
-    for _schema, _channel, message in found.messages(topics=(Topic.STEP,)):
-        event = parsed(StepEvent, message)
-        return None if event is None else (event.key, event.attempt)
-    return None
+def _replace_damaged(
+    path: Path, header: Header, notes: dict[str, Line], attached: dict[str, bytes], messages: Iterable[Record]
+) -> tuple[str, dict[str, int]]:
+    """Write a file with these contents in place of `path`, and keep the damaged one beside it.
+
+    Returns where that is, and the messages by topic as read back. Raises `SessionError`; the damaged file then still
+    has its own name.
+    """
+    fresh = path.with_name(path.name + ".repair")
+    try:
+        fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
+        with new_mcap(fresh, header, notes, attached) as writer:
+            for record in messages:
+                writer.copy(*record)
+        counts = dict(scan_sound(fresh).counts)
+        return _put_in_place(fresh, path), counts
+    except OSError as error:
+        raise disk_error(path, "cannot write its repaired copy", error) from error
 
 
-def _parts_by_step(found: McapFile) -> dict[Step | int, list[Part]]:
-    """Sound chunks of a merged file by the step, between its begin and end, and by the number of the still in them."""
-    parts: dict[Step | int, list[Part]] = defaultdict(list)
-    step: Step | None = None
-    for part in found.parts:
-        if not part.sound:
-            step = None
-            continue
-        inside: set[Step | int] = set() if step is None else {step}
-        for _schema, channel, message in found.messages(parts=[part], topics=(Topic.STEP, Topic.STILL, Topic.STROKE)):
-            if channel.topic != Topic.STEP:
-                inside.add(message.sequence)  # a stroke has that of its still
-            elif (event := parsed(StepEvent, message)) is not None:
-                inside.add((event.key, event.attempt))
-                step = (event.key, event.attempt) if event.phase == "begin" else None
-        for name in inside:
-            parts[name].append(part)
-    return parts
+def _write_anew(path: Path, data: bytes) -> str:
+    """Replace a file; returns where the damaged one is kept. Raises `OSError`."""
+    fresh = path.with_name(path.name + ".repair")
+    with fresh.open("wb") as file:
+        file.write(data)
+        sync(file)
+    return _put_in_place(fresh, path)
 
 
-def _of_step(records: Iterator[Record], step: Step, still: int | None) -> Iterator[Record]:
-    """The messages of one step among those of a merged file."""
-    inside = False
-    for record in records:
-        _schema, channel, message = record
-        event = parsed(StepEvent, message) if channel.topic == Topic.STEP else None
-        if event is not None:
-            inside = (event.key, event.attempt) == step
-        if inside or (channel.topic in MEASURED and message.sequence == still):
-            yield record
-        if event is not None and event.phase == "end":
-            inside = False
+def _put_in_place(fresh: Path, path: Path) -> str:
+    kept = _keep(path)
+    fresh.replace(path)
+    fsync_folder(path.parent)
+    return kept
+
+
+def _keep(path: Path) -> str:
+    """Give the damaged file, if there is one, a second name, and say which."""
+    return f"; the damaged file is kept as {set_aside(path, 'damaged').name}" if path.exists() else ""

@@ -128,7 +128,7 @@ class RunState:
             case events.Doubt(sheet=sheet, file=file):
                 self.doubtful_sheets.add(sheet)
                 self.begun = max(self.begun, _next_serial(file))
-            case events.Torn() | events.Clock() | events.JournalRepaired() | events.Remark():
+            case events.Torn() | events.Clock() | events.Remark():
                 pass  # for people who read the journal
         self.last_ns = event.t_ns
 

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
-from brushloop.sessions.events import Begin, CaptureResult, DipResult, Done, DrawResult, PressResult
+from brushloop.sessions.events import CaptureResult, Done, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
 from brushloop.sessions.recording import Recording, check_path, merged_file, remarks_of
 from brushloop.sessions.records import Header
@@ -147,21 +147,6 @@ def _cut(state: RunState) -> tuple[list[str], str]:
     lines = [f"{step_words(begin)}, attempt {begin.attempt}: {why}" for begin, why in cut]
     open_steps = [step_words(begin) for begin, _ in cut if begin.key not in state.done]
     return lines, open_steps[-1] if open_steps and state.closed is None else ""
-
-
-def step_words(step: Begin | Done) -> str:
-    """Name of a step for people: `capture H13-a05-r02`."""
-    press = None
-    match step:
-        case Begin(press=press):
-            pass
-        case Done(result=PressResult(press=press) | DrawResult(press=press) | CaptureResult(press=press)):
-            pass
-        case Done(result=DipResult(skipped=press)):
-            pass
-        case _:
-            pass
-    return f"{step.kind} {'' if press is None else press.stroke_id}".strip().replace("_", " ")
 
 
 def _segment(folder: Path, step: Done) -> Segment:

@@ -1,28 +1,260 @@
-"""Judge a session: every file is read again in full, and every difference from what was recorded is described.
+"""Judge a session: what it contained according to its journal and its files together, and every difference from that.
 
-`brushloop sessions verify` prints the verdict, and `repair` acts on it; judging changes nothing.
+The file of every step holds a copy of the journal's `begin` line and, once finished, of its `done` line: lines that the
+journal lost are rebuilt from these word for word. Every file is read again in full. `brushloop sessions verify` prints
+the verdict, and `repair` acts on it; judging changes nothing.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import check_digest, holds
+from brushloop.sessions.disk import (
+    MAX_SNAPSHOT_BYTES,
+    SEGMENT_NAME,
+    SNAPSHOT_NAMES,
+    check_digest,
+    check_file,
+    file_sha256,
+    holds,
+    read_bounded,
+)
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
-from brushloop.sessions.events import Begin, Closed, Done, Lost, Open, Repaired
-from brushloop.sessions.evidence import Evidence, gather, is_collected
-from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.events import (
+    Begin,
+    CaptureResult,
+    Closed,
+    Done,
+    Doubt,
+    Event,
+    Lost,
+    Open,
+    StepKind,
+    Void,
+    parse_event,
+    serial_of,
+    step_words,
+)
+from brushloop.sessions.journal import JOURNAL_NAME, Line, Reading, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.recording import Recording, check_path, find_recording
-from brushloop.sessions.records import HEADER_NOTE, Stroke, Topic
-from brushloop.sessions.show import details, step_words
+from brushloop.sessions.recording import Recording, check_path, find_recording, merged_file, parse_header, remarks_of
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Header, Stroke, Topic
+from brushloop.sessions.run_state import DoneTwice, RunState
+from brushloop.sessions.store import closed
 from brushloop.sessions.terminal import Progress, counted, unseen
+
+MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
+"""Kinds of steps that use patches."""
+
+
+@dataclass(slots=True)
+class Evidence:
+    """A session's folder as it is, and as it must have been."""
+
+    folder: Path
+    final: Path
+    """The merged file."""
+    reading: Reading
+    files: dict[str, McapFile]
+    """What the files of steps and the merged file hold, by name."""
+    session: str
+    """Id of the session: neither lines nor files of another one are evidence of anything."""
+    rebuilt: list[Event] = field(default_factory=list[Event])
+    """Events missing from the journal and found in the files."""
+    doubtful: list[str] = field(default_factory=list[str])
+    """Files of attempts whose sheet and patch are unknown."""
+    strays: dict[str, str] = field(default_factory=dict[str, str])
+    """Files that cannot stand where they are, and why."""
+    state: RunState = field(default_factory=RunState)
+    """State after all events."""
+
+    @property
+    def lost(self) -> int:
+        """Number of damaged or missing lines for which nothing was rebuilt."""
+        return max(0, self.reading.lost - len(self.rebuilt))
+
+    def foreign(self, file: McapFile) -> list[str]:
+        """What is wrong with a file of another session: nothing in it is evidence."""
+        session = file.session
+        return [] if session in ("", self.session) else [f"is of another session, {session[:100]!r}"]
+
+    def events(self) -> list[Event]:
+        """Events of the journal as it must have been, with the rebuilt ones in their places."""
+        placed = [(_place(event), event) for event in self.rebuilt]
+        place = -1.0
+        for event in self.reading.events:
+            place = max(place, _place(event))
+            placed.append((place, event))
+        return [event for _, event in sorted(placed, key=lambda one: one[0])]
+
+
+def _place(event: Event) -> float:
+    """Where an event belongs: by the serial number of its step; -1 for one that stays behind the one before it."""
+    match event:
+        case Open():
+            return -2
+        case Begin() | Done():
+            serial = serial_of(event.file)
+            return float("inf") if serial is None else serial + isinstance(event, Done) / 2
+        case Closed():
+            return float("inf")
+        case _:
+            return -1
+
+
+def gather(folder: Path) -> Evidence:
+    """Read the journal and the files, and rebuild what the journal lost.
+
+    Raises `SessionDamaged` if not even a header is left.
+    """
+    data, unreadable = b"", list[str]()
+    try:
+        if check_file(folder / JOURNAL_NAME):
+            data = read_journal(folder / JOURNAL_NAME)
+        else:
+            unreadable = ["is missing, though the folder holds recordings"]
+    except SessionDamaged as error:
+        unreadable = [error.what]
+    reading = read(data)
+    # A damaged journal may have lost the name of the merged file.
+    final = merged_file(folder, None if unreadable or reading.faults else reading.state)
+    files = {path.name: scan(path) for path in [*_step_files(folder), *([final] if final.is_file() else [])]}
+    named = "" if reading.state.opened is None else reading.state.opened.header.session_id
+    session = _session(folder.name, named, Counter(file.session for file in files.values() if file.session))
+    if session not in ("", named):
+        reading = read(data, session)
+    reading.faults[:0] = unreadable
+    evidence = Evidence(folder, final, reading, files, session)
+    _rebuild_steps(evidence)
+    if reading.state.opened is None:
+        evidence.rebuilt.append(Open(t_ns=0, header=_header(evidence), snapshots=_snapshots(folder)))
+    for event in evidence.events():
+        try:
+            evidence.state.apply(event)
+        except DoneTwice:
+            # Only a rebuilt event can raise this: the journal's own were applied before.
+            evidence.rebuilt = [other for other in evidence.rebuilt if other is not event]
+    _rebuild_closed(evidence)
+    return evidence
+
+
+def is_collected(folder: Path) -> bool:
+    """Whether a folder holds a journal or files of steps."""
+    return (folder / JOURNAL_NAME).exists() or bool(_step_files(folder))
+
+
+def _step_files(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.glob("*.mcap*")) if SEGMENT_NAME.fullmatch(path.name)]
+
+
+def _session(folder: str, named: str, files: Counter[str]) -> str:
+    """Id of the session in a folder: its name, unless neither journal nor files say it; then the id of most files."""
+    if folder == named or folder in files:
+        return folder
+    return named if not files or files[named] == max(files.values()) else files.most_common(1)[0][0]
+
+
+def _rebuild_steps(evidence: Evidence) -> None:
+    """Rebuild `begin` and `done` from the notes in the files of steps, whatever these are called now."""
+    events, state = evidence.reading.events, evidence.reading.state
+    begun = {event.file: event for event in events if isinstance(event, Begin)}
+    doubted = {event.file for event in events if isinstance(event, Doubt)}
+    over: set[str | tuple[str, int]] = {event.file for event in events if isinstance(event, Done | Lost)}
+    over |= {(event.key, event.attempt) for event in events if isinstance(event, Void)}
+    attempts = dict(state.attempts)
+    unlisted: list[str] = []
+    for name, file in evidence.files.items():
+        step_name = SEGMENT_NAME.fullmatch(name)
+        if step_name is None:
+            continue
+        own = name.removesuffix(".part")
+        if foreign := evidence.foreign(file):
+            evidence.strays |= {} if own in begun else {name: foreign[0]}
+            continue
+        begin = _begin(file) or begun.get(own)
+        if begin is None:
+            if step_name[2] in MARKING and name not in doubted:
+                evidence.doubtful.append(name)
+            continue
+        if begin.file not in begun:
+            begun[begin.file] = begin
+            attempts[begin.key] = max(attempts.get(begin.key, 0), begin.attempt)
+            evidence.rebuilt.append(begin)
+        if own != begin.file:
+            unlisted.append(name)
+        if name != own or over & {begin.file, (begin.key, begin.attempt)} or attempts[begin.key] > begin.attempt:
+            continue
+        known = state.done.get(begin.key)
+        if known is not None and Topic.STROKE in known.counts:
+            continue
+        if (done := _done(file, begin)) is not None:
+            # An empty digest matches no file, so a damaged file is found and repaired like any other.
+            whole = own == begin.file and not file.damage and dict(file.counts) == done.counts
+            over.add(done.file)
+            evidence.rebuilt.append(done.model_copy(update={"sha256": file_sha256(file.path) if whole else ""}))
+        elif own == begin.file:
+            evidence.strays[name] = "is finished, but the result of its step cannot be read"
+    words = "holds a step that the journal lists under another file"
+    evidence.strays |= {name: words for name in unlisted if name.removesuffix(".part") not in begun}
+
+
+def _begin(file: McapFile) -> Begin | None:
+    """The `begin` that a file notes; None where it makes no sense."""
+    event = _noted(file.notes.get(BEGIN_NOTE, {}))
+    return event if isinstance(event, Begin) else None
+
+
+def _done(file: McapFile, begin: Begin) -> Done | None:
+    """The `done` that a file notes, without a digest; that of a capture is also known from its stroke."""
+    line: Line = {"event": "done", **file.notes.get(DONE_NOTE, {}), "file": begin.file, "sha256": ""}
+    if DONE_NOTE not in file.notes and begin.press is not None and file.counts[Topic.STROKE]:
+        stills = [message.sequence for _schema, _channel, message in file.messages((Topic.STROKE,))]
+        result = CaptureResult(press=begin.press, still=stills[-1]).model_dump(exclude_none=True)
+        line |= {"t_ns": begin.t_ns, "key": begin.key, "attempt": begin.attempt, "counts": file.counts}
+        line |= {"result": result}
+    event = _noted(line)
+    return event if isinstance(event, Done) else None
+
+
+def _noted(line: Line) -> Event | None:
+    try:
+        return parse_event(line)
+    except ValueError:
+        return None
+
+
+def _header(evidence: Evidence) -> Header:
+    """Header of the session in one of its files, preferably where it matches its CRC. Raises `SessionDamaged`."""
+    ours = [file for file in evidence.files.values() if file.header is not None and not evidence.foreign(file)]
+    if not ours:
+        raise SessionDamaged(evidence.folder / JOURNAL_NAME, "has no `open` event, and no file holds its header")
+    return parse_header(max(ours, key=lambda file: file.session == evidence.session))
+
+
+def _snapshots(folder: Path) -> dict[str, str]:
+    present = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
+    return {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace") for path in present}
+
+
+def _rebuild_closed(evidence: Evidence) -> None:
+    """Rebuild `closed` if the merged file is sound and holds all messages that the journal counts, or more.
+
+    It holds more where the files of steps are lost with their lines: it is then the only copy.
+    """
+    file, state = evidence.files.get(evidence.final.name), evidence.state
+    if state.closed is not None or file is None or file.damage or file.session != evidence.session:
+        return
+    if file.counts and file.counts >= Counter(state.counts()):
+        event = closed(evidence.final, dict(file.counts), state.last_ns)
+        evidence.rebuilt.append(event)
+        state.apply(event)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,39 +311,109 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
     return judge(evidence, progress)
 
 
+def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
+    file = scan(path)
+    verdict = Verdict(name, "recording", files=1, strokes=file.counts[Topic.STROKE], messages=file.counts.total())
+    if file.index is not None and HEADER_NOTE not in (one.name for one in file.index.metadata_indexes):
+        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}")
+    verdict.find(path.name, *file.damage, *_content_problems(file, progress))
+    if verdict.sound:
+        try:
+            Recording(path)
+        except SessionError as error:
+            verdict.find(path.name, error.what)
+    return verdict
+
+
 def judge(evidence: Evidence, progress: Progress = unseen) -> Verdict:
     """Judge a session's folder by its files and by what its journal must have said."""
     folder, state = evidence.folder, evidence.state
+    counts = Counter(state.counts() if state.closed is None else state.closed.counts)
     verdict = Verdict(folder.name, "open" if state.closed is None else "closed")
+    verdict.strokes, verdict.messages = counts[Topic.STROKE], counts.total()
     _judge_journal(verdict, evidence)
     for done in counted(list(state.files.values()), "files of steps read", len(state.files), progress):
-        _judge_step(verdict, evidence, done)
+        _judge_file(verdict, evidence, done.file, done)
     for name, text in ({} if state.opened is None else state.opened.snapshots).items():
-        if not (folder / name).is_file():
-            verdict.find(name, "is missing, though the journal holds its text")
-        elif not holds(folder / name, text.encode()):
-            verdict.find(name, "has changed since the session was started")
-    _judge_final(verdict, evidence, progress)
-    if verdict.sound:
-        _try_readers(verdict, folder)
-    _count(verdict, Counter(state.counts() if state.closed is None else state.closed.counts))
-    verdict.notes += [f"{repair.file}: {_repair_words(repair)}" for repair in state.repairs]
-    kept = [path for path in folder.iterdir() if ".damaged-" in path.name or ".superseded-" in path.name]
-    if kept:
+        if not holds(folder / name, text.encode()):
+            verdict.find(name, "is missing, or has changed since the session was started")
+    _judge_file(verdict, evidence, evidence.final.name, state.closed, progress)
+    if verdict.sound:  # then every reader can read it
+        try:
+            remarks_of(folder)
+            if state.closed is not None:
+                Recording(folder)
+        except (InputError, SessionDamaged) as error:
+            verdict.find(error.path.name, error.what)
+    for repair in state.repairs:
+        if isinstance(repair, Lost):
+            verdict.notes.append(f"{repair.file}: was lost: {repair.why}")
+        else:
+            missing = count_words(repair.missing) or "nothing"
+            verdict.notes.append(f"{repair.file}: was repaired; missing: {missing}")
+    if kept := [path for path in folder.iterdir() if ".damaged-" in path.name or ".superseded-" in path.name]:
         verdict.notes.append(f"{len(kept)} damaged or replaced files are kept beside the session's own")
     return verdict
 
 
-def content_problems(found: McapFile, progress: Progress = unseen) -> list[str]:
+def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
+    reading = evidence.reading
+    verdict.find(JOURNAL_NAME, *reading.faults)
+    if evidence.lost:
+        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines cannot be rebuilt")
+    elif reading.faults:
+        verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
+    if reading.torn:
+        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
+    for event in evidence.rebuilt:
+        match event:
+            case Begin(file=file):
+                verdict.find(JOURNAL_NAME, f"does not mention {file}")
+            case Done(file=file):
+                verdict.notes.append(f"{file}: {step_words(event)} is finished, but not journalled as done")
+            case Closed(file=file):
+                verdict.notes.append(f"{file} is complete, but not journalled as closed")
+            case _:
+                verdict.find(JOURNAL_NAME, "does not say how the session was opened")
+    for name, what in evidence.strays.items():
+        verdict.find(name, what)
+    for name in evidence.doubtful:
+        verdict.find(name, "the patch and the sheet that it pressed are unknown")
+
+
+def _judge_file(
+    verdict: Verdict, evidence: Evidence, name: str, listed: Done | Closed | None, progress: Progress = unseen
+) -> None:
+    """Judge a file of a step or the merged one by its content and by what the journal says of it, if anything."""
+    file, problems = evidence.files.get(name), list[str]()
+    verdict.files += file is not None or listed is not None
+    if file is not None:
+        problems = evidence.foreign(file) or list(file.damage)
+        # In a closed session the merged file holds the same messages, so they are decoded only there.
+        if not problems and (evidence.state.closed is None or name == evidence.final.name):
+            problems = _content_problems(file, progress)
+    if listed is not None:
+        try:
+            check_digest(evidence.folder / name, listed.sha256)
+            if file is not None and not problems and dict(file.counts) != listed.counts:
+                problems = [f"holds {dict(file.counts)}, but the journal says {listed.counts}"]
+        except SessionDamaged as error:
+            why = verdict.damaged[name] = "; ".join(problems) or error.what
+            lost = Counter[str]() if file is None else Counter(listed.counts) - file.counts
+            problems = [why if file is None else f"{why}; messages lost: {count_words(lost) or 'none'}"]
+    step = f"({step_words(listed)}) " if isinstance(listed, Done) else ""
+    verdict.find(name, *(f"{step}{problem}" for problem in problems))
+
+
+def _content_problems(file: McapFile, progress: Progress) -> list[str]:
     """Decode the photographs and the strokes of a file, and list what is wrong with them."""
     problems: list[str] = []
     stills: set[int] = set()
     strokes: set[str] = set()
-    name = found.path.name
     try:
-        for _schema, channel, message in found.messages(topics=(Topic.STILL, Topic.STROKE)):
+        for _schema, channel, message in file.messages(topics=(Topic.STILL, Topic.STROKE)):
             if channel.topic == Topic.STILL:
-                progress(f"{name}: photographs decoded", len(stills), found.counts[Topic.STILL])
+                progress(f"{file.path.name}: photographs decoded", len(stills), file.counts[Topic.STILL])
                 decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
                 stills.add(message.sequence)
                 continue
@@ -130,106 +432,6 @@ def content_problems(found: McapFile, progress: Progress = unseen) -> list[str]:
     return problems
 
 
-def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
-    verdict = Verdict(name, "recording", files=1)
-    found = scan(path)
-    if found.index is not None and HEADER_NOTE not in (one.name for one in found.index.metadata_indexes):
-        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}")
-    verdict.find(path.name, *found.damage, *content_problems(found, progress))
-    if verdict.sound:
-        try:
-            Recording(path)
-        except SessionError as error:
-            verdict.find(path.name, error.what)
-    _count(verdict, found.counts)
-    return verdict
-
-
-def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
-    verdict.find(JOURNAL_NAME, *(str(fault) for fault in evidence.reading.faults))
-    if evidence.lost:
-        verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines cannot be rebuilt")
-    elif evidence.reading.faults:
-        verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
-    if not evidence.has_journal:
-        verdict.find(JOURNAL_NAME, "is missing, though the folder holds recordings")
-    if evidence.reading.torn:
-        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
-    for event in evidence.rebuilt:
-        match event:
-            case Begin(file=file):
-                verdict.find(JOURNAL_NAME, f"does not mention {file}")
-            case Done(file=file):
-                verdict.notes.append(f"{file}: {step_words(event)} is finished, but not journalled as done")
-            case Closed(file=file):
-                verdict.notes.append(f"{file} is complete, but not journalled as closed")
-            case Open():
-                verdict.find(JOURNAL_NAME, "does not say how the session was opened")
-            case _:
-                pass
-    for name, what in evidence.strays.items():
-        verdict.find(name, what)
-    for name in evidence.doubtful:
-        verdict.find(name, "the patch and the sheet that it pressed are unknown")
-
-
-def _judge_step(verdict: Verdict, evidence: Evidence, done: Done) -> None:
-    found = evidence.files.get(done.file)
-    verdict.files += 1
-    # The merged file holds the same messages, so they are decoded only there.
-    problems = [] if found is None else _problems(evidence, found, decode=evidence.state.closed is None)
-    if changed := _changed(evidence.folder / done.file, done.sha256):
-        why = verdict.damaged[done.file] = "; ".join(problems) or changed
-        lost = Counter[str]() if found is None else Counter(done.counts) - found.counts
-        words = ", ".join(f"{count} of {topic}" for topic, count in lost.items()) or "none"
-        problems = [why if found is None else f"{why}; messages lost: {words}"]
-    elif found is not None and dict(found.counts) != done.counts:
-        problems.append(f"holds {dict(found.counts)}, but the journal says {done.counts}")
-    verdict.find(done.file, *(f"({step_words(done)}) {problem}" for problem in problems))
-
-
-def _judge_final(verdict: Verdict, evidence: Evidence, progress: Progress) -> None:
-    """Judge the merged file; that of an open session was left by a close that was cut off or is not in the journal."""
-    found, closed = evidence.files.get(evidence.final.name), evidence.state.closed
-    verdict.files += closed is not None or found is not None
-    if closed is not None and (changed := _changed(evidence.final, closed.sha256)):
-        verdict.find(evidence.final.name, changed)
-    if found is not None:
-        problems = _problems(evidence, found, progress)
-        if closed is not None and not problems and dict(found.counts) != closed.counts:
-            problems = [f"holds {dict(found.counts)}, but the journal says {closed.counts}"]
-        verdict.find(evidence.final.name, *problems)
-
-
-def _problems(evidence: Evidence, found: McapFile, progress: Progress = unseen, *, decode: bool = True) -> list[str]:
-    """What is wrong with the content of a file; nothing in one of another session is evidence."""
-    return evidence.foreign(found) or [*found.damage, *(content_problems(found, progress) if decode else ())]
-
-
-def _changed(path: Path, sha256: str) -> str:
-    try:
-        check_digest(path, sha256)
-    except SessionDamaged as error:
-        return error.what
-    return ""
-
-
-def _try_readers(verdict: Verdict, folder: Path) -> None:
-    """Report as damage any error that `show` or a reader raises."""
-    try:
-        details(folder)
-        if verdict.state == "closed":
-            Recording(folder)
-    except (InputError, SessionDamaged) as error:
-        verdict.find(error.path.name, error.what)
-
-
-def _count(verdict: Verdict, counts: Counter[str]) -> None:
-    verdict.strokes, verdict.messages = counts[Topic.STROKE], counts.total()
-
-
-def _repair_words(repair: Repaired | Lost) -> str:
-    if isinstance(repair, Lost):
-        return f"was lost: {repair.why}"
-    missing = ", ".join(f"{count} of {topic}" for topic, count in repair.missing.items())
-    return f"was repaired; missing: {missing or 'nothing'}"
+def count_words(counts: Mapping[str, int]) -> str:
+    """Text such as `1 of /step, 5 of /robot/tcp`."""
+    return ", ".join(f"{count} of {topic}" for topic, count in counts.items())

@@ -7,7 +7,8 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from brushloop.sessions import mcap_writer, salvage
+from brushloop.sessions import mcap_writer
+from brushloop.sessions import repair as repairs
 from brushloop.sessions.cli import app
 from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
 from brushloop.sessions.events import StepKind
@@ -261,7 +262,7 @@ def test_a_repair_that_was_cut_short_comes_to_the_same_end(make, folder, repair,
     path = file_of(folder, "H13-a05-r01 capture")
     path.write_bytes(path.read_bytes()[:-40])
     with monkeypatch.context() as killed:
-        killed.setattr(salvage, "fsync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        killed.setattr(repairs, "fsync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             repair(folder)
     repair(folder)
