@@ -14,8 +14,7 @@ import os
 import re
 import zlib
 from collections import Counter
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -56,8 +55,10 @@ class Reading:
     """State after them."""
     faults: list[str] = field(default_factory=list[str])
     """All problems, such as `line 5 does not match its CRC`; every command uses this list. Empty without damage."""
-    lost: int = 0
-    """Number of lines that are missing or cannot be read."""
+    missing: int = 0
+    """Number of lines between others that are gone or cannot be read."""
+    unread_at_end: int = 0
+    """Number of lines behind all others that cannot be read."""
     torn: bytes = b""
     """Last line, cut off by a crash: the next process sets it aside."""
     next_seq: int = 1
@@ -108,13 +109,18 @@ def read(data: bytes, session: str = "") -> Reading:
     Lines of another session than `session` are not used; without it, those of the session with most lines are.
     """
     reading = Reading()
-    with _without_collection():
+    collects = gc.isenabled()
+    gc.disable()  # none of a long journal's many small objects is garbage, and looking at them takes more than reading
+    try:
         for entry in _in_order(reading, _decoded(reading, data), session):
             try:
                 reading.state.apply(entry.event)
                 reading.events.append(entry.event)
             except DoneTwice as error:
                 reading.faults.append(f"line {entry.number} {error}")
+    finally:
+        if collects:
+            gc.enable()
     return reading
 
 
@@ -138,19 +144,6 @@ def read_header(folder: Path, state: RunState) -> Header:
     return state.opened.header
 
 
-@contextmanager
-def _without_collection() -> Generator[None]:
-    """Within the block, cyclic garbage is not collected: of the many small objects of a long journal none is garbage,
-    and looking at all of them again and again takes more time than reading them."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def _decoded(reading: Reading, data: bytes) -> list[Entry]:
     """Lines that can be used; the others are reported."""
     *pieces, tail = data.split(b"\n")
@@ -158,13 +151,13 @@ def _decoded(reading: Reading, data: bytes) -> list[Entry]:
     for number, raw in enumerate([*pieces, tail] if tail else pieces, start=1):
         try:
             entries.append(decode_line(raw, number))
-            reading.lost = 0  # those before it are missing in the numbers
+            reading.unread_at_end = 0
         except ValueError as error:
             if number > len(pieces) and _END.search(raw) is None:
                 reading.torn = tail
             else:
                 reading.faults.append(f"line {number} {error}")
-                reading.lost += 1
+                reading.unread_at_end += 1
     return entries
 
 
@@ -193,7 +186,7 @@ def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entr
         reading.faults.append(f"line {foreign[0].number} {of}{_more(foreign)}")
     last = max(by_seq, default=0)
     reading.next_seq = last + 1
-    reading.lost += last - len(by_seq)
+    reading.missing = last - len(by_seq)
     return [by_seq[seq] for seq in sorted(by_seq)]
 
 

@@ -78,7 +78,10 @@ class Evidence:
     @property
     def lost(self) -> int:
         """Number of damaged or missing lines for which nothing was rebuilt."""
-        return max(0, self.reading.lost - len(self.rebuilt))
+        last = max((_place(event) for event in self.reading.events), default=-2.0)
+        at_end = sum(_place(event) > last for event in self.rebuilt)
+        between = self.reading.missing - (len(self.rebuilt) - at_end)
+        return max(0, between) + max(0, self.reading.unread_at_end - at_end)
 
     def foreign(self, file: McapFile) -> list[str]:
         """What is wrong with a file of another session: nothing in it is evidence."""
