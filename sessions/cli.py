@@ -47,9 +47,8 @@ def list_(
 def show(
     session: Session,
     as_json: Annotated[bool, typer.Option("--json", help="Everything, as one JSON object.")] = False,
-    files: Annotated[bool, typer.Option("--files", help="List every step's file too.")] = False,
 ) -> None:
-    """Show what is in a session: steps, strokes per cell of the grid, sheets, files, devices."""
+    """Show what is in a session: steps, strokes per cell of the grid, sheets, devices."""
     import json
     from dataclasses import asdict
 
@@ -62,7 +61,7 @@ def show(
 
     from brushloop.sessions.show import renderables
 
-    say(*renderables(found, files=files))
+    say(*renderables(found))
 
 
 @app.command()

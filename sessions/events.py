@@ -9,10 +9,11 @@ import re
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from brushloop.sessions.disk import bare_name
 from brushloop.sessions.records import Check, Condition, Header
+from brushloop.sessions.records import Event as Value
 
 MAX_NUMBER = 10**9
 _SERIAL = re.compile(r"\d{1,9}(?=-)")
@@ -25,52 +26,32 @@ class StepKind(StrEnum):
     BOARD = "board"
     DIP = "dip"
     PRESS = "press"
-    DRAW = "draw"
-    """A figure: all strokes of one character, on one patch. If it is interrupted, all of it is done again."""
-    TOUCH = "touch"
-    """Bring the tip down on a given point of the sheet and measure its height."""
+    DRAW = "draw"  # a figure: all strokes of one character on one patch; if interrupted, all of it is done again
+    TOUCH = "touch"  # bring the tip down on a given point of the sheet and measure its height
     CAPTURE = "capture"
-    REVIEW = "review"
-    """Read which captures a person has marked bad; nothing moves."""
-    SELF_CHECK = "self_check"
-    """Press an uneven triangle of marks, which a mirrored, turned or stretched rig does not reproduce."""
-
-
-def _step_file(name: str) -> str:
-    if not bare_name(name).endswith(".mcap"):
-        raise ValueError("does not end in .mcap")
-    return name
-
-
-def _snapshot_file(name: str) -> str:
-    if not bare_name(name).endswith((".toml", ".json")):
-        raise ValueError("is no configuration")
-    return name
+    REVIEW = "review"  # read which captures a person has marked bad; nothing moves
+    SELF_CHECK = "self_check"  # press an uneven triangle of marks, which shows a mirrored, turned or stretched rig
 
 
 FileName = Annotated[str, AfterValidator(bare_name)]
-StepFile = Annotated[str, AfterValidator(_step_file)]
-SnapshotFile = Annotated[str, AfterValidator(_snapshot_file)]
+StepFile = Annotated[str, AfterValidator(bare_name), Field(pattern=r"\.mcap$")]
+SnapshotFile = Annotated[str, AfterValidator(bare_name), Field(pattern=r"\.(toml|json)$")]
 Whole = Annotated[int, Field(ge=0, le=MAX_NUMBER, strict=True)]
 Number = Annotated[float, Field(strict=True)]
 TimeNs = Annotated[int, Field(gt=-(2**63), lt=2**63, strict=True)]
 Counts = dict[str, Whole]
 """Messages by topic."""
-PointMm = tuple[Number, Number]
-
-
-class Value(BaseModel):
-    """Base of everything here: frozen, without unknown fields or NaN."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+Point = tuple[Number, Number]
 
 
 class Press(Value):
-    """One press, or one figure of several strokes; sheet, patch and what was measured are None until they are known."""
+    """One press, or one figure of several strokes, whose condition is that of its deepest point.
+
+    Sheet, patch and what was measured are None until they are known.
+    """
 
     stroke_id: str
     condition: Condition
-    """Of a figure, that of its deepest point."""
     take: Whole = 1
     sheet: Whole | None = None
     patch: Whole | None = None
@@ -81,25 +62,25 @@ class Press(Value):
 
 
 class TouchedPoint(Value):
-    """One point of the paper, and the touches of which it is the mean."""
+    """One point of the paper, the mean of touches whose highest and lowest are `span_mm` apart.
+
+    `sigma_mm` is the standard deviation of each touch; None where the method gives none.
+    """
 
     x_mm: Number
     y_mm: Number
     z_mm: Number
     span_mm: Number = 0.0
-    """Difference between the highest and the lowest touch."""
     touches_mm: tuple[Number, ...] = ()
     sigma_mm: tuple[Number | None, ...] = ()
-    """Standard deviation of each touch; None where the method gives none."""
 
 
 class ZeroTouchResult(Value):
-    """Where the paper lies, in the base frame."""
+    """Where the paper lies, in the base frame: its height at the sheet's origin, and its slope."""
 
     kind: Literal[StepKind.ZERO_TOUCH] = StepKind.ZERO_TOUCH
     method: str
     touch_z_mm: Number
-    """Height of the paper at the sheet's origin."""
     slope_x: Number = 0.0
     slope_y: Number = 0.0
     slope_deg: Number = 0.0
@@ -111,7 +92,7 @@ class ZeroTouchResult(Value):
 
 
 class BoardResult(Value):
-    """The board as the camera sees it."""
+    """The board as the camera sees it; `sheet_px` are the corners of the sheet in the photograph."""
 
     kind: Literal[StepKind.BOARD] = StepKind.BOARD
     still: Whole
@@ -119,15 +100,14 @@ class BoardResult(Value):
     mm_per_px: Number
     rms_px: Number
     size_px: tuple[Whole, Whole]
-    sheet_px: tuple[PointMm, ...]
-    """Corners of the sheet in the photograph."""
+    sheet_px: tuple[Point, ...]
     camera_delay_ms: Number | None = None
     camera_jitter_ms: Number | None = None
     checks: tuple[Check, ...] = ()
 
 
 class TouchResult(Value):
-    """One point of the paper, in the base frame."""
+    """One point of the paper, in the base frame; its highest and lowest touch are `span_mm` apart."""
 
     kind: Literal[StepKind.TOUCH] = StepKind.TOUCH
     method: str
@@ -135,32 +115,29 @@ class TouchResult(Value):
     y_mm: Number
     z_mm: Number
     span_mm: Number | None = None
-    """Difference between the highest and the lowest touch; None for a single one."""
 
 
 class SelfCheckResult(Value):
-    """Three marks as commanded and as found."""
+    """Three marks as commanded and as found; `residuals_mm` remain once offset and turn are taken out."""
 
     kind: Literal[StepKind.SELF_CHECK] = StepKind.SELF_CHECK
     sheet: Whole
     patches: tuple[Whole, ...]
-    commanded_mm: tuple[PointMm, ...]
-    found_mm: tuple[PointMm, ...]
-    offset_mm: PointMm
+    commanded_mm: tuple[Point, ...]
+    found_mm: tuple[Point, ...]
+    offset_mm: Point
     turn_deg: Number
-    scale: PointMm
+    scale: Point
     residuals_mm: tuple[Number, ...]
-    """Distance that remains at each mark once offset and turn are taken out."""
 
 
 class DipResult(Value):
-    """The well before the dip; None where nothing measures it."""
+    """The well before the dip, as far as it is measured, and the stroke that the operator leaves out, if any."""
 
     kind: Literal[StepKind.DIP] = StepKind.DIP
     ink_level: Number | None = None
     dosed_ml: Number | None = None
     skipped: Press | None = None
-    """The stroke that is left out, as the operator requested."""
 
 
 class PressResult(Value):
@@ -172,13 +149,12 @@ class PressResult(Value):
 
 
 class DrawResult(Value):
-    """A figure that was drawn."""
+    """A figure that was drawn, and the depth that the arm reached in each of its strokes."""
 
     kind: Literal[StepKind.DRAW] = StepKind.DRAW
     press: Press
     peak_force_n: Number | None = None
     depths_mm: tuple[Number, ...]
-    """Depth that the arm reached in each stroke."""
 
 
 class CaptureResult(Value):
@@ -227,8 +203,7 @@ StepResult = Annotated[
 
 
 class _Event(Value):
-    t_ns: TimeNs
-    """Time by the host's clock."""
+    t_ns: TimeNs  # by the host's clock
 
 
 class Open(_Event):
@@ -307,13 +282,6 @@ class Torn(_Event):
     hex: str
 
 
-class Clock(_Event):
-    """The host's clock was set back."""
-
-    event: Literal["clock"] = "clock"
-    back_s: Number
-
-
 class Ended(_Event):
     """A run ended before its time."""
 
@@ -360,31 +328,17 @@ class Doubt(_Event):
 
 
 class Remark(_Event):
-    """A remark on one capture, made afterwards: it stands in a journal of its own, and the latest on a still counts."""
+    """A remark on the capture with this still, made afterwards, in a journal of its own; the latest counts."""
 
     event: Literal["remark"] = "remark"
     still: Whole
-    """`sequence` of the capture's still, unique in the session."""
     stroke_id: str
     bad: bool = False
     note: str = ""
 
 
 Event = Annotated[
-    Open
-    | Process
-    | Begin
-    | Done
-    | Void
-    | FreshSheet
-    | Torn
-    | Clock
-    | Ended
-    | Closed
-    | Repaired
-    | Lost
-    | Doubt
-    | Remark,
+    Open | Process | Begin | Done | Void | FreshSheet | Torn | Ended | Closed | Repaired | Lost | Doubt | Remark,
     Field(discriminator="event"),
 ]
 _EVENTS: TypeAdapter[Event] = TypeAdapter(Event)

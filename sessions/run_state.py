@@ -59,8 +59,6 @@ class RunState:
     processes: int = 0
     ended: str = ""
     """How the last run ended; empty if its process was cut off before it could say so."""
-    last_ns: int = 0
-    """Time of the latest event, to notice a clock that was set back."""
 
     @property
     def voids(self) -> int:
@@ -128,9 +126,8 @@ class RunState:
             case events.Doubt(sheet=sheet, file=file):
                 self.doubtful_sheets.add(sheet)
                 self.begun = max(self.begun, _next_serial(file))
-            case events.Torn() | events.Clock() | events.Remark():
+            case events.Torn() | events.Remark():
                 pass  # for people who read the journal
-        self.last_ns = event.t_ns
 
     def _begin(self, begin: Begin) -> None:
         # Serials also number stills, so that of a lost line must not be used again.

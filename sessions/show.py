@@ -1,6 +1,4 @@
-"""Contents of one session (steps, strokes per cell of the grid, sheets, files, devices), and lists of sessions.
-
-`renderables` prints them on a terminal.
+"""Contents of one session (steps, strokes per cell of the grid, sheets, devices), and lists of sessions.
 
 Only journals and headers are read, no photographs.
 """
@@ -15,12 +13,12 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, ValidationError
 from rich.console import RenderableType
-from rich.table import Column, Table
+from rich.table import Table
 from rich.text import Text
 
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
-from brushloop.sessions.events import CaptureResult, Done, step_words
+from brushloop.sessions.events import CaptureResult, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
 from brushloop.sessions.recording import Recording, check_path, merged_file, remarks_of
 from brushloop.sessions.records import Header
@@ -29,25 +27,6 @@ from brushloop.sessions.run_state import KILLED, RunState
 Cell = tuple[float | None, float | None]
 """H in mm and alpha in degrees; None where a recording does not state them."""
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
-
-
-@dataclass(frozen=True, slots=True)
-class Segment:
-    """One finished step's file."""
-
-    file: str
-    step: str
-    size_bytes: int | None
-    """None if the file is missing."""
-    messages: dict[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """One sheet of paper, counted from 1, and the cells that were pressed on it or may have been."""
-
-    sheet: int
-    used_patches: list[int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +61,12 @@ class Details:
     marked_bad: int = 0
     planned: int | None = None
     grid: list[GridCell] = field(default_factory=list[GridCell])
-    sheets: list[Sheet] = field(default_factory=list[Sheet])
-    segments: list[Segment] = field(default_factory=list[Segment])
+    sheets: dict[int, list[int]] = field(default_factory=dict[int, list[int]])
+    """Patches that were pressed on each sheet, or may have been; sheets are counted from 1."""
     processes: int = 0
     messages: dict[str, int] = field(default_factory=dict[str, int])
     file: str = ""
     """The merged file, once there is one."""
-    size_bytes: int | None = None
     repairs: list[str] = field(default_factory=list[str])
 
 
@@ -103,7 +81,7 @@ def details(path: Path) -> Details:
     shown.strokes = len(strokes)
     shown.grid = _grid(((stroke.depth_mm, stroke.tilt_deg) for stroke in strokes), _planned(recording.header))
     shown.messages = recording.counts
-    shown.file, shown.size_bytes = recording.path.name, recording.path.stat().st_size
+    shown.file = recording.path.name
     return shown
 
 
@@ -122,11 +100,9 @@ def _of_journal(folder: Path) -> Details:
     shown.finished = dict(Counter(str(step.kind) for step in state.files.values()))
     shown.void, shown.next = _cut(state)
     shown.messages = state.counts()
-    shown.segments = [_segment(folder, step) for step in state.files.values()]
-    patches: dict[int, list[int]] = {state.sheet: []}
     for sheet, patch in sorted(state.used_patches):
-        patches.setdefault(sheet, []).append(patch)
-    shown.sheets = [Sheet(sheet + 1, used) for sheet, used in sorted(patches.items())]
+        shown.sheets.setdefault(sheet + 1, []).append(patch)
+    shown.sheets.setdefault(state.sheet + 1, [])
     bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
     kept = [capture for capture in state.results(CaptureResult) if capture.kept]
     counted = [capture.press.condition for capture in kept if capture.still not in bad]
@@ -137,7 +113,7 @@ def _of_journal(folder: Path) -> Details:
     shown.repairs = [f"{repair.event} {repair.file}: {repair.why}" for repair in state.repairs]
     final = merged_file(folder, state)
     if state.closed is not None and final.is_file():
-        shown.file, shown.size_bytes = final.name, final.stat().st_size
+        shown.file = final.name
     return shown
 
 
@@ -147,12 +123,6 @@ def _cut(state: RunState) -> tuple[list[str], str]:
     lines = [f"{step_words(begin)}, attempt {begin.attempt}: {why}" for begin, why in cut]
     open_steps = [step_words(begin) for begin, _ in cut if begin.key not in state.done]
     return lines, open_steps[-1] if open_steps and state.closed is None else ""
-
-
-def _segment(folder: Path, step: Done) -> Segment:
-    path = folder / step.file
-    size = path.stat().st_size if path.is_file() else None
-    return Segment(path.name, step_words(step), size, step.counts)
 
 
 class _GridPlan(BaseModel):
@@ -215,20 +185,18 @@ def _summary(folder: Path) -> Summary | None:
     return Summary(folder.name, state_name, recording.header.source, recording.strokes(), recording.path.name)
 
 
-def renderables(details: Details, *, files: bool = False) -> Iterator[RenderableType]:
-    """Parts to print, top to bottom; `files` adds a row for each step's file, which may be hundreds of lines."""
-    yield _facts(details, files=files)
+def renderables(details: Details) -> Iterator[RenderableType]:
+    """Parts to print, top to bottom."""
+    yield _facts(details)
     if details.grid:
         yield _grid_table(details)
-    if files and details.segments:
-        yield _segment_table(details)
     for title, lines in (("Cut attempts", details.void), ("Repaired", details.repairs)):
         if lines:
             yield Text(title, "bold")
             yield from (f"  {line}" for line in lines)
 
 
-def _facts(details: Details, *, files: bool) -> Table:
+def _facts(details: Details) -> Table:
     table = Table(show_header=False, box=None)
     table.add_row("session", Text.assemble((details.session_id, "bold"), f", {details.state}, {details.source}"))
     of = f" of {details.planned} planned" if details.planned else ""
@@ -239,52 +207,36 @@ def _facts(details: Details, *, files: bool) -> Table:
         table.add_row("steps", f"finished: {steps or 'none'}; cut: {len(details.void)}")
     if details.next:
         table.add_row("next", f"{details.next} (under way when the last process ended)")
-    for sheet in details.sheets:
-        table.add_row(f"sheet {sheet.sheet}", f"{len(sheet.used_patches)} patches used: {ranges(sheet)}")
+    for sheet, used_patches in details.sheets.items():
+        table.add_row(f"sheet {sheet}", f"{len(used_patches)} patches used: {ranges(used_patches)}")
     for name, value in details.devices.items():
         table.add_row(name.replace("_", " "), value)
     processes = f", {details.processes} processes" if details.processes else ""
     table.add_row("recorded by", f"{details.software}, schema {details.schema_version}{processes}")
     messages = ", ".join(f"{count} {topic}" for topic, count in sorted(details.messages.items()))
     table.add_row("messages", messages or "none")
-    if details.segments:
-        table.add_row("files", f"{_files(details)}{'' if files else ' (--files lists them)'}")
     if details.file:
-        table.add_row("recording", f"{details.file}, {_size(details.size_bytes)}")
+        table.add_row("recording", details.file)
     return table
 
 
 def _grid_table(details: Details) -> Table:
-    heights = sorted({cell.depth_mm for cell in details.grid}, key=lambda h: (h is None, h or 0.0))
-    tilts = sorted({cell.tilt_deg for cell in details.grid}, key=lambda a: (a is None, a or 0.0))
-    counts = {(c.depth_mm, c.tilt_deg): (c.strokes, c.planned) for c in details.grid}
-    table = Table("H \\ alpha", *(_number(tilt, "°") for tilt in tilts), title="Strokes per cell of the grid")
-    for height in heights:
-        row = [counts.get((height, tilt)) for tilt in tilts]
-        table.add_row(_number(height, " mm"), *("" if c is None else _count(*c) for c in row))
+    depths_mm = dict.fromkeys(cell.depth_mm for cell in details.grid)
+    tilts_deg = sorted({cell.tilt_deg for cell in details.grid}, key=lambda tilt: (tilt is None, tilt or 0.0))
+    strokes = {
+        (cell.depth_mm, cell.tilt_deg): str(cell.strokes) if cell.planned is None else f"{cell.strokes}/{cell.planned}"
+        for cell in details.grid
+    }
+    table = Table("H \\ alpha", *(_number(tilt, "°") for tilt in tilts_deg), title="Strokes per cell of the grid")
+    for depth in depths_mm:
+        table.add_row(_number(depth, " mm"), *(strokes.get((depth, tilt), "") for tilt in tilts_deg))
     return table
 
 
-def _segment_table(details: Details) -> Table:
-    file = Column("file", overflow="fold")
-    table = Table(file, "step", "size", "messages", title=f"{len(details.segments)} finished steps")
-    for segment in details.segments:
-        messages = ", ".join(f"{count} {topic}" for topic, count in segment.messages.items())
-        table.add_row(segment.file, segment.step, _size(segment.size_bytes), messages)
-    return table
-
-
-def _files(details: Details) -> str:
-    """Text such as `2 of finished steps, 0.01 MB, 1 missing`."""
-    sizes = [segment.size_bytes for segment in details.segments]
-    missing = f", {sizes.count(None)} missing" if None in sizes else ""
-    return f"{len(sizes)} of finished steps, {_size(sum(size or 0 for size in sizes))}{missing}"
-
-
-def ranges(sheet: Sheet) -> str:
+def ranges(patches: list[int]) -> str:
     """Patches as `0-3, 7`, with consecutive numbers joined."""
     parts: list[list[int]] = []
-    for patch in sheet.used_patches:
+    for patch in patches:
         if parts and patch == parts[-1][-1] + 1:
             parts[-1].append(patch)
         else:
@@ -294,11 +246,3 @@ def ranges(sheet: Sheet) -> str:
 
 def _number(value: float | None, unit: str) -> str:
     return "not given" if value is None else f"{value:g}{unit}"
-
-
-def _count(strokes: int, planned: int | None) -> str:
-    return str(strokes) if planned is None else f"{strokes}/{planned}"
-
-
-def _size(size_bytes: int | None) -> str:
-    return "missing" if size_bytes is None else f"{size_bytes / 1e6:.2f} MB"

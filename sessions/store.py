@@ -29,7 +29,6 @@ from brushloop.sessions.disk import (
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
 from brushloop.sessions.events import (
     Begin,
-    Clock,
     Closed,
     Done,
     Ended,
@@ -214,14 +213,9 @@ class SessionStore:
             self._lock.release()
 
     def _log(self, event: Event) -> None:
-        if event.t_ns < self.state.last_ns:
-            self._append(Clock(t_ns=event.t_ns, back_s=(self.state.last_ns - event.t_ns) / 1e9))
-        self._append(event)
-        self.state.apply(event)
-
-    def _append(self, event: Event) -> None:
         assert self._journal is not None, "the store was released"
         self._journal.append(event.t_ns, line_of(event))
+        self.state.apply(event)
 
     def _check_serials(self) -> None:
         """Raise `SessionDamaged` if the journal lost its last lines: their numbers and patches would be used again."""

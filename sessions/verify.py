@@ -255,7 +255,8 @@ def _rebuild_closed(evidence: Evidence) -> None:
     if state.closed is not None or file is None or file.damage or file.session != evidence.session:
         return
     if file.counts and file.counts >= Counter(state.counts()):
-        event = closed(evidence.final, dict(file.counts), state.last_ns)
+        last_ns = max(event.t_ns for event in evidence.events())
+        event = closed(evidence.final, dict(file.counts), last_ns)
         evidence.rebuilt.append(event)
         state.apply(event)
 

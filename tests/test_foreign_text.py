@@ -76,7 +76,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 COMMANDS = [
     "sessions list .",
     "sessions show closed",
-    "sessions show open --files",
+    "sessions show open",
     "sessions show closed --json",
     "sessions show damaged",
     "sessions verify closed",

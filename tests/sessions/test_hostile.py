@@ -32,7 +32,7 @@ WATCHED = {
 }
 COMMANDS = {
     "list": ["sessions", "list", "{root}"],
-    "show": ["sessions", "show", "{session}", "--files"],
+    "show": ["sessions", "show", "{session}"],
     "show json": ["sessions", "show", "{session}", "--json"],
     "verify": ["sessions", "verify", "{session}"],
     "repair": ["sessions", "repair", "{session}"],

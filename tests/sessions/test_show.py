@@ -9,7 +9,7 @@ from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.recording import mark_bad_or_good
-from brushloop.sessions.show import GridCell, Sheet, details, ranges
+from brushloop.sessions.show import GridCell, details, ranges
 from brushloop.sessions.store import SessionStore
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
@@ -53,9 +53,9 @@ def test_an_open_session_shows_what_is_done_cut_and_next(collected):
     ]
     assert shown.next == "press H13-a5-r02"
     assert shown.grid == [GridCell(13.0, 5.0, 1, 2), GridCell(15.0, 5.0, 1, 2)]
-    assert shown.sheets == [Sheet(1, [0, 1, 2]), Sheet(2, [0])]
+    assert shown.sheets == {1: [0, 1, 2], 2: [0]}
     assert shown.devices["robot"] == "aubo_i5"
-    assert [segment.messages for segment in shown.segments[:2]] == [{}, {"/camera/still": 1, "/stroke": 1}]
+    assert shown.messages == {"/camera/still": 2, "/stroke": 2}
 
 
 def test_what_is_marked_bad_is_distinguished_from_what_counts(collected):
@@ -78,8 +78,8 @@ def test_a_closed_session_and_its_file_agree(collected):
 
 
 def test_cells_that_follow_each_other_are_put_together():
-    assert ranges(Sheet(1, [0, 1, 2, 5, 7, 8])) == "0-2, 5, 7-8"
-    assert ranges(Sheet(1, [])) == "none"
+    assert ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
+    assert ranges([]) == "none"
 
 
 def test_the_command_prints_it_and_json_holds_all_of_it(collected):
@@ -88,19 +88,7 @@ def test_the_command_prints_it_and_json_holds_all_of_it(collected):
     for word in ("2 of 4 planned", "3 patches used: 0-2", "13 mm", "1/2", "press H13-a5-r02 (under way", "goat"):
         assert word in ran.output
     as_json = json.loads(CliRunner().invoke(app, ["show", str(collected.folder), "--json"]).output)
-    assert as_json["segments"][1]["messages"] == {"/camera/still": 1, "/stroke": 1}
-
-
-def test_files_are_counted_and_listed_only_where_that_is_asked_for(collected):
-    names = [segment.file for segment in details(collected.folder).segments]
-    (collected.folder / names[0]).unlink()
-    size_bytes = sum((collected.folder / name).stat().st_size for name in names[1:])
-    wide = CliRunner(env={"COLUMNS": "160"})
-    ran = wide.invoke(app, ["show", str(collected.folder)])
-    assert f"4 of finished steps, {size_bytes / 1e6:.2f} MB, 1 missing (--files lists them)" in ran.output
-    assert not [name for name in names if name in ran.output]
-    listed = wide.invoke(app, ["show", str(collected.folder), "--files"])
-    assert [name for name in names if name not in listed.output] == []
+    assert as_json["sheets"] == {"1": [0, 1, 2], "2": [0]}
 
 
 def test_what_is_not_there_is_refused(tmp_path):

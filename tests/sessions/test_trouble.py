@@ -123,7 +123,7 @@ def test_a_folder_that_cannot_be_made_for_want_of_room_is_a_full_disk(make, tmp_
         make.store(tmp_path / "s")
 
 
-def test_a_clock_that_is_set_back_is_noted_and_reorders_nothing(make, tmp_path):
+def test_a_clock_that_is_set_back_reorders_nothing(make, tmp_path):
     """The strokes come out in the order in which they were made, each with its own photograph."""
     ticks = itertools.chain([make.t0_ns + 10**10] * 2, itertools.count(make.t0_ns, 1_000_000))
     store = SessionStore.create(tmp_path / "s", make.header, make.snapshots, lambda: next(ticks))
@@ -138,8 +138,8 @@ def test_a_clock_that_is_set_back_is_noted_and_reorders_nothing(make, tmp_path):
     captures = list(Recording(final).captures())
     assert [capture.stroke.stroke_id for capture in captures] == ["stroke 3", "stroke 2", "stroke 1"]
     assert [capture.still_png for capture in captures] == [make.png(3), make.png(2), make.png(1)]
-    [noted] = [line for line in read_lines(store.folder / JOURNAL_NAME) if line["event"] == "clock"]
-    assert noted["back_s"] == pytest.approx(10.0, abs=0.1)
+    times_ns = [line["t_ns"] for line in read_lines(store.folder / JOURNAL_NAME)]
+    assert times_ns != sorted(times_ns)
     assert verify_session(store.folder).sound
 
 

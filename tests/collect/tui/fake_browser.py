@@ -14,7 +14,7 @@ from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCaptur
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.sessions.events import Remark
-from brushloop.sessions.show import Details, Sheet, Summary
+from brushloop.sessions.show import Details, Summary
 from tests.collect.tui.fake import blot
 
 FINDINGS = [
@@ -67,7 +67,7 @@ class FakeBrowser(SessionBrowser):
             session_id, "open", "loopback rig", {}, "brushloop 0.1", 1, {"capture": 13}, strokes=13, planned=30
         )
         details.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
-        details.next, details.sheets = "press H15-a5-r01", [Sheet(1, [1, 2])]
+        details.next, details.sheets = "press H15-a5-r01", {1: [1, 2]}
         return details
 
     def health(self) -> list[Finding]:
