@@ -9,7 +9,7 @@ import html
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast
@@ -21,7 +21,6 @@ from pydantic import ValidationError
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.sessions.cells import CsvWriter
 from brushloop.sessions.records import Source
 
 Image = NDArray[np.float32]
@@ -72,15 +71,6 @@ def _templates() -> Any:
 def framed(page: Path) -> str:
     """A written page as a notebook shows it: in a frame of its own, because it has its own styles."""
     return f'<iframe srcdoc="{html.escape(page.read_text("utf-8"))}" width="100%" height="600"></iframe>'
-
-
-def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table as CSV."""
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    writer.writerow(head)
-    writer.writerows(rows)
-    return out.getvalue()
 
 
 def write_files(folder: Path, texts: Mapping[str, str]) -> None:

@@ -1,19 +1,23 @@
-"""Files of a session: safe names, disk space, durable writes, and ways to place a file without losing another.
+"""Files: safe names, disk space, durable writes, ways to place a file without losing another, and cells of CSV files.
 
 The journal of a session received from elsewhere may contain any name, and its folder may contain links in place of
-files. Every name that is read from a session is checked by `bare_name`, and every folder by `check_folder`, first.
+files. Every name that is read from a session is checked by `bare_name`, and every folder by `check_folder`, first. A
+text that a spreadsheet would run as a formula is written into a CSV file with an apostrophe before it.
 """
 
 from __future__ import annotations
 
+import csv
 import filecmp
 import hashlib
+import io
 import itertools
+import math
 import os
 import re
 import shutil
 import stat
-from collections.abc import Generator
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -29,6 +33,9 @@ SEGMENT_NAME = re.compile(r"(\d{4,})-([a-z_]+)-([0-9A-Za-z_.-]+?)\.mcap(\.part)?
 """File of a step: serial, kind, start of the key, and `.part` while unfinished."""
 SNAPSHOT_NAMES = ("rig.toml", "protocol.toml", "rig.effective.json")
 MAX_NAME_BYTES = 255
+NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+FORMULA_START = re.compile(r"'*[=+\-@\t\r\n＝＋－＠]")
+"""Text that a spreadsheet runs, also where apostrophes precede it."""
 COMPANIONS = (
     "journal.jsonl",
     "remarks.jsonl",
@@ -220,3 +227,34 @@ def check_file(path: Path) -> bool:
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
         raise InputError(path, "is neither a file nor a folder; nothing else may be in a session's folder")
     return True
+
+
+def csv_text(head: Sequence[str], rows: Iterable[Iterable[object]], end: str = "\n") -> str:
+    """A table as CSV, whose cells may hold untrusted text."""
+    out = io.StringIO()
+    table = csv.writer(out, lineterminator=end)  # noqa: TID251 - the one place
+    table.writerow(map(as_cell, head))
+    table.writerows(map(as_cell, row) for row in rows)
+    return out.getvalue()
+
+
+def as_cell(value: object) -> object:
+    """Cell for a value: numbers, also as text (`-0.5`), are unchanged; other text is never a formula."""
+    formula = isinstance(value, str) and FORMULA_START.match(value) and not NUMBER.fullmatch(value)
+    return f"'{value}" if formula else value
+
+
+def as_text(cell: str) -> str:
+    """Undo `as_cell`."""
+    return cell[1:] if cell.startswith("'") and FORMULA_START.match(cell) else cell
+
+
+def number(text: str) -> float:
+    """The finite number in a cell, an option or an answer: `10`, `-0.5`, `1e3`. Raises ValueError.
+
+    `1_0`, which Python reads as 10, is not one: in a table it is a typing error.
+    """
+    value = float(text) if NUMBER.fullmatch(text) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:80]!r} is not a finite number")
+    return value

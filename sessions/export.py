@@ -23,7 +23,7 @@ import json
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -33,8 +33,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.cells import CsvWriter
-from brushloop.sessions.disk import check_room, staged_folder, sync, write_durably
+from brushloop.sessions.disk import check_room, csv_text, staged_folder, sync, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
 from brushloop.sessions.messages import PNG_START, decode_gray
 from brushloop.sessions.recording import Capture, Recording, unlike
@@ -288,19 +287,12 @@ def write_png(export: Export, folder: Path) -> None:
             write_durably(folder / str(row[file_column(name)]), data)
         rows.append(row)
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    _write_csv(folder / "strokes.csv", columns, ([row.get(name) for name in columns] for row in rows))
+    cells = [[row.get(name) for name in columns] for row in rows]
+    write_durably(folder / "strokes.csv", csv_text(columns, cells, "\r\n").encode())
     for series in export.series:
         samples = zip(*(table.tolist() for table in export.samples(series)), strict=True)
-        columns = (*SAMPLE_COLUMNS, *series.columns)
-        _write_csv(folder / f"{series.name}s.csv", columns, ((*when, *values) for when, values in samples))
-
-
-def _write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    with path.open("x", newline="", encoding="utf-8") as file:
-        table = CsvWriter(file, "\r\n")
-        table.writerow(columns)
-        table.writerows(rows)
-        sync(file)
+        text = csv_text((*SAMPLE_COLUMNS, *series.columns), ((*when, *values) for when, values in samples), "\r\n")
+        write_durably(folder / f"{series.name}s.csv", text.encode())
 
 
 def write_npz(export: Export, folder: Path) -> None:

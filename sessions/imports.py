@@ -13,8 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from brushloop.sessions.cells import as_text, number
-from brushloop.sessions.disk import SESSION_ID, read_bounded, staged_folder
+from brushloop.sessions.disk import SESSION_ID, as_text, number, read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.mcap_writer import Outgoing, new_mcap
 from brushloop.sessions.messages import (

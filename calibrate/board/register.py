@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.lens import Floats, rms
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.sessions.cells import number
+from brushloop.sessions.disk import number
 
 Model = Literal["rigid", "similarity", "affine"]
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")

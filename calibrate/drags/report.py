@@ -18,7 +18,6 @@ from brushloop.calibrate.drags.predicted import OURS, Predictions
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
-    csv_text,
     image_uri,
     overlay_uri,
     plot,
@@ -27,6 +26,7 @@ from brushloop.calibrate.report import (
     source_note,
     write_files,
 )
+from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Header
 
 MAX_THUMBNAILS = 60

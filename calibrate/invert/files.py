@@ -9,7 +9,7 @@ from pathlib import Path
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.invert.invert import Inversion
-from brushloop.calibrate.report import csv_text
+from brushloop.sessions.disk import csv_text
 
 PROTOCOL = "protocol-replay.toml"
 MAX_ROWS = 10_000

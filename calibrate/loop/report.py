@@ -18,7 +18,6 @@ from brushloop.calibrate.loop.scores import FILE as NUMBERS
 from brushloop.calibrate.report import (
     BLUE,
     Point,
-    csv_text,
     ink_uri,
     overlay,
     overlay_uri,
@@ -33,6 +32,7 @@ from brushloop.calibrate.report import (
     source_point,
     write_files,
 )
+from brushloop.sessions.disk import csv_text
 
 HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), (Alignment.MM, Tone.GRAY)
 PICTURE, PAGE, TABLE = "loop.png", "loop.html", "loop.csv"

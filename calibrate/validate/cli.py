@@ -128,7 +128,7 @@ def captures(
     from brushloop.calibrate.files import check_target
     from brushloop.calibrate.validate.sources import open_session
     from brushloop.calibrate.validate.tuning import align_captures, write_captures
-    from brushloop.sessions.cells import number
+    from brushloop.sessions.disk import number
 
     cells: list[tuple[float, float]] = []
     for text in leave_out or ():

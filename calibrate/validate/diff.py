@@ -18,7 +18,7 @@ import numpy as np
 from brushloop.calibrate.compare.stats import Paired, holm, paired
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.report.data import Report, load_report
-from brushloop.sessions.cells import as_text
+from brushloop.sessions.disk import as_text
 
 SIGNIFICANT = 0.05
 MEASURES = ("csim", "ssim")

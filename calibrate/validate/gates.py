@@ -11,7 +11,7 @@ from typing import ClassVar
 from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate.report.data import Report
-from brushloop.sessions.cells import number
+from brushloop.sessions.disk import number
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     ">=": operator.ge,

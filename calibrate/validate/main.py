@@ -17,7 +17,7 @@ from brushloop.calibrate.drags.report import DragValidation, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
-from brushloop.calibrate.report import csv_text, framed, write_files
+from brushloop.calibrate.report import framed, write_files
 from brushloop.calibrate.stroke.params import Params
 from brushloop.calibrate.validate.ablation import similarity_by_strokes
 from brushloop.calibrate.validate.candidates import generator_file
@@ -31,6 +31,7 @@ from brushloop.calibrate.validate.report.page import page_of, pages_beside
 from brushloop.calibrate.validate.report.summary import report_of
 from brushloop.calibrate.validate.run import Options, Outcome, validate_presses
 from brushloop.calibrate.validate.sources import URL, LoadedSession, one_source, open_session
+from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FOLDER = "validation"

@@ -11,7 +11,6 @@ from typing import Any
 from brushloop.calibrate.compare.field import Alignment, Image, Tone
 from brushloop.calibrate.compare.similarity import SSIM_SETTINGS, Polarity
 from brushloop.calibrate.report import (
-    csv_text,
     ink_uri,
     overlay,
     overlay_uri,
@@ -38,6 +37,7 @@ from brushloop.calibrate.writing.scores import (
     WrittenRecord,
     WrittenScore,
 )
+from brushloop.sessions.disk import csv_text
 
 PAGE, TABLE = "written.html", "written.csv"
 

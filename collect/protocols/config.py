@@ -21,7 +21,7 @@ from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
 from brushloop.collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
 from brushloop.collect.rig.config_file import EARLIER_NAMES, read_text, read_toml, refusal
-from brushloop.sessions.cells import as_text, number
+from brushloop.sessions.disk import as_text, number
 
 MAX_PROTOCOL_BYTES = 4 * 1024 * 1024
 MAX_EFFECTIVE_BYTES = 64 * 1024 * 1024

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.collect.operator import Choice
-from brushloop.sessions.cells import number
+from brushloop.sessions.disk import number
 
 Picture = NDArray[np.uint8]
 """(h, w) gray or (h, w, 3) BGR."""

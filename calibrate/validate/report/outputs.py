@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import io
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,13 +14,13 @@ from rich.table import Column, Table
 
 from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import replacing
+from brushloop.calibrate.files import replacing, write_whole
 from brushloop.calibrate.loop.scores import AGAIN
-from brushloop.calibrate.report import csv_text, source_label, source_note
+from brushloop.calibrate.report import source_label, source_note
 from brushloop.calibrate.validate.report import findings, tables
 from brushloop.calibrate.validate.report.data import Report, Stat
 from brushloop.calibrate.validate.run import REPEATED, Outcome
-from brushloop.sessions.cells import CsvWriter
+from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import narrow
 
 COLUMNS = (
@@ -67,26 +66,13 @@ def score_rows(outcome: Outcome) -> Iterator[Cells]:
 
 def write_csv(outcome: Outcome, path: Path) -> str:
     """Write every score and return the file's SHA-256. Raises OSError and leaves no partial file."""
-    digest = hashlib.sha256()
-    with replacing(path) as part, part.open("wb") as file:
-        for text in _lines(outcome):
-            data = text.encode()
-            digest.update(data)
-            file.write(data)
-    return digest.hexdigest()
-
-
-def _lines(outcome: Outcome) -> Iterator[str]:
-    out = io.StringIO()
-    writer = CsvWriter(out)
-    writer.writerow(COLUMNS)
-    for row in score_rows(outcome):
-        writer.writerow([f"{v:.8f}" if name in ("csim", "ssim") else v for name, v in zip(COLUMNS, row, strict=True)])
-        if out.tell() > 2**16:
-            yield out.getvalue()
-            out.seek(0)
-            out.truncate()
-    yield out.getvalue()
+    rows = (
+        [f"{v:.8f}" if name in ("csim", "ssim") else v for name, v in zip(COLUMNS, row, strict=True)]
+        for row in score_rows(outcome)
+    )
+    text = csv_text(COLUMNS, rows)
+    write_whole(path, text)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def write_parquet(outcome: Outcome, path: Path) -> None:
