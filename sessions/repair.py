@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from google.protobuf.message import DecodeError
 from mcap.records import Message
 from pydantic import ValidationError
 
@@ -39,7 +38,6 @@ from brushloop.sessions.events import (
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
 from brushloop.sessions.mcap_writer import new_mcap
-from brushloop.sessions.messages import decode_still
 from brushloop.sessions.recording import check_path, find_recording, parse_header
 from brushloop.sessions.records import (
     BEGIN_NOTE,
@@ -141,12 +139,10 @@ class _FolderRepair:
     def run(self) -> Report:
         """Repair journal, configuration, steps and merged file."""
         report, state = self._report, self._state
-        if self._evidence.reading.faults:
+        if self._evidence.reading.faults or self._evidence.rebuilt:
             self._rewrite_journal()
         self._journal = Journal(self._folder / JOURNAL_NAME, self._now_ns(), self._header.session_id)
         try:
-            if not self._evidence.reading.faults:
-                self._add_rebuilt()
             self._doubt()
             self._snapshots()
             self._repair_steps()
@@ -167,24 +163,16 @@ class _FolderRepair:
         return report
 
     def _rewrite_journal(self) -> None:
-        evidence, session = self._evidence, self._header.session_id
+        evidence, session, report = self._evidence, self._header.session_id, self._report
         lines = (encode_line(event.t_ns, line_of(event), n, session) for n, event in enumerate(evidence.events(), 1))
         kept = _write_anew(self._folder / JOURNAL_NAME, b"".join(lines))
-        self._report.did.append(
-            f"wrote {JOURNAL_NAME} again: {len(evidence.reading.events)} lines as they were, "
-            f"{len(evidence.rebuilt)} rebuilt from the files{kept}"
-        )
-        self._report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
+        as_they_were, rebuilt = len(evidence.reading.events), len(evidence.rebuilt)
+        what = f"{as_they_were} lines as they were, {rebuilt} rebuilt from the files"
+        report.did.append(f"wrote {JOURNAL_NAME} again: {what}{kept}")
+        report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
         if evidence.lost:
             count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
-            self._report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
-
-    def _add_rebuilt(self) -> None:
-        for event in self._evidence.rebuilt:
-            self._journal.append(event.t_ns, line_of(event))
-            what = step_words(event) if isinstance(event, Begin | Done) else "the session"
-            shown = getattr(event, "file", "the header")
-            self._report.did.append(f"journalled {event.event!r} of {what}, which {shown} shows")
+            report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
 
     def _doubt(self) -> None:
         sheet = self._state.sheet
@@ -231,34 +219,20 @@ class _FolderRepair:
                     yield from _in_steps(file, steps)
 
     def _write_again(self, step: Done, records: list[Record]) -> None:
-        path, why = self._folder / step.file, self._verdict.damaged[step.file]
-        # Without its `begin` in the journal, one is made from its `done`.
+        path, why, sheet = self._folder / step.file, self._verdict.damaged[step.file], self._state.sheet
+        # Where neither the journal nor a file has its `begin`, one is made from its `done`.
         begin = self._begins.get(step.file) or Begin(
-            t_ns=step.t_ns,
-            key=step.key,
-            kind=step.kind,
-            attempt=step.attempt,
-            sheet=self._state.sheet,
-            file=step.file,
+            t_ns=step.t_ns, key=step.key, kind=step.kind, attempt=step.attempt, sheet=sheet, file=step.file
         )
-        begun = {"t_ns": begin.t_ns, **line_of(begin)}
-        done = {name: value for name, value in line_of(step).items() if name in ("key", "attempt", "result")}
         notes: dict[str, Line] = {
-            BEGIN_NOTE: begun,
-            DONE_NOTE: {"t_ns": step.t_ns, **done, "counts": dict(_count(records))},
+            BEGIN_NOTE: {"t_ns": begin.t_ns, **line_of(begin)},
+            DONE_NOTE: {"t_ns": step.t_ns, **line_of(step), "counts": dict(_count(records))},
         }
         kept, counts = _replace_damaged(path, self._header, notes, {}, records)
         missing = dict(Counter(step.counts) - Counter(counts))
+        sha256, now_ns = file_sha256(path), self._now_ns()
         self._log(
-            Repaired(
-                t_ns=self._now_ns(),
-                key=step.key,
-                file=step.file,
-                sha256=file_sha256(path),
-                counts=counts,
-                missing=missing,
-                why=why,
-            )
+            Repaired(t_ns=now_ns, key=step.key, file=step.file, sha256=sha256, counts=counts, missing=missing, why=why)
         )
         how = f"without {count_words(missing)}" if missing else "whole"
         self._report.did.append(f"wrote {step.file} ({step_words(step)}) again {how}: {why}{kept}")
@@ -299,8 +273,7 @@ class _FolderRepair:
         """
         state, file = self._state, self._evidence.files.get(self._final.name)
         counts, lost, how = state.counts(), self._lost_steps, "from the steps' files"
-        more = file is not None and len(_Strokes(file).kept) > counts.get(Topic.STROKE, 0)
-        if file is not None and more and not self._evidence.foreign(file):
+        if file is not None and self._holds_more(file):
             repairs = [line_of(repair) for repair in state.repairs]
             notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
             names = {} if state.opened is None else state.opened.snapshots
@@ -315,45 +288,33 @@ class _FolderRepair:
         self._report.did.append(f"wrote {self._final.name} again {how}: {'; '.join(self._final_problems)}{kept}")
         return lost
 
+    def _holds_more(self, final: McapFile) -> bool:
+        """Whether more whole strokes can be read of the damaged merged file than the files of steps hold."""
+        in_steps = self._state.counts().get(Topic.STROKE, 0)
+        if self._evidence.foreign(final) or final.counts[Topic.STROKE] <= in_steps:
+            return False
+        strokes: dict[str, bool] = {}
+        for _record in _whole(final, strokes):
+            pass
+        return sum(strokes.values()) > in_steps
+
     def _log(self, event: Event) -> None:
         self._journal.append(event.t_ns, line_of(event))
         self._state.apply(event)
 
 
-class _Strokes:
-    """Strokes of a damaged file: those recovered with their photographs, each once, and those that are lost."""
-
-    def __init__(self, file: McapFile) -> None:
-        self._file = file
-        self.kept: dict[str, int] = {}
-        """Number of the still that shows it, by name of the stroke."""
-        stills, named = set[int](), dict[str, None]()
-        for _schema, channel, message in file.messages((Topic.STILL, Topic.STROKE)):
-            if channel.topic == Topic.STILL and _shows(message):
-                stills.add(message.sequence)
-            elif channel.topic == Topic.STROKE and (stroke := _parsed(Stroke, message)) is not None:
-                named[stroke.stroke_id] = None
-                if stroke.still in stills:
-                    self.kept.setdefault(stroke.stroke_id, stroke.still)
-        self.photograph_lost = [name for name in named if name not in self.kept]
-
-    def messages(self) -> Iterator[Record]:
-        """Everything readable, except strokes without a photograph and strokes that were read before."""
-        waiting = dict(self.kept)
-        for schema, channel, message in self._file.messages():
-            stroke = _parsed(Stroke, message) if channel.topic == Topic.STROKE else None
-            if stroke is not None:
-                if waiting.get(stroke.stroke_id) != stroke.still:
-                    continue
-                del waiting[stroke.stroke_id]
-            yield schema, channel, message
-
-
-def _shows(message: Message) -> bool:
-    try:
-        return bool(decode_still(message.data))
-    except DecodeError:
-        return False
+def _whole(file: McapFile, strokes: dict[str, bool]) -> Iterator[Record]:
+    """Everything readable, but no stroke without its photograph or for the second time; `strokes` says which came."""
+    stills: set[int] = set()
+    for schema, channel, message in file.messages():
+        if channel.topic == Topic.STILL:
+            stills.add(message.sequence)
+        elif channel.topic == Topic.STROKE and (stroke := _parsed(Stroke, message)) is not None:
+            whole = stroke.still in stills and not strokes.get(stroke.stroke_id)
+            strokes[stroke.stroke_id] = whole or strokes.get(stroke.stroke_id, False)
+            if not whole:
+                continue
+        yield schema, channel, message
 
 
 def _parsed(kind: type[_E], message: Message) -> _E | None:
@@ -371,9 +332,9 @@ def _rewrite(
 
     Returns where the damaged file is kept, the messages by topic, and descriptions of what was lost.
     """
-    strokes = _Strokes(file)
-    kept, counts = _replace_damaged(file.path, header, notes, attached, strokes.messages())
-    lost = [f"stroke {name}: its photograph is lost" for name in strokes.photograph_lost]
+    strokes: dict[str, bool] = {}
+    kept, counts = _replace_damaged(file.path, header, notes, attached, _whole(file, strokes))
+    lost = [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
     gone = before - Counter(counts)
     unknown = gone.pop(Topic.STROKE, 0) - len(lost)
     if unknown > 0:

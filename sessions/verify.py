@@ -166,46 +166,40 @@ def _session(folder: str, named: str, files: Counter[str]) -> str:
 
 def _rebuild_steps(evidence: Evidence) -> None:
     """Rebuild `begin` and `done` from the notes in the files of steps, whatever these are called now."""
-    events, state = evidence.reading.events, evidence.reading.state
+    events = evidence.reading.events
     begun = {event.file: event for event in events if isinstance(event, Begin)}
     doubted = {event.file for event in events if isinstance(event, Doubt)}
     over: set[str | tuple[str, int]] = {event.file for event in events if isinstance(event, Done | Lost)}
     over |= {(event.key, event.attempt) for event in events if isinstance(event, Void)}
-    attempts = dict(state.attempts)
-    unlisted: list[str] = []
+    attempts = dict(evidence.reading.state.attempts)
+    steps: list[tuple[str, McapFile, Begin]] = []
     for name, file in evidence.files.items():
-        step_name = SEGMENT_NAME.fullmatch(name)
+        step_name, own = SEGMENT_NAME.fullmatch(name), name.removesuffix(".part")
         if step_name is None:
             continue
-        own = name.removesuffix(".part")
         if foreign := evidence.foreign(file):
             evidence.strays |= {} if own in begun else {name: foreign[0]}
-            continue
-        begin = _begin(file) or begun.get(own)
-        if begin is None:
-            if step_name[2] in MARKING and name not in doubted:
-                evidence.doubtful.append(name)
-            continue
-        if begin.file not in begun:
-            begun[begin.file] = begin
-            attempts[begin.key] = max(attempts.get(begin.key, 0), begin.attempt)
-            evidence.rebuilt.append(begin)
-        if own != begin.file:
-            unlisted.append(name)
-        if name != own or over & {begin.file, (begin.key, begin.attempt)} or attempts[begin.key] > begin.attempt:
-            continue
-        known = state.done.get(begin.key)
-        if known is not None and Topic.STROKE in known.counts:
+        elif (begin := _begin(file) or begun.get(own)) is not None:
+            steps.append((name, file, begin))
+            if begin.file not in begun:
+                begun[begin.file] = begin
+                attempts[begin.key] = max(attempts.get(begin.key, 0), begin.attempt)
+                evidence.rebuilt.append(begin)
+        elif step_name[2] in MARKING and name not in doubted:
+            evidence.doubtful.append(name)
+    for name, file, begin in steps:
+        if name.removesuffix(".part") not in begun:
+            evidence.strays[name] = "holds a step that the journal lists under another file"
+        unfinished = name.endswith(".part") or attempts[begin.key] > begin.attempt
+        if unfinished or over & {begin.file, (begin.key, begin.attempt)}:
             continue
         if (done := _done(file, begin)) is not None:
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
-            whole = own == begin.file and not file.damage and dict(file.counts) == done.counts
+            whole = name == begin.file and not file.damage and dict(file.counts) == done.counts
             over.add(done.file)
             evidence.rebuilt.append(done.model_copy(update={"sha256": file_sha256(file.path) if whole else ""}))
-        elif own == begin.file:
+        elif name == begin.file:
             evidence.strays[name] = "is finished, but the result of its step cannot be read"
-    words = "holds a step that the journal lists under another file"
-    evidence.strays |= {name: words for name in unlisted if name.removesuffix(".part") not in begun}
 
 
 def _begin(file: McapFile) -> Begin | None:

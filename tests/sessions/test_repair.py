@@ -157,9 +157,8 @@ def test_a_step_finished_but_not_journalled_is_given_back(make, folder, repair, 
     journal = folder / JOURNAL_NAME
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(b"".join(lines[:-1]))
-    assert repair(folder).did == [
-        "journalled 'done' of capture H13-a05-r01, which 0005-capture-H13-a05-.mcap shows",
-    ]
+    assert repair(folder).lossless
+    assert repair(folder).did == []
     assert make.stroke_names(go_on(folder).close()) == ["H13-a05-r00", "H13-a05-r01"]
 
 
