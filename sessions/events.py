@@ -366,7 +366,7 @@ def step_words(step: Begin | Done) -> str:
     return f"{step.kind} {stroke_id}".strip().replace("_", " ")
 
 
-def serial_of(file: str) -> int | None:
-    """Serial number at the start of the name of a step's file; None for a name without one."""
+def serial_of(file: str) -> int:
+    """Serial number at the start of the name of a step's file; -1 for a name without one."""
     serial = _SERIAL.match(file)
-    return int(serial[0]) if serial else None
+    return int(serial[0]) if serial else -1

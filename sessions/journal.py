@@ -1,5 +1,7 @@
 """The lines of a journal: written one at a time, each on disk before anything depends on it, and read back as events.
 
+`RunState` is the state of a run after them, and its only memory: resume, screens, review, lists and repair read it.
+
 A line is a JSON object with its number `seq` (1, 2, 3 ...), the id of its `session`, its time, its event, and a CRC-32
 of all that as the last field. Reading reports lines that do not match their CRC, are missing, stand twice, are out of
 place, are of another session or make no sense. A last line that is cut off is what a crash leaves, and is harmless. A
@@ -17,13 +19,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
+from brushloop.sessions import events
 from brushloop.sessions.disk import check_file, fsync_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error
-from brushloop.sessions.events import Event, parse_event
-from brushloop.sessions.records import Header
-from brushloop.sessions.run_state import DoneTwice, RunState
+from brushloop.sessions.events import Begin, Done, Event, Lost, Press, Repaired, parse_event, serial_of
+from brushloop.sessions.records import Header, Topic
 
 JOURNAL_NAME = "journal.jsonl"
 MAX_JOURNAL_BYTES = 256 * 1024 * 1024
@@ -31,6 +33,132 @@ MAX_JOURNAL_BYTES = 256 * 1024 * 1024
 Line = dict[str, Any]
 _END = re.compile(rb',"crc":"([0-9a-f]{8})"\}')
 _TAIL = re.compile(_END.pattern + rb"\Z")
+KILLED = "the process ended during it"
+_R = TypeVar("_R")
+
+
+class DoneTwice(ValueError):
+    """A step is journalled as done twice: its strokes would appear twice."""
+
+
+@dataclass(slots=True)
+class RunState:
+    """What the journal of a session says; `apply` is the only way in which it changes."""
+
+    opened: events.Open | None = None
+    closed: events.Closed | None = None
+    done: dict[str, Done] = field(default_factory=dict[str, Done])
+    """Finished steps by key; of a set-up step, the newest."""
+    files: dict[str, Done] = field(default_factory=dict[str, Done])
+    """Finished steps by file, in order of time; the merged file is made of these files."""
+    attempts: dict[str, int] = field(default_factory=dict[str, int])
+    """Attempts that were begun, by key."""
+    running: dict[tuple[str, int], Begin] = field(default_factory=dict[tuple[str, int], Begin])
+    """Attempts of the last process that neither finished nor were cut, by key and number."""
+    cut: list[tuple[Begin, str]] = field(default_factory=list[tuple[Begin, str]])
+    """Attempts that were cut, and why."""
+    used_patches: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
+    """(sheet, patch) of every press that was begun, finished or not: never pressed again."""
+    doubtful_sheets: set[int] = field(default_factory=set[int])
+    """Sheets that may hold an unrecorded press: nothing more is pressed on them."""
+    repairs: list[Repaired | Lost] = field(default_factory=list[Repaired | Lost])
+    """What was repaired or lost; the merged file records it."""
+    sheet: int = 0
+    begun: int = 0
+    """Attempts begun; the next one's serial number."""
+    processes: int = 0
+    ended: str = ""
+    """How the last run ended; empty if its process was cut off before it could say so."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the session can be resumed. A crash before the first event left nothing to resume."""
+        return self.opened is not None and self.closed is None
+
+    def counts(self) -> dict[str, int]:
+        """Messages by topic that the merged file must hold."""
+        counts: Counter[str] = Counter()
+        for step in self.files.values():
+            counts.update(step.counts)
+        return dict(counts)
+
+    def results(self, kind: type[_R]) -> list[_R]:
+        """Results of one kind, in order of time."""
+        return [step.result for step in self.files.values() if isinstance(step.result, kind)]
+
+    def not_photographed(self) -> list[Press]:
+        """Presses without a capture of the same take."""
+        waiting: dict[tuple[str, int], Press] = {}
+        for step in self.files.values():
+            match step.result:
+                case events.PressResult(press=press) | events.DrawResult(press=press):
+                    waiting[press.stroke_id, press.take] = press
+                case events.CaptureResult(press=press):
+                    waiting.pop((press.stroke_id, press.take), None)
+                case _:
+                    pass
+        return list(waiting.values())
+
+    def apply(self, event: Event) -> None:
+        """Apply the next event. Raises `DoneTwice` for a step that was done already; the state is then unchanged."""
+        match event:
+            case events.Open():
+                self.opened = event
+            case events.Process():
+                self.processes += 1
+                self.ended = ""
+                self.cut += [(begin, KILLED) for begin in self.running.values()]
+                self.running.clear()
+            case events.Begin():
+                self._begin(event)
+            case events.Done():
+                self._done(event)
+            case events.Void(key=key, attempt=attempt, why=why):
+                if (begin := self.running.pop((key, attempt), None)) is not None:
+                    self.cut.append((begin, why))
+            case events.FreshSheet(sheet=sheet):
+                self.sheet = sheet
+            case events.Ended(why=why):
+                self.ended = why
+            case events.Closed():
+                self.closed = event
+            case events.Repaired() | events.Lost():
+                self._repair(event)
+            case events.Doubt(sheet=sheet, file=file):
+                self.doubtful_sheets.add(sheet)
+                self.begun = max(self.begun, serial_of(file) + 1)
+            case events.Torn() | events.Remark():
+                pass  # for people who read the journal
+
+    def _begin(self, begin: Begin) -> None:
+        # Serials also number stills, so that of a lost line must not be used again.
+        self.begun = max(self.begun, serial_of(begin.file)) + 1
+        self.attempts[begin.key] = max(self.attempts.get(begin.key, 0), begin.attempt)
+        self.running[begin.key, begin.attempt] = begin
+        self.sheet = max(self.sheet, begin.sheet)
+        if begin.patch is not None:
+            self.used_patches |= {(begin.sheet, patch) for patch in (begin.patch, *begin.more_patches)}
+
+    def _done(self, done: Done) -> None:
+        earlier, known = self.files.get(done.file), self.done.get(done.key)
+        # Only a set-up step may be done again, as a later attempt.
+        if known is not None and (known.attempt >= done.attempt or Topic.STROKE in {**known.counts, **done.counts}):
+            earlier = known
+        if earlier is not None:
+            raise DoneTwice(f"says that {done.file} is done: its step was done already, in {earlier.file}")
+        self.running.pop((done.key, done.attempt), None)
+        self.done[done.key] = self.files[done.file] = done
+
+    def _repair(self, repair: Repaired | Lost) -> None:
+        self.repairs.append(repair)
+        if (step := self.files.get(repair.file)) is None:
+            return
+        for steps, name in ((self.files, step.file), (self.done, step.key)):
+            if steps.get(name) is step:
+                if isinstance(repair, Lost):
+                    del steps[name]
+                else:
+                    steps[name] = step.model_copy(update={"sha256": repair.sha256, "counts": repair.counts})
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,10 @@ from pydantic import ValidationError
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.events import CaptureResult, Remark, line_of
-from brushloop.sessions.journal import JOURNAL_NAME, Journal, replay, undamaged
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, replay, undamaged
 from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.records import Event, Header, StepEvent, Stroke, Topic
-from brushloop.sessions.run_state import RunState
 
 if TYPE_CHECKING:
     import numpy as np

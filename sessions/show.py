@@ -19,10 +19,9 @@ from rich.text import Text
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, step_words
-from brushloop.sessions.journal import JOURNAL_NAME, read_header, replay
+from brushloop.sessions.journal import JOURNAL_NAME, KILLED, RunState, read_header, replay
 from brushloop.sessions.recording import Recording, check_path, merged_file, remarks_of
-from brushloop.sessions.records import Header
-from brushloop.sessions.run_state import KILLED, RunState
+from brushloop.sessions.records import Header, Topic
 
 Cell = tuple[float | None, float | None]
 """H in mm and alpha in degrees; None where a recording does not state them."""
@@ -177,7 +176,7 @@ def _summary(folder: Path) -> Summary | None:
     check_folder(folder)
     state = replay(folder / JOURNAL_NAME) if (folder / JOURNAL_NAME).is_file() else None
     if state is not None and state.is_open:
-        return Summary(folder.name, "open", "", state.strokes(), "")
+        return Summary(folder.name, "open", "", state.counts().get(Topic.STROKE, 0), "")
     if not merged_file(folder, state).is_file():
         return None
     recording = Recording(folder)

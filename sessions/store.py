@@ -42,12 +42,11 @@ from brushloop.sessions.events import (
     Void,
     line_of,
 )
-from brushloop.sessions.journal import JOURNAL_NAME, Journal, read_header, replay
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, read_header, replay
 from brushloop.sessions.mcap_file import scan_sound
 from brushloop.sessions.mcap_writer import SegmentWriter, new_mcap
 from brushloop.sessions.recording import merged_file
 from brushloop.sessions.records import REPAIRS_NOTE, Header
-from brushloop.sessions.run_state import RunState
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
@@ -155,20 +154,11 @@ class SessionStore:
 
     def done(self, attempt: Attempt, result: StepResult) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""
-        begin, t_ns = attempt.begin, self._now_ns()
-        identity = {"t_ns": t_ns, "key": begin.key, "attempt": begin.attempt}
-        noted = {**identity, "result": result.model_dump(mode="json", exclude_none=True)}
-        sha256 = attempt.writer.finish(noted)
-        done = Done(
-            t_ns=t_ns,
-            key=begin.key,
-            attempt=begin.attempt,
-            file=begin.file,
-            sha256=sha256,
-            counts=dict(attempt.writer.counts),
-            result=result,
-        )
-        self._log(done)
+        key, number, file, t_ns = attempt.begin.key, attempt.begin.attempt, attempt.begin.file, self._now_ns()
+        noted = {"t_ns": t_ns, "key": key, "attempt": number}
+        sha256 = attempt.writer.finish({**noted, "result": result.model_dump(mode="json", exclude_none=True)})
+        counts = dict(attempt.writer.counts)
+        self._log(Done(t_ns=t_ns, key=key, attempt=number, file=file, sha256=sha256, counts=counts, result=result))
 
     def void(self, attempt: Attempt, why: str) -> None:
         """Journal that an attempt was cut; its part file is kept as evidence, and its patch stays used."""

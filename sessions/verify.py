@@ -41,12 +41,11 @@ from brushloop.sessions.events import (
     serial_of,
     step_words,
 )
-from brushloop.sessions.journal import JOURNAL_NAME, Line, Reading, read, read_journal
+from brushloop.sessions.journal import JOURNAL_NAME, DoneTwice, Line, Reading, RunState, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording, check_path, find_recording, merged_file, parse_header, remarks_of
 from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Header, Stroke, Topic
-from brushloop.sessions.run_state import DoneTwice, RunState
 from brushloop.sessions.store import closed
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -104,8 +103,7 @@ def _place(event: Event) -> float:
         case Open():
             return -2
         case Begin() | Done():
-            serial = serial_of(event.file)
-            return float("inf") if serial is None else serial + isinstance(event, Done) / 2
+            return serial_of(event.file) + isinstance(event, Done) / 2
         case Closed():
             return float("inf")
         case _:

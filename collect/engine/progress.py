@@ -20,7 +20,7 @@ from brushloop.collect.protocols.steps import MARKING, Step
 from brushloop.collect.rig.paper import Layout, Sheet
 from brushloop.drivers.clock import Clock
 from brushloop.sessions.events import ReviewResult, StepKind, StepResult
-from brushloop.sessions.run_state import RunState
+from brushloop.sessions.journal import RunState
 from brushloop.sessions.store import SessionStore
 
 LOG_LINES = 200
@@ -207,7 +207,7 @@ class Progress:
                 strokes_done=tally.done.total(),
                 strokes_planned=len(self._plan),
                 grid=grid,
-                voids=self._state.voids - len(self._state.running),
+                voids=len(self._state.cut),
                 given_up=tally.left_out.total(),
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
                 eta_s=self._eta_s(),

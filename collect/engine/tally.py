@@ -17,7 +17,7 @@ from brushloop.sessions.events import (
     ReviewResult,
     SelfCheckResult,
 )
-from brushloop.sessions.run_state import RunState
+from brushloop.sessions.journal import RunState
 
 
 @dataclass(slots=True)

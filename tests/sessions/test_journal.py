@@ -177,7 +177,7 @@ def test_replay_folds_begin_done_void_and_sheet(path):
     assert state.done["k1"].result.press.condition == Condition(depth_mm=13.0, tilt_deg=5.0)
     assert list(state.files) == ["0000-k1.mcap"]
     assert state.attempts == {"k1": 1, "k2": 2}
-    assert (state.begun, state.voids, state.sheet) == (3, 2, 1)
+    assert (state.begun, len(state.cut), state.sheet) == (3, 1, 1)
 
 
 def test_a_press_that_was_begun_and_never_done_has_used_its_cell(path):

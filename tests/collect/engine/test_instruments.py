@@ -15,9 +15,8 @@ from brushloop.drivers.errors import ConnectionLost, Stuck
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.sim.faults.kinds import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
-from brushloop.sessions.journal import replay
+from brushloop.sessions.journal import RunState, replay
 from brushloop.sessions.records import Topic
-from brushloop.sessions.run_state import RunState
 from tests.collect.until import until, wait_for_end
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from brushloop.drivers.clock import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
+from brushloop.sessions.journal import RunState
 from brushloop.sessions.records import Header, Source
-from brushloop.sessions.run_state import RunState
 from brushloop.sessions.store import SessionStore
 from tests.collect.tui.fake import FakeEngine, picture
 
