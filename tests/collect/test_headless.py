@@ -60,7 +60,7 @@ def test_a_run_whose_terminal_is_closed_finishes_its_step_and_parks(lab: Lab) ->
     assert stderr.splitlines()[-1] == "brushloop: parked on request; the same command resumes from here"
     assert lab.rig.faults.truth.phase() is Phase.PARKED
     [folder] = lab.sessions.iterdir()
-    assert replay(folder / JOURNAL_NAME).voids == 0
+    assert not replay(folder / JOURNAL_NAME).cut
 
 
 def test_a_signal_says_that_the_brush_may_be_down_where_it_may(lab: Lab) -> None:

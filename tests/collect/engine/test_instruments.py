@@ -81,7 +81,7 @@ def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_cell
     # It was stopped on its way down, and not moved away from what it met: a person must look first.
     assert 120.0 - 11.0 <= lab.rig.world.tool().z_mm < 116.0
     state = replay(only_session(lab) / "journal.jsonl")
-    assert (state.voids, len(state.used_patches)) == (1, 1)
+    assert (len(state.cut), len(state.used_patches)) == (1, 1)
 
 
 def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_done_again_elsewhere(
@@ -128,7 +128,7 @@ def test_a_sensor_that_is_stuck_in_mid_press_stops_the_arm_and_ends_the_run_with
     with pytest.raises(Stuck, match="the sensor is stuck"):
         run(lab.engine())
     state = replay(only_session(lab) / "journal.jsonl")
-    assert (state.voids, len(state.used_patches)) == (1, 1)
+    assert (len(state.cut), len(state.used_patches)) == (1, 1)
     assert at_rest(lab)
     assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order: the brush was lifted"
 
@@ -183,5 +183,5 @@ def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkey
         run(lab.engine())
     assert caught.value.lag_ms == 412.0
     state = replay(only_session(lab) / "journal.jsonl")
-    assert state.voids == 1
+    assert len(state.cut) == 1
     assert not state.results(PressResult)

@@ -88,7 +88,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert max(abs(scale - 1.0) for scale in check["result"]["scale"]) < 0.005
     state = replay(folder / "journal.jsonl")
     assert {(0, 0), (0, 5), (0, 36), (0, 1)} <= state.used_patches
-    assert len(state.used_patches) == 4 + 3 * state.voids
+    assert len(state.used_patches) == 4 + 3 * len(state.cut)
 
 
 def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
