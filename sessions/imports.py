@@ -120,10 +120,9 @@ def _photograph(path: Path, t_ns: int) -> CompressedImage:
     """A photograph that can be decoded, as it is recorded. Raises `InputError`."""
     data = read_bounded(path, MAX_IMAGE_BYTES)
     try:
-        decode_gray(data, str(path))
+        data = upright(data, decode_gray(data, str(path)))
     except SessionDamaged as error:
         raise InputError(path, error.what) from None
-    data = upright(data)
     return image_message(t_ns, data, "png" if data.startswith(PNG_START) else "jpeg")
 
 

@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -15,6 +16,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError
 
 from brushloop.sessions.errors import SessionDamaged
 
@@ -119,9 +121,12 @@ def log_message(t_ns: int, text: str, *, warning: bool = False) -> Log:
     return message
 
 
-def decode_still(data: bytes) -> bytes:
-    """Encoded image of a message on an image topic. Raises `google.protobuf.message.DecodeError`."""
-    return CompressedImage.FromString(data).data
+def decode_still(data: bytes, where: Path | str) -> bytes:
+    """Encoded image of a message on an image topic. Raises `SessionDamaged`."""
+    try:
+        return CompressedImage.FromString(data).data
+    except DecodeError:
+        raise SessionDamaged(where, "a photograph does not fit its schema") from None
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
@@ -161,11 +166,11 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
     return image
 
 
-def upright(data: bytes) -> bytes:
-    """The photograph itself, or a gray PNG of it where a JPEG says that it is to be turned.
+def upright(data: bytes, image: NDArray[np.uint8]) -> bytes:
+    """The photograph itself, or `image`, what `decode_gray` made of it, as PNG, where a JPEG says that it is turned.
 
-    `data` must have been decoded by `decode_gray` before. Readers differ in whether they turn a picture: without the
-    mark every reader sees the same pixels, and a point measured in a viewer lies where it was measured.
+    Readers differ in whether they turn a picture: without the mark every reader sees the same pixels, and a point
+    measured in a viewer lies where it was measured.
     """
     import cv2
     import numpy as np
@@ -173,8 +178,7 @@ def upright(data: bytes) -> bytes:
     if EXIF not in data or data.startswith(PNG_START):
         return data
     stored = _decoded(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, "")
-    turned = decode_gray(data, "")
-    return data if stored is not None and np.array_equal(stored, turned) else encode_png(turned)
+    return data if stored is not None and np.array_equal(stored, image) else encode_png(image)
 
 
 def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | None:

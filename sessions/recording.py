@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
@@ -129,7 +128,7 @@ class Recording:
                 event = _event(self.path, StepEvent, message.data)
                 current = event.kind if event.phase == "begin" else ""
             elif current == kind:
-                yield _still(self.path, message.data)
+                yield decode_still(message.data, self.path)
 
     def messages(self, *topics: Topic) -> Iterator[Record]:
         """Messages on these topics, in the order in which they were written. Raises `SessionDamaged`."""
@@ -140,7 +139,7 @@ class Recording:
         stills: OrderedDict[int, bytes] = OrderedDict()
         for _schema, channel, message in messages:
             if channel.topic == Topic.STILL:
-                stills[message.sequence] = _still(self.path, message.data)
+                stills[message.sequence] = decode_still(message.data, self.path)
                 while len(stills) > STILLS_KEPT:
                     stills.popitem(last=False)
                 continue
@@ -215,27 +214,14 @@ def parse_header(file: McapFile) -> Header:
     try:
         return Header.model_validate(file.header, strict=False)
     except ValidationError as error:
-        raise SessionDamaged(file.path, _first_error(Header, error)) from None
-
-
-def _still(path: Path, data: bytes) -> bytes:
-    try:
-        return decode_still(data)
-    except DecodeError as error:
-        raise SessionDamaged(path, f"a still cannot be read: {in_one_line(error)}") from None
+        raise SessionDamaged(file.path, in_one_line(error)) from None
 
 
 def _event(path: Path, kind: type[_E], data: bytes) -> _E:
     try:
         return kind.model_validate_json(data)
     except ValidationError as error:
-        raise SessionDamaged(path, _first_error(kind, error)) from None
-
-
-def _first_error(kind: type[Event], error: ValidationError) -> str:
-    first = error.errors()[0]
-    field = ".".join(str(part) for part in first["loc"])
-    return " ".join(f"{kind.__name__}.{field}: {first['msg']}".split())
+        raise SessionDamaged(path, in_one_line(error)) from None
 
 
 def waits_of(state: RunState) -> dict[int, float]:

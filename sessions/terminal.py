@@ -22,8 +22,8 @@ Progress = Callable[[str, int, int], None]
 """Called with a description of the work, the number done and the total."""
 T = TypeVar("T")
 Request = TypeVar("Request")
-QUIET_S = 2.0
-"""Without a terminal, shorter work prints nothing."""
+QUIET_S = 5.0
+"""Without a terminal, progress is printed at most this often; shorter work prints nothing."""
 _ACTED_ON = re.compile(
     # Control characters of ASCII and Latin-1 (an escape sequence begins with one), except the tab.
     "[\x00-\x08\x0a-\x1f\x7f-\x9f"
@@ -117,7 +117,7 @@ def counted(items: Iterable[T], what: str, total: int, progress: Progress) -> It
 def shown() -> Generator[Progress]:
     """Show progress until the end of the block."""
     if not sys.stderr.isatty():
-        yield Lines(time.monotonic).update
+        yield lines_of(time.monotonic)
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -152,28 +152,14 @@ def show_work(work: Callable[[Request, Progress], Result], request: Request) -> 
     return result
 
 
-class Lines:
-    """Progress as lines: one for each tenth, and none within `QUIET_S` of the start or of the last."""
+def lines_of(clock_s: Callable[[], float]) -> Progress:
+    """Progress as lines for a terminal or a log that shows no bar."""
+    last_s = clock_s()
 
-    def __init__(self, clock_s: Callable[[], float]) -> None:
-        self._clock_s = clock_s
-        self._began: dict[str, tuple[float, int]] = {}
-        self._said: dict[str, int] = {}
-        self._last_s = clock_s()
+    def update(what: str, done: int, total: int) -> None:
+        nonlocal last_s
+        if clock_s() - last_s >= QUIET_S:
+            last_s = clock_s()
+            say(f"{what}: {done} of {total}", err=True)
 
-    def update(self, what: str, done: int, total: int) -> None:
-        """See `Progress`."""
-        now_s, tenth = self._clock_s(), 10 * done // max(total, 1)
-        began_s, before = self._began.setdefault(what, (now_s, done))
-        if now_s - self._last_s < QUIET_S or tenth <= self._said.get(what, 0):
-            return
-        self._last_s, self._said[what] = now_s, tenth
-        line = f"{what}: {done} of {total}"
-        if before < done < total:
-            line += f", {left_text((now_s - began_s) / (done - before) * (total - done))}"
-        say(line, err=True)
-
-
-def left_text(seconds: float) -> str:
-    """`about 40 s left`, or minutes where it is longer."""
-    return f"about {seconds:.0f} s left" if seconds < 100 else f"about {seconds / 60:.0f} min left"
+    return update

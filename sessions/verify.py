@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from brushloop.sessions.disk import (
@@ -410,7 +409,8 @@ def _content_problems(file: McapFile, progress: Progress) -> list[str]:
         for _schema, channel, message in file.messages(topics=(Topic.STILL, Topic.STROKE)):
             if channel.topic == Topic.STILL:
                 progress(f"{file.path.name}: photographs decoded", len(stills), file.counts[Topic.STILL])
-                decode_gray(decode_still(message.data), f"the image {message.sequence} on {channel.topic}")
+                where = f"the image {message.sequence} on {channel.topic}"
+                decode_gray(decode_still(message.data, where), where)
                 stills.add(message.sequence)
                 continue
             stroke = Stroke.model_validate_json(message.data)
@@ -421,7 +421,7 @@ def _content_problems(file: McapFile, progress: Progress) -> list[str]:
                 problems.append(f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there")
     except SessionDamaged as error:
         problems.append(f"{error.path} {error.what}")
-    except (DecodeError, ValidationError) as error:
+    except ValidationError as error:
         problems.append(f"a message does not fit its schema ({type(error).__name__})")
     except OSError as error:
         problems.append(f"cannot be read: {error.strerror}")

@@ -70,7 +70,7 @@ def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
             event = StepEvent.model_validate_json(message.data)
             kind = event.kind if event.phase == "begin" else ""
         elif kind == "board":
-            yield message.log_time, decode_gray(decode_still(message.data), str(recording.path))
+            yield message.log_time, decode_gray(decode_still(message.data, recording.path), str(recording.path))
 
 
 def _rig(session: SessionSource) -> dict[str, Any]:

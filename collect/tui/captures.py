@@ -174,7 +174,7 @@ class Review:
             if message.sequence != capture.still:
                 continue
             if channel.topic == Topic.STILL:
-                image, log_ns = decode_gray(decode_still(message.data), f"still {capture.still}"), message.log_time
+                image, log_ns = decode_gray(decode_still(message.data, path), str(path)), message.log_time
             elif channel.topic == Topic.QUALITY:
                 checks = Quality.model_validate_json(message.data).checks
             else:
