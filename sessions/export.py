@@ -394,13 +394,9 @@ def _card(export: Export, counts: dict[str, int]) -> bytes:
         f"  - split: train\n    path: {name}/train-*.parquet\n"
         for name in counts
     )
-    given = {"Brush": header.brush, "Ink": header.ink, "Paper": header.paper, "Robot": header.robot}
-    facts = " ".join(f"{name}: {_text(value)}." for name, value in {**given, "Licence": header.licence}.items())
-    images = (
-        "`image` is a crop seen straight from above, `px_per_mm_x` pixels per mm, gray and not corrected for the\n"
-        "light; `mask` is 255 where the stroke's ink is. Ink of neighbouring strokes may show in `image`."
-        if export.cropper
-        else "`image` is the photograph as it was recorded."
+    facts = " ".join(
+        f"{name.capitalize()}: {_text(str(getattr(header, name)))}."
+        for name in ("brush", "ink", "paper", "robot", "licence")
     )
     text = f"""---
 {_licence(header.licence)}configs:
@@ -413,14 +409,13 @@ Source: **{header.source}**. {", ".join(f"{count} {name}" for name, count in cou
 {facts}
 
 `strokes`: one row per stroke; `depth_mm` is the commanded depth H, `reached_mm` the depth that the arm reached,
-`tilt_deg` the tilt alpha. {images}
+`tilt_deg` the tilt alpha. `image` is the photograph as it was recorded; beside a `mask`, which is 255 where the
+stroke's ink is, it is a crop seen from above, in which ink of neighbouring strokes may show.
 
-`poses`, where any were recorded: poses of the brush tip in the robot's base frame; `observation.state` is \
-{", ".join(POSES.columns)}. `forces`, likewise: samples of the force sensor, in its own frame; `observation.force` is \
-{", ".join(FORCES.columns)}.
+`poses`: of the brush tip in the robot's base frame; `observation.state` is {", ".join(POSES.columns)}.
+`forces`: of the sensor, in its own frame; `observation.force` is {", ".join(FORCES.columns)}.
 
-`episode_index` joins the tables. `timestamp` is in seconds from the stroke's first sample, as measured;
-`sequence` shows gaps.
+`episode_index` joins the tables. `timestamp` is in seconds from the stroke's first sample, as measured.
 """
     if export.left_out:
         text += "\n## Strokes without a crop, left out\n"
