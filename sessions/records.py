@@ -163,14 +163,6 @@ class Quality(Event):
         return f"failed: {failed}" if failed else "passed"
 
 
-class SlowSection(Event):
-    """Part of a loop that took longer than allowed."""
-
-    name: str
-    times: int = Field(ge=1)
-    longest_ms: float = Field(ge=0.0)
-
-
 class Cadence(Event):
     """Regularity of a topic's messages during one step."""
 
@@ -183,7 +175,6 @@ class Cadence(Event):
     """None for fewer than two messages."""
     lag_ms: float | None = Field(default=None, ge=0.0)
     """How late poses arrived while the arm moved; None for other topics, and where it is not known."""
-    slow_sections: tuple[SlowSection, ...] = ()
 
 
 class Header(Event):

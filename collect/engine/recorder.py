@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING
 
@@ -27,7 +25,6 @@ from brushloop.sessions.records import (
     Event,
     InkState,
     Quality,
-    SlowSection,
     StepEvent,
     Stroke,
     Topic,
@@ -43,8 +40,6 @@ POSE_HZ = 100.0
 """Rate at which the driver asks the arm for its pose."""
 CLOCK_STEP_NS = 1_000_000_000
 """A sample that seems to have taken longer to arrive shows that the device's clock was set or began again."""
-SLOW_MS = 250.0
-"""Sections that take longer are recorded, because an operator has to wait for them."""
 
 
 class Recorder:
@@ -66,7 +61,6 @@ class Recorder:
         self._listeners: list[Callable[[PoseSample], None]] = []
         self._offset_ns: int | None = None
         """Of the host's clock from the force sensor's."""
-        self.sections = Sections()
 
     @contextlib.contextmanager
     def also(self, on_sample: Callable[[PoseSample], None]) -> Generator[None]:
@@ -116,11 +110,9 @@ class Recorder:
         self._now(Topic.QUALITY, quality, number)
 
     def cadence(self, lag_ms: float | None) -> None:
-        """Record how steadily samples came, how late poses, and which sections were slow; call it once, at the end of
-        the step."""
+        """Record how steadily samples came, and how late poses; call it once, at the end of the step."""
         now_ns = self._clock.now_ns()
-        slow = self.sections.report()
-        for report in (self._poses.report(slow, lag_ms), self._forces.report() if self._forces is not None else None):
+        for report in (self._poses.report(lag_ms), self._forces.report() if self._forces is not None else None):
             if report is not None:
                 self._put(Topic.CADENCE, now_ns, now_ns, 0, report)
 
@@ -189,8 +181,8 @@ class Arrivals:
             self._missed += max(0, round(gap_ns * self._expected_hz / 1e9) - 1)
         self._last_ns = host_ns
 
-    def report(self, slow: tuple[SlowSection, ...] = (), lag_ms: float | None = None) -> Cadence | None:
-        """The counts, to be recorded with `slow` and `lag_ms`; None if no sample came."""
+    def report(self, lag_ms: float | None = None) -> Cadence | None:
+        """The counts, to be recorded with `lag_ms`; None if no sample came."""
         if not self._received:
             return None
         return Cadence(
@@ -200,29 +192,4 @@ class Arrivals:
             missed=self._missed,
             longest_gap_ms=self._longest_ns / 1e6 if self._received > 1 else None,
             lag_ms=lag_ms,
-            slow_sections=slow,
-        )
-
-
-class Sections:
-    """Wall time of named sections of one step."""
-
-    def __init__(self) -> None:
-        self._slow_ms: defaultdict[str, list[float]] = defaultdict(list)
-
-    @contextlib.contextmanager
-    def timed(self, name: str) -> Generator[None]:
-        """Time the block; only times above `SLOW_MS` are kept."""
-        began_s = time.perf_counter()
-        try:
-            yield
-        finally:
-            took_ms = (time.perf_counter() - began_s) * 1e3
-            if took_ms > SLOW_MS:
-                self._slow_ms[name].append(took_ms)
-
-    def report(self) -> tuple[SlowSection, ...]:
-        """The slow sections."""
-        return tuple(
-            SlowSection(name=name, times=len(took), longest_ms=max(took)) for name, took in self._slow_ms.items()
         )

@@ -21,7 +21,7 @@ from brushloop.sessions.messages import (
     log_message,
     transforms_message,
 )
-from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, SlowSection, Topic, Wrench
+from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, Topic, Wrench
 
 JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
 K = [[1500.0, 0.0, 1024.0], [0.0, 1500.0, 768.0], [0.0, 0.0, 1.0]]
@@ -50,7 +50,6 @@ def each(make):
             received=990,
             missed=10,
             longest_gap_ms=50.0,
-            slow_sections=(SlowSection(name="png", times=3, longest_ms=80.0),),
         ),
     }
     outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]

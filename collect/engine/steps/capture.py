@@ -34,8 +34,7 @@ async def board(context: StepContext) -> BoardResult:
     """The BOARD step. Raises `StepError` where the board is not seen: nothing that follows could be measured; and
     `NeedsOperator` where photographs have another size, or the board another place, than before the first mark."""
     image = await photograph(context)
-    with context.recorder.sections.timed("see the board"):
-        plane, checks = await uninterrupted(_board, context.run, image)
+    plane, checks = await uninterrupted(_board, context.run, image)
     delay_ms, jitter_ms = _camera_delay(context)
     return BoardResult(
         still=context.attempt.serial,
@@ -139,8 +138,7 @@ async def photograph(context: StepContext) -> Gray:
 async def _fresh_frame(context: StepContext) -> Frame:
     run, photographer = context.run, context.run.procedures.photographer
     known = photographer.delay
-    with context.recorder.sections.timed("wait for a fresh frame"):
-        frame = await run.procedures.capture()
+    frame = await run.procedures.capture()
     if photographer.delay is not known:
         context.recorder.log(f"camera delay: {photographer.delay}")
         run.progress.log(f"camera delay: {photographer.delay}")
@@ -148,8 +146,7 @@ async def _fresh_frame(context: StepContext) -> Frame:
 
 
 async def _recorded(context: StepContext, frame: Frame) -> Gray:
-    with context.recorder.sections.timed("encode still"):
-        await uninterrupted(context.recorder.still, frame, context.attempt.serial)
+    await uninterrupted(context.recorder.still, frame, context.attempt.serial)
     return await uninterrupted(undistorted, context.run.rig.config.camera, frame.image)
 
 
@@ -229,8 +226,7 @@ async def _judged(
         run.progress.log(f"{stroke_id}: {waited.reason}", warning=True)
     if not run.rig.config.quality.enabled:
         return None
-    with context.recorder.sections.timed("judge the capture"):
-        verdict = await uninterrupted(_judge, context.run, step, image, patch)
+    verdict = await uninterrupted(_judge, context.run, step, image, patch)
     checks = _recorded_checks(verdict.checks)
     remarks = () if waited is None else (waited,)
     context.recorder.quality(records.Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
