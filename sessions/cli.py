@@ -16,14 +16,6 @@ from brushloop.sessions.terminal import say
 
 LOSSY, DAMAGED = 3, 6
 Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap file.")]
-Out = Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")]
-Licence = Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")]
-Origin = Annotated[str, typer.Option(help="Where they come from, kept in the recording.")]
-Brush = Annotated[str, typer.Option(help="Description of the brush.")]
-Radius = Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R of the brush; default: 6.")]
-Length = Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L of the brush; default: 48.")]
-Simulated = Annotated[bool, typer.Option("--simulated", help="The ink was simulated; every report says so.")]
-Kind = Annotated[str, typer.Option(help="press (vertical presses) or drag (strokes that travel).")]
 
 app = typer.Typer(help="Inspect, check, repair, import and export recordings.", no_args_is_help=True)
 
@@ -130,15 +122,15 @@ def close(session: Annotated[Path, typer.Argument(help="The folder of a session 
 def import_(
     folder: Annotated[Path, typer.Argument(help="Folder of photographs.")],
     csv: Annotated[Path, typer.Option(help="Table with a `file` column, px_per_mm, and one column per parameter.")],
-    out: Out = None,
-    kind: Kind = "drag",
+    out: Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")] = None,
+    kind: Annotated[str, typer.Option(help="press (vertical presses) or drag (strokes that travel).")] = "drag",
     px_per_mm: Annotated[float | None, typer.Option(help="Scale, where the table has none.")] = None,
-    licence: Licence = "",
-    origin: Origin = "",
-    brush: Brush = "",
-    brush_radius_mm: Radius = None,
-    brush_length_mm: Length = None,
-    simulated: Simulated = False,
+    licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
+    origin: Annotated[str, typer.Option(help="Where they come from, kept in the recording.")] = "",
+    brush: Annotated[str, typer.Option(help="Description of the brush.")] = "",
+    brush_radius_mm: Annotated[float | None, typer.Option(min=0.5, max=50.0, help="R; default: 6.")] = None,
+    brush_length_mm: Annotated[float | None, typer.Option(min=5.0, max=500.0, help="L; default: 48.")] = None,
+    simulated: Annotated[bool, typer.Option("--simulated", help="The ink was simulated; reports say so.")] = False,
 ) -> None:
     """Turn a folder of photographs with a parameter table into a session that every later command accepts."""
     import time

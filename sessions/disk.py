@@ -36,16 +36,7 @@ MAX_NAME_BYTES = 255
 NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 FORMULA_START = re.compile(r"'*[=+\-@\t\r\n＝＋－＠]")
 """Text that a spreadsheet runs, also where apostrophes precede it."""
-COMPANIONS = (
-    "journal.jsonl",
-    "remarks.jsonl",
-    "calibration",
-    "brushfit",
-    "dragfit",
-    "validation",
-    "loop",
-    "written",
-)
+COMPANIONS = ("journal.jsonl", "remarks.jsonl", "calibration", "brushfit", "dragfit", "validation", "loop", "written")
 """Files and folders that belong to a recording whose folder may also hold unrelated files."""
 
 

@@ -8,7 +8,7 @@ session stays byte for byte as recorded. Photographs are read one at a time.
 from __future__ import annotations
 
 import statistics
-from collections import OrderedDict
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +62,13 @@ class Recording:
     """One finished recording, opened by its folder or its MCAP file."""
 
     def __init__(self, path: Path) -> None:
-        self.path = _finished(path)
+        check_path(path)
+        if path.is_file():
+            check_companions(path.parent)
+        state = replay(path / JOURNAL_NAME) if (path / JOURNAL_NAME).is_file() else None
+        if state is not None and state.is_open:
+            raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
+        self.path = find_recording(path, state)
         self._file = open_mcap(self.path)
         self.header = parse_header(self._file)
 
@@ -136,20 +142,16 @@ class Recording:
 
     def _captures(self, messages: Iterable[Record], bad: dict[int, str]) -> Iterator[Capture]:
         """Strokes with their stills, from messages on both topics."""
-        stills: OrderedDict[int, bytes] = OrderedDict()
+        latest: deque[tuple[int, bytes]] = deque(maxlen=STILLS_KEPT)
         for _schema, channel, message in messages:
             if channel.topic == Topic.STILL:
-                stills[message.sequence] = decode_still(message.data, self.path)
-                while len(stills) > STILLS_KEPT:
-                    stills.popitem(last=False)
+                latest.append((message.sequence, decode_still(message.data, self.path)))
                 continue
             stroke = _event(self.path, Stroke, message.data)
-            if stroke.still not in stills:
-                raise SessionDamaged(
-                    self.path, f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
-                )
-            where = f"{self.path} stroke {stroke.stroke_id}"
-            yield Capture(stroke, stills[stroke.still], where, bad.get(stroke.still, ""))
+            if (still := dict(latest).get(stroke.still)) is None:
+                what = f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
+                raise SessionDamaged(self.path, what)
+            yield Capture(stroke, still, f"{self.path} stroke {stroke.stroke_id}", bad.get(stroke.still, ""))
 
 
 def merged_file(folder: Path, state: RunState | None = None) -> Path:
@@ -167,12 +169,23 @@ def merged_file(folder: Path, state: RunState | None = None) -> Path:
 
 
 def find_recording(path: Path, state: RunState | None = None) -> Path:
-    """The MCAP file that a path names, or that of a session's folder. Raises `InputError` where there is none."""
-    check_path(path)
+    """The MCAP file that a path names, or that of a session's folder.
+
+    Raises `InputError` where there is none; the message says what to give instead.
+    """
     found = merged_file(path, state) if path.is_dir() else path
-    if not found.is_file():
-        raise _no_recording(path)
-    return found
+    if found.is_file():
+        return found
+    if not path.is_dir():
+        raise InputError(path, "no such session: give a session's folder or its .mcap file")
+    if (path / JOURNAL_NAME).is_file():
+        raise InputError(
+            path, f"has lost its recording {found.name}: `brushloop sessions repair {path}` makes it again"
+        )
+    inside = sorted(one for one in path.iterdir() if (one / JOURNAL_NAME).is_file() or any(one.glob("*.mcap")))
+    if inside:
+        raise InputError(path, f"is not a session but holds {len(inside)} of them: give one, such as {inside[0]}")
+    raise InputError(path, f"is not a session: it holds neither {JOURNAL_NAME} nor a recording {found.name}")
 
 
 def check_path(path: Path) -> None:
@@ -182,29 +195,6 @@ def check_path(path: Path) -> None:
         raise InputError(path, f"{what}. Give the session's folder, {path.parent}")
     if path.is_dir():
         check_folder(path)
-
-
-def _no_recording(folder: Path) -> InputError:
-    """Make the error for a path without a recording; the message says what to give instead."""
-    if not folder.is_dir():
-        return InputError(folder, "no such session: give a session's folder or its .mcap file")
-    name = f"{folder.resolve().name}.mcap"
-    if (folder / JOURNAL_NAME).is_file():
-        return InputError(folder, f"has lost its recording {name}: `brushloop sessions repair {folder}` makes it again")
-    inside = sorted(path for path in folder.iterdir() if (path / JOURNAL_NAME).is_file() or any(path.glob("*.mcap")))
-    if inside:
-        return InputError(folder, f"is not a session but holds {len(inside)} of them: give one, such as {inside[0]}")
-    return InputError(folder, f"is not a session: it holds neither {JOURNAL_NAME} nor a recording {name}")
-
-
-def _finished(path: Path) -> Path:
-    check_path(path)
-    if path.is_file():
-        check_companions(path.parent)
-    state = replay(path / JOURNAL_NAME) if (path / JOURNAL_NAME).is_file() else None
-    if state is not None and state.is_open:
-        raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
-    return find_recording(path, state)
 
 
 def parse_header(file: McapFile) -> Header:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from brushloop.sessions.disk import bare_name
+from brushloop.sessions.disk import SESSION_ID
 
 SCHEMA_VERSION = 1
 HEADER_NOTE = "brushloop.header"
@@ -25,12 +25,8 @@ REPAIRS_NOTE = "brushloop.repairs"
 NOTES = (HEADER_NOTE, BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE)
 
 
-def _bare_or_empty(value: str) -> str:
-    return bare_name(value) if value else value
-
-
-BareName = Annotated[str, AfterValidator(_bare_or_empty)]
-"""Name of a file or folder that cannot lead to another folder; empty until it is known."""
+BareName = Annotated[str, Field(pattern=f"^({SESSION_ID.pattern})?$")]
+"""Name of a session or of a file in one; empty until it is known."""
 
 
 class Topic(StrEnum):
