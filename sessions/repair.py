@@ -39,16 +39,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line,
 from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
 from brushloop.sessions.mcap_writer import new_mcap
 from brushloop.sessions.recording import check_path, find_recording, parse_header
-from brushloop.sessions.records import (
-    BEGIN_NOTE,
-    DONE_NOTE,
-    HEADER_NOTE,
-    REPAIRS_NOTE,
-    Header,
-    StepEvent,
-    Stroke,
-    Topic,
-)
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Header, StepEvent, Stroke, Topic
 from brushloop.sessions.store import closed, lock, merge_session
 from brushloop.sessions.verify import Evidence, count_words, gather, is_collected, judge, verify_session
 
@@ -105,20 +96,11 @@ def _repair_file(path: Path) -> Report:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
     if HEADER_NOTE not in file.notes:
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
-    notes = {name: values for name, values in file.notes.items() if name != HEADER_NOTE}
-    attached = {attachment.name: attachment.data for attachment in file.attachments()}
-    kept, counts, lost = _rewrite(file, parse_header(file), notes, attached, Counter(file.stated))
+    kept, counts, lost = _rewrite(file, parse_header(file), file.stated)
     why = "; ".join(finding.what for finding in verdict.findings)
     report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept}")
-    report.strokes = counts.get(Topic.STROKE, 0)
     report.lost += lost
-    if file.index is None:
-        if len(file.damage) > 1:
-            report.lost.append("anything else behind the damage: without its index its amount is unknown")
-    elif len(attached) < len(file.index.attachment_indexes) or (
-        {one.name for one in file.index.metadata_indexes} - {HEADER_NOTE, *file.notes}
-    ):
-        report.lost.append("an attached file, or a note of what was done to the recording")
+    report.strokes = counts.get(Topic.STROKE, 0)
     return report
 
 
@@ -273,13 +255,8 @@ class _FolderRepair:
         """
         state, file = self._state, self._evidence.files.get(self._final.name)
         counts, lost, how = state.counts(), self._lost_steps, "from the steps' files"
-        if file is not None and self._holds_more(file):
-            repairs = [line_of(repair) for repair in state.repairs]
-            notes: dict[str, Line] = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
-            names = {} if state.opened is None else state.opened.snapshots
-            attached = {name: text.encode() for name, text in names.items()}
-            before = Counter[str]({} if state.closed is None else state.closed.counts)
-            kept, counts, lost = _rewrite(file, self._header, notes, attached, before)
+        if file is not None and state.closed is not None and self._holds_more(file):
+            kept, counts, lost = _rewrite(file, self._header, state.closed.counts)
             how = "from what can be read of it"
         else:
             kept = _keep(self._final)
@@ -325,21 +302,28 @@ def _parsed(kind: type[_E], message: Message) -> _E | None:
         return None
 
 
-def _rewrite(
-    file: McapFile, header: Header, notes: dict[str, Line], attached: dict[str, bytes], before: Counter[str]
-) -> tuple[str, dict[str, int], list[str]]:
+def _rewrite(file: McapFile, header: Header, before: Mapping[str, int]) -> tuple[str, dict[str, int], list[str]]:
     """Write a damaged recording again from what can be read of it; `before` are its messages by topic as they were.
 
     Returns where the damaged file is kept, the messages by topic, and descriptions of what was lost.
     """
     strokes: dict[str, bool] = {}
+    notes = {name: values for name, values in file.notes.items() if name != HEADER_NOTE}
+    attached = {attachment.name: attachment.data for attachment in file.attachments()}
     kept, counts = _replace_damaged(file.path, header, notes, attached, _whole(file, strokes))
     lost = [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
-    gone = before - Counter(counts)
+    gone = Counter(before) - Counter(counts)
     unknown = gone.pop(Topic.STROKE, 0) - len(lost)
     if unknown > 0:
         lost.append(f"strokes that cannot be read: {unknown}")
-    return kept, counts, lost + [f"messages on {topic}: {count}" for topic, count in gone.items()]
+    lost += [f"messages on {topic}: {count}" for topic, count in gone.items()]
+    if file.index is None and len(file.damage) > 1:
+        lost.append("anything else behind the damage: without its index its amount is unknown")
+    if file.index is not None:
+        noted = {one.name for one in file.index.metadata_indexes} - {HEADER_NOTE, *notes}
+        if noted or len(attached) < len(file.index.attachment_indexes):
+            lost.append("an attached file, or a note of what was done to the recording")
+    return kept, counts, lost
 
 
 def _in_steps(file: McapFile, steps: Mapping[object, Done]) -> Iterator[tuple[Done, list[Record]]]:
