@@ -19,22 +19,10 @@ from typing import TypeVar
 from mcap.records import Message
 from pydantic import ValidationError
 
+from brushloop.sessions import events
 from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside, sync
 from brushloop.sessions.errors import SessionDamaged, disk_error
-from brushloop.sessions.events import (
-    Begin,
-    BoardResult,
-    CaptureResult,
-    Done,
-    Doubt,
-    DrawResult,
-    Event,
-    Lost,
-    PressResult,
-    Repaired,
-    line_of,
-    step_words,
-)
+from brushloop.sessions.events import Begin, Done, Event, line_of, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
 from brushloop.sessions.mcap_writer import new_mcap
@@ -110,7 +98,7 @@ class _FolderRepair:
     def __init__(self, evidence: Evidence, now_ns: Callable[[], int]) -> None:
         self._evidence, self._verdict = evidence, judge(evidence)
         self._folder, self._final, self._state = evidence.folder, evidence.final, evidence.state
-        self._final_problems = self._verdict.problems(self._final.name)
+        self._final_problems = [one.what for one in self._verdict.findings if one.file == self._final.name]
         self._now_ns = now_ns
         self._header = read_header(evidence.folder, evidence.state)
         self._report = Report(evidence.folder.name)
@@ -159,7 +147,7 @@ class _FolderRepair:
     def _doubt(self) -> None:
         sheet = self._state.sheet
         for name in [] if sheet in self._state.doubtful_sheets else self._evidence.doubtful:
-            self._log(Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
+            self._log(events.Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
             self._report.lost.append(
                 f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
                 f"go on with a fresh one, --sheet {sheet + 2}"
@@ -191,7 +179,7 @@ class _FolderRepair:
         steps: dict[object, Done] = {}
         for step in damaged.values():
             steps[step.key, step.attempt] = step
-            if isinstance(step.result, CaptureResult | BoardResult):
+            if isinstance(step.result, events.CaptureResult | events.BoardResult):
                 steps[step.result.still] = step
         # Those kept aside come last: what was replaced just now is among them.
         for pattern in ("*.mcap", "*.mcap.damaged-*") if steps else ():
@@ -212,10 +200,8 @@ class _FolderRepair:
         }
         kept, counts = _replace_damaged(path, self._header, notes, {}, records)
         missing = dict(Counter(step.counts) - Counter(counts))
-        sha256, now_ns = file_sha256(path), self._now_ns()
-        self._log(
-            Repaired(t_ns=now_ns, key=step.key, file=step.file, sha256=sha256, counts=counts, missing=missing, why=why)
-        )
+        repaired = {"t_ns": self._now_ns(), "key": step.key, "file": step.file, "sha256": file_sha256(path)}
+        self._log(events.Repaired.model_validate({**repaired, "counts": counts, "missing": missing, "why": why}))
         how = f"without {count_words(missing)}" if missing else "whole"
         self._report.did.append(f"wrote {step.file} ({step_words(step)}) again {how}: {why}{kept}")
         if missing:
@@ -226,18 +212,18 @@ class _FolderRepair:
         self._mark_lost(step, self._verdict.damaged[step.file], kept)
         again = "" if self._state.closed is not None else "; it is done again when the session goes on"
         self._lost_steps.append(f"{step_words(step)}{again}")
-        if self._state.closed is not None or not isinstance(step.result, CaptureResult):
+        if self._state.closed is not None or not isinstance(step.result, events.CaptureResult):
             return
         # If its sheet was removed, the stroke cannot be photographed again: its press is lost too.
         for done in list(self._state.files.values()):
-            press = done.press if isinstance(done.result, PressResult | DrawResult) else None
+            press = done.press if isinstance(done.result, events.PressResult | events.DrawResult) else None
             if press is None or press.stroke_id != step.result.press.stroke_id:
                 continue
             if press.sheet is not None and press.sheet != self._state.sheet:
                 self._mark_lost(done, f"its photograph is lost and its sheet {press.sheet + 1} is no longer in")
 
     def _mark_lost(self, step: Done, why: str, kept: str = "") -> None:
-        self._log(Lost(t_ns=self._now_ns(), key=step.key, file=step.file, why=why))
+        self._log(events.Lost(t_ns=self._now_ns(), key=step.key, file=step.file, why=why))
         self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}{kept}")
 
     def _move_aside(self, path: Path) -> str:

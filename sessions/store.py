@@ -13,35 +13,19 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from brushloop.sessions import events
 from brushloop.sessions.disk import (
-    MAX_SNAPSHOT_BYTES,
     SEGMENT_NAME,
-    SNAPSHOT_NAMES,
     check_digest,
     check_folder,
     check_room,
     file_sha256,
     fsync_folder,
-    read_bounded,
     set_aside,
     write_durably,
 )
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
-from brushloop.sessions.events import (
-    Begin,
-    Closed,
-    Done,
-    Ended,
-    Event,
-    FreshSheet,
-    Open,
-    Press,
-    Process,
-    StepKind,
-    StepResult,
-    Void,
-    line_of,
-)
+from brushloop.sessions.events import Begin, Done, Event, Press, StepKind, StepResult, line_of
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, read_header, replay
 from brushloop.sessions.mcap_file import scan_sound
 from brushloop.sessions.mcap_writer import SegmentWriter, new_mcap
@@ -89,9 +73,9 @@ class SessionStore:
             self.header = header or read_header(folder, self.state)
             self._journal = Journal(folder / JOURNAL_NAME, now_ns(), self.header.session_id)
             if header is not None:
-                self._log(Open(t_ns=now_ns(), header=header, snapshots=snapshots or {}))
+                self._log(events.Open(t_ns=now_ns(), header=header, snapshots=snapshots or {}))
             self._check_serials()
-            self._log(Process(t_ns=now_ns()))
+            self._log(events.Process(t_ns=now_ns()))
         except SessionDamaged as error:
             error.add_note(f"Try `brushloop sessions repair {folder}`.")
             self.release()
@@ -154,24 +138,25 @@ class SessionStore:
 
     def done(self, attempt: Attempt, result: StepResult) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""
-        key, number, file, t_ns = attempt.begin.key, attempt.begin.attempt, attempt.begin.file, self._now_ns()
-        noted = {"t_ns": t_ns, "key": key, "attempt": number}
-        sha256 = attempt.writer.finish({**noted, "result": result.model_dump(mode="json", exclude_none=True)})
-        counts = dict(attempt.writer.counts)
-        self._log(Done(t_ns=t_ns, key=key, attempt=number, file=file, sha256=sha256, counts=counts, result=result))
+        begin, t_ns = attempt.begin, self._now_ns()
+        done = Done(
+            t_ns=t_ns, key=begin.key, attempt=begin.attempt, file=begin.file, sha256="", counts={}, result=result
+        )
+        sha256 = attempt.writer.finish({"t_ns": done.t_ns, **line_of(done)})
+        self._log(done.model_copy(update={"sha256": sha256, "counts": dict(attempt.writer.counts)}))
 
     def void(self, attempt: Attempt, why: str) -> None:
         """Journal that an attempt was cut; its part file is kept as evidence, and its patch stays used."""
         attempt.writer.abandon()
-        self._log(Void(t_ns=self._now_ns(), key=attempt.begin.key, attempt=attempt.begin.attempt, why=why))
+        self._log(events.Void(t_ns=self._now_ns(), key=attempt.begin.key, attempt=attempt.begin.attempt, why=why))
 
     def fresh_sheet(self) -> None:
         """Journal that the operator put a fresh sheet in: its patches are all free."""
-        self._log(FreshSheet(t_ns=self._now_ns(), sheet=self.state.sheet + 1))
+        self._log(events.FreshSheet(t_ns=self._now_ns(), sheet=self.state.sheet + 1))
 
     def ended(self, why: str) -> None:
         """Journal how a run ended before its time: it is shown to whoever resumes the session."""
-        self._log(Ended(t_ns=self._now_ns(), why=why))
+        self._log(events.Ended(t_ns=self._now_ns(), why=why))
 
     def verify(self) -> None:
         """Raise `SessionDamaged` naming the first finished step whose file is missing or has changed."""
@@ -233,8 +218,8 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
         part.unlink(missing_ok=True)  # only a copy of steps that still exist
         repairs = [repair.model_dump(mode="json") for repair in state.repairs]
         notes = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
-        snapshots = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
-        attachments = {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES) for path in snapshots}
+        snapshots = {} if state.opened is None else state.opened.snapshots
+        attachments = {name: text.encode() for name, text in snapshots.items()}
         with new_mcap(part, header, notes, attachments) as writer:
             for file in state.files:
                 writer.copy_file(folder / file)
@@ -296,6 +281,6 @@ def lock(folder: Path) -> FileLock:
     return held
 
 
-def closed(final: Path, counts: dict[str, int], t_ns: int) -> Closed:
+def closed(final: Path, counts: dict[str, int], t_ns: int) -> events.Closed:
     """The event of a closed session."""
-    return Closed(t_ns=t_ns, file=final.name, sha256=file_sha256(final), counts=counts)
+    return events.Closed(t_ns=t_ns, file=final.name, sha256=file_sha256(final), counts=counts)

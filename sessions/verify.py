@@ -11,9 +11,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import ValidationError
 
+from brushloop.sessions import events
 from brushloop.sessions.disk import (
     MAX_SNAPSHOT_BYTES,
     SEGMENT_NAME,
@@ -25,31 +27,18 @@ from brushloop.sessions.disk import (
     read_bounded,
 )
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
-from brushloop.sessions.events import (
-    Begin,
-    CaptureResult,
-    Closed,
-    Done,
-    Doubt,
-    Event,
-    Lost,
-    Open,
-    StepKind,
-    Void,
-    parse_event,
-    serial_of,
-    step_words,
-)
-from brushloop.sessions.journal import JOURNAL_NAME, DoneTwice, Line, Reading, RunState, read, read_journal
+from brushloop.sessions.events import Begin, Done, Event, StepKind, parse_event, serial_of, step_words
+from brushloop.sessions.journal import JOURNAL_NAME, DoneTwice, Reading, RunState, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording, check_path, find_recording, merged_file, parse_header, remarks_of
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Header, Stroke, Topic
+from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Stroke, Topic
 from brushloop.sessions.store import closed
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
 """Kinds of steps that use patches."""
+_E = TypeVar("_E", Begin, Done)
 
 
 @dataclass(slots=True)
@@ -99,11 +88,11 @@ class Evidence:
 def _place(event: Event) -> float:
     """Where an event belongs: by the serial number of its step; -1 for one that stays behind the one before it."""
     match event:
-        case Open():
+        case events.Open():
             return -2
         case Begin() | Done():
             return serial_of(event.file) + isinstance(event, Done) / 2
-        case Closed():
+        case events.Closed():
             return float("inf")
         case _:
             return -1
@@ -134,14 +123,21 @@ def gather(folder: Path) -> Evidence:
     evidence = Evidence(folder, final, reading, files, session)
     _rebuild_steps(evidence)
     if reading.state.opened is None:
-        evidence.rebuilt.append(Open(t_ns=0, header=_header(evidence), snapshots=_snapshots(folder)))
+        evidence.rebuilt.append(_opened(evidence))
     for event in evidence.events():
         try:
             evidence.state.apply(event)
         except DoneTwice:
             # Only a rebuilt event can raise this: the journal's own were applied before.
             evidence.rebuilt = [other for other in evidence.rebuilt if other is not event]
-    _rebuild_closed(evidence)
+    merged, state = files.get(final.name), evidence.state
+    if state.closed is not None or merged is None or merged.damage or merged.session != session:
+        return evidence
+    # It holds more than the steps where their files are lost with their lines: it is then the only copy.
+    if merged.counts and merged.counts >= Counter(state.counts()):
+        last_ns = max(event.t_ns for event in evidence.events())
+        evidence.rebuilt.append(closed(final, dict(merged.counts), last_ns))
+        state.apply(evidence.rebuilt[-1])
     return evidence
 
 
@@ -163,11 +159,11 @@ def _session(folder: str, named: str, files: Counter[str]) -> str:
 
 def _rebuild_steps(evidence: Evidence) -> None:
     """Rebuild `begin` and `done` from the notes in the files of steps, whatever these are called now."""
-    events = evidence.reading.events
-    begun = {event.file: event for event in events if isinstance(event, Begin)}
-    doubted = {event.file for event in events if isinstance(event, Doubt)}
-    over: set[str | tuple[str, int]] = {event.file for event in events if isinstance(event, Done | Lost)}
-    over |= {(event.key, event.attempt) for event in events if isinstance(event, Void)}
+    known = evidence.reading.events
+    begun = {event.file: event for event in known if isinstance(event, Begin)}
+    doubted = {event.file for event in known if isinstance(event, events.Doubt)}
+    over: set[str | tuple[str, int]] = {event.file for event in known if isinstance(event, Done | events.Lost)}
+    over |= {(event.key, event.attempt) for event in known if isinstance(event, events.Void)}
     attempts = dict(evidence.reading.state.attempts)
     steps: list[tuple[str, McapFile, Begin]] = []
     for name, file in evidence.files.items():
@@ -176,7 +172,7 @@ def _rebuild_steps(evidence: Evidence) -> None:
             continue
         if foreign := evidence.foreign(file):
             evidence.strays |= {} if own in begun else {name: foreign[0]}
-        elif (begin := _begin(file) or begun.get(own)) is not None:
+        elif (begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own)) is not None:
             steps.append((name, file, begin))
             if begin.file not in begun:
                 begun[begin.file] = begin
@@ -190,66 +186,44 @@ def _rebuild_steps(evidence: Evidence) -> None:
         unfinished = name.endswith(".part") or attempts[begin.key] > begin.attempt
         if unfinished or over & {begin.file, (begin.key, begin.attempt)}:
             continue
-        if (done := _done(file, begin)) is not None:
+        if (done := _noted(file, DONE_NOTE, Done) or _captured(file, begin)) is not None:
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
             whole = name == begin.file and not file.damage and dict(file.counts) == done.counts
-            over.add(done.file)
-            evidence.rebuilt.append(done.model_copy(update={"sha256": file_sha256(file.path) if whole else ""}))
+            over.add(begin.file)
+            sha256 = file_sha256(file.path) if whole else ""
+            evidence.rebuilt.append(done.model_copy(update={"file": begin.file, "sha256": sha256}))
         elif name == begin.file:
             evidence.strays[name] = "is finished, but the result of its step cannot be read"
 
 
-def _begin(file: McapFile) -> Begin | None:
-    """The `begin` that a file notes; None where it makes no sense."""
-    event = _noted(file.notes.get(BEGIN_NOTE, {}))
-    return event if isinstance(event, Begin) else None
-
-
-def _done(file: McapFile, begin: Begin) -> Done | None:
-    """The `done` that a file notes, without a digest; that of a capture is also known from its stroke."""
-    line: Line = {"event": "done", **file.notes.get(DONE_NOTE, {}), "file": begin.file, "sha256": ""}
-    if DONE_NOTE not in file.notes and begin.press is not None and file.counts[Topic.STROKE]:
-        stills = [message.sequence for _schema, _channel, message in file.messages((Topic.STROKE,))]
-        result = CaptureResult(press=begin.press, still=stills[-1]).model_dump(exclude_none=True)
-        line |= {"t_ns": begin.t_ns, "key": begin.key, "attempt": begin.attempt, "counts": file.counts}
-        line |= {"result": result}
-    event = _noted(line)
-    return event if isinstance(event, Done) else None
-
-
-def _noted(line: Line) -> Event | None:
+def _noted(file: McapFile, note: str, kind: type[_E]) -> _E | None:
+    """The event that a file notes; None where it makes no sense."""
     try:
-        return parse_event(line)
+        event = parse_event(file.notes.get(note, {}))
     except ValueError:
         return None
+    return event if isinstance(event, kind) else None
 
 
-def _header(evidence: Evidence) -> Header:
-    """Header of the session in one of its files, preferably where it matches its CRC. Raises `SessionDamaged`."""
+def _captured(file: McapFile, begin: Begin) -> Done | None:
+    """The `done` of a capture whose note is lost, from its stroke."""
+    if begin.press is None or not file.counts[Topic.STROKE]:
+        return None
+    *_, (_schema, _channel, stroke) = file.messages((Topic.STROKE,))
+    result, counts = events.CaptureResult(press=begin.press, still=stroke.sequence), dict(file.counts)
+    key, attempt = begin.key, begin.attempt
+    return Done(t_ns=begin.t_ns, key=key, attempt=attempt, file=begin.file, sha256="", counts=counts, result=result)
+
+
+def _opened(evidence: Evidence) -> events.Open:
+    """The `open` of a session, from its files. Raises `SessionDamaged`."""
     ours = [file for file in evidence.files.values() if file.header is not None and not evidence.foreign(file)]
     if not ours:
         raise SessionDamaged(evidence.folder / JOURNAL_NAME, "has no `open` event, and no file holds its header")
-    return parse_header(max(ours, key=lambda file: file.session == evidence.session))
-
-
-def _snapshots(folder: Path) -> dict[str, str]:
-    present = [path for name in SNAPSHOT_NAMES if (path := folder / name).is_file()]
-    return {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace") for path in present}
-
-
-def _rebuild_closed(evidence: Evidence) -> None:
-    """Rebuild `closed` if the merged file is sound and holds all messages that the journal counts, or more.
-
-    It holds more where the files of steps are lost with their lines: it is then the only copy.
-    """
-    file, state = evidence.files.get(evidence.final.name), evidence.state
-    if state.closed is not None or file is None or file.damage or file.session != evidence.session:
-        return
-    if file.counts and file.counts >= Counter(state.counts()):
-        last_ns = max(event.t_ns for event in evidence.events())
-        event = closed(evidence.final, dict(file.counts), last_ns)
-        evidence.rebuilt.append(event)
-        state.apply(event)
+    header = parse_header(max(ours, key=lambda file: file.session == evidence.session))  # its CRC matches, if one does
+    present = [path for name in SNAPSHOT_NAMES if (path := evidence.folder / name).is_file()]
+    texts = {path.name: read_bounded(path, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace") for path in present}
+    return events.Open(t_ns=0, header=header, snapshots=texts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,10 +259,6 @@ class Verdict:
     def find(self, file: str, *problems: str) -> None:
         """Add what is wrong with a file."""
         self.findings += [Finding(file, what) for what in problems]
-
-    def problems(self, file: str) -> list[str]:
-        """What is wrong with a file."""
-        return [finding.what for finding in self.findings if finding.file == file]
 
 
 def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
@@ -341,7 +311,7 @@ def judge(evidence: Evidence, progress: Progress = unseen) -> Verdict:
         except (InputError, SessionDamaged) as error:
             verdict.find(error.path.name, error.what)
     for repair in state.repairs:
-        if isinstance(repair, Lost):
+        if isinstance(repair, events.Lost):
             verdict.notes.append(f"{repair.file}: was lost: {repair.why}")
         else:
             missing = count_words(repair.missing) or "nothing"
@@ -366,7 +336,7 @@ def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
                 verdict.find(JOURNAL_NAME, f"does not mention {file}")
             case Done(file=file):
                 verdict.notes.append(f"{file}: {step_words(event)} is finished, but not journalled as done")
-            case Closed(file=file):
+            case events.Closed(file=file):
                 verdict.notes.append(f"{file} is complete, but not journalled as closed")
             case _:
                 verdict.find(JOURNAL_NAME, "does not say how the session was opened")
@@ -377,7 +347,7 @@ def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
 
 
 def _judge_file(
-    verdict: Verdict, evidence: Evidence, name: str, listed: Done | Closed | None, progress: Progress = unseen
+    verdict: Verdict, evidence: Evidence, name: str, listed: Done | events.Closed | None, progress: Progress = unseen
 ) -> None:
     """Judge a file of a step or the merged one by its content and by what the journal says of it, if anything."""
     file, problems = evidence.files.get(name), list[str]()
