@@ -1,11 +1,4 @@
-"""Errors about sessions on disk, each with the path of a file or folder.
-
-SessionError
- +-- InputError          a file from elsewhere cannot be used as it is; nothing was written
- +-- SessionLocked       another process has the session open
- +-- SessionDamaged      what is on disk does not agree with the journal
- +-- DiskFull            no room for the next step; finished steps stay, and the same command resumes
-"""
+"""Errors about sessions on disk, each with the path of a file or folder."""
 
 from __future__ import annotations
 
@@ -26,7 +19,7 @@ class SessionError(Exception):
 
 
 class InputError(SessionError):
-    """A file given by the user cannot be used; the message names the field and what is allowed."""
+    """A file from elsewhere cannot be used as it is; the message names the field and what is allowed."""
 
     exit_code: ClassVar[int] = 2
 
@@ -44,7 +37,7 @@ class SessionDamaged(SessionError):
 
 
 class DiskFull(SessionError):
-    """The disk is full. Nothing finished is lost; the current attempt was not finished."""
+    """No room for the next step. Finished steps stay, and the same command resumes."""
 
 
 def disk_error(path: Path | str, what: str, error: BaseException) -> SessionError:

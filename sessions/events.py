@@ -187,19 +187,9 @@ class ReviewResult(Value):
     again: tuple[Again, ...] = ()
 
 
+SetUpResult = ZeroTouchResult | BoardResult | TouchResult | SelfCheckResult
 MarkResult = PressResult | DrawResult
-StepResult = Annotated[
-    ZeroTouchResult
-    | BoardResult
-    | TouchResult
-    | SelfCheckResult
-    | DipResult
-    | PressResult
-    | DrawResult
-    | CaptureResult
-    | ReviewResult,
-    Field(discriminator="kind"),
-]
+StepResult = Annotated[SetUpResult | MarkResult | DipResult | CaptureResult | ReviewResult, Field(discriminator="kind")]
 
 
 class _Event(Value):
@@ -337,10 +327,9 @@ class Remark(_Event):
     note: str = ""
 
 
-Event = Annotated[
-    Open | Process | Begin | Done | Void | FreshSheet | Torn | Ended | Closed | Repaired | Lost | Doubt | Remark,
-    Field(discriminator="event"),
-]
+_OfSession = Open | Process | FreshSheet | Ended | Closed | Torn | Remark
+_OfStep = Begin | Done | Void | Repaired | Lost | Doubt
+Event = Annotated[_OfSession | _OfStep, Field(discriminator="event")]
 _EVENTS: TypeAdapter[Event] = TypeAdapter(Event)
 
 

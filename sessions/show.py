@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -234,13 +235,8 @@ def _grid_table(details: Details) -> Table:
 
 def ranges(patches: list[int]) -> str:
     """Patches as `0-3, 7`, with consecutive numbers joined."""
-    parts: list[list[int]] = []
-    for patch in patches:
-        if parts and patch == parts[-1][-1] + 1:
-            parts[-1].append(patch)
-        else:
-            parts.append([patch])
-    return ", ".join(f"{p[0]}-{p[-1]}" if len(p) > 1 else str(p[0]) for p in parts) or "none"
+    runs = [[patch for _, patch in run] for _, run in groupby(enumerate(patches), lambda pair: pair[1] - pair[0])]
+    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs) or "none"
 
 
 def _number(value: float | None, unit: str) -> str:
