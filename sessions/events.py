@@ -292,7 +292,6 @@ class Repaired(_Event):
     """A repair wrote the file of a step again."""
 
     event: Literal["repaired"] = "repaired"
-    key: str
     file: StepFile
     sha256: str
     counts: Counts
@@ -304,7 +303,6 @@ class Lost(_Event):
     """A repair could not recover a step: it counts as never done."""
 
     event: Literal["lost"] = "lost"
-    key: str
     file: StepFile
     why: str = ""
 

@@ -200,8 +200,8 @@ class _FolderRepair:
         }
         kept, counts = _replace_damaged(path, self._header, notes, {}, records)
         missing = dict(Counter(step.counts) - Counter(counts))
-        repaired = {"t_ns": self._now_ns(), "key": step.key, "file": step.file, "sha256": file_sha256(path)}
-        self._log(events.Repaired.model_validate({**repaired, "counts": counts, "missing": missing, "why": why}))
+        t_ns, sha256 = self._now_ns(), file_sha256(path)
+        self._log(events.Repaired(t_ns=t_ns, file=step.file, sha256=sha256, counts=counts, missing=missing, why=why))
         how = f"without {count_words(missing)}" if missing else "whole"
         self._report.did.append(f"wrote {step.file} ({step_words(step)}) again {how}: {why}{kept}")
         if missing:
@@ -223,7 +223,7 @@ class _FolderRepair:
                 self._mark_lost(done, f"its photograph is lost and its sheet {press.sheet + 1} is no longer in")
 
     def _mark_lost(self, step: Done, why: str, kept: str = "") -> None:
-        self._log(events.Lost(t_ns=self._now_ns(), key=step.key, file=step.file, why=why))
+        self._log(events.Lost(t_ns=self._now_ns(), file=step.file, why=why))
         self._report.did.append(f"marked {step.file} ({step_words(step)}) as lost: {why}{kept}")
 
     def _move_aside(self, path: Path) -> str:

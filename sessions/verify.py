@@ -164,7 +164,6 @@ def _rebuild_steps(evidence: Evidence) -> None:
     doubted = {event.file for event in known if isinstance(event, events.Doubt)}
     over: set[str | tuple[str, int]] = {event.file for event in known if isinstance(event, Done | events.Lost)}
     over |= {(event.key, event.attempt) for event in known if isinstance(event, events.Void)}
-    attempts = dict(evidence.reading.state.attempts)
     steps: list[tuple[str, McapFile, Begin]] = []
     for name, file in evidence.files.items():
         step_name, own = SEGMENT_NAME.fullmatch(name), name.removesuffix(".part")
@@ -176,15 +175,14 @@ def _rebuild_steps(evidence: Evidence) -> None:
             steps.append((name, file, begin))
             if begin.file not in begun:
                 begun[begin.file] = begin
-                attempts[begin.key] = max(attempts.get(begin.key, 0), begin.attempt)
                 evidence.rebuilt.append(begin)
         elif step_name[2] in MARKING and name not in doubted:
             evidence.doubtful.append(name)
     for name, file, begin in steps:
         if name.removesuffix(".part") not in begun:
             evidence.strays[name] = "holds a step that the journal lists under another file"
-        unfinished = name.endswith(".part") or attempts[begin.key] > begin.attempt
-        if unfinished or over & {begin.file, (begin.key, begin.attempt)}:
+        done_again = evidence.reading.state.attempts.get(begin.key, 0) > begin.attempt
+        if name.endswith(".part") or done_again or over & {begin.file, (begin.key, begin.attempt)}:
             continue
         if (done := _noted(file, DONE_NOTE, Done) or _captured(file, begin)) is not None:
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
