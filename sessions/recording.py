@@ -20,7 +20,7 @@ from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.events import CaptureResult, Remark, line_of
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, replay, undamaged
-from brushloop.sessions.mcap_file import McapFile, Part, Record, open_mcap
+from brushloop.sessions.mcap_file import McapFile, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.records import Event, Header, StepEvent, Stroke, Topic
 
@@ -104,22 +104,17 @@ class Recording:
 
     def captures(self) -> Iterator[Capture]:
         """Strokes with their stills, in order of capture. Raises `SessionDamaged`."""
-        return self._captures(self.messages(Topic.STILL, Topic.STROKE), self.marked_bad())
-
-    def capture(self, number: int, bad: dict[int, str]) -> Capture:
-        """The capture of one stroke, counted from 0, read without the others; `bad` as from `marked_bad`.
-
-        Raises `SessionDamaged` also for a recording whose strokes do not have a chunk each, as they do in ours.
-        """
-        before, parts = 0, list[Part]()
-        for part in self._file.parts:
-            if before == number:
-                parts.append(part)
-            before += self._file.may_hold(part, Topic.STROKE)
-        found = list(self._captures(self._file.messages([Topic.STILL, Topic.STROKE], parts), bad))
-        if before != self.strokes() or len(found) != 1:
-            raise SessionDamaged(self.path, f"stroke number {number} cannot be read alone")
-        return found[0]
+        bad = self.marked_bad()
+        latest: deque[tuple[int, bytes]] = deque(maxlen=STILLS_KEPT)
+        for _schema, channel, message in self.messages(Topic.STILL, Topic.STROKE):
+            if channel.topic == Topic.STILL:
+                latest.append((message.sequence, decode_still(message.data, self.path)))
+                continue
+            stroke = _event(self.path, Stroke, message.data)
+            if (still := dict(latest).get(stroke.still)) is None:
+                what = f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
+                raise SessionDamaged(self.path, what)
+            yield Capture(stroke, still, f"{self.path} stroke {stroke.stroke_id}", bad.get(stroke.still, ""))
 
     def marked_bad(self) -> dict[int, str]:
         """Reasons why captures were marked bad, by number of the still. Raises `SessionDamaged`."""
@@ -139,19 +134,6 @@ class Recording:
     def messages(self, *topics: Topic) -> Iterator[Record]:
         """Messages on these topics, in the order in which they were written. Raises `SessionDamaged`."""
         return self._file.messages(topics)
-
-    def _captures(self, messages: Iterable[Record], bad: dict[int, str]) -> Iterator[Capture]:
-        """Strokes with their stills, from messages on both topics."""
-        latest: deque[tuple[int, bytes]] = deque(maxlen=STILLS_KEPT)
-        for _schema, channel, message in messages:
-            if channel.topic == Topic.STILL:
-                latest.append((message.sequence, decode_still(message.data, self.path)))
-                continue
-            stroke = _event(self.path, Stroke, message.data)
-            if (still := dict(latest).get(stroke.still)) is None:
-                what = f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
-                raise SessionDamaged(self.path, what)
-            yield Capture(stroke, still, f"{self.path} stroke {stroke.stroke_id}", bad.get(stroke.still, ""))
 
 
 def merged_file(folder: Path, state: RunState | None = None) -> Path:

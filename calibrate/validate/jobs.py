@@ -42,21 +42,6 @@ class PrepareJob:
 
 
 @dataclass(frozen=True, slots=True)
-class ReadJob:
-    """The same, for a worker that reads the photograph itself."""
-
-    session: str
-    """Path or URL of the recording."""
-    sha256: str
-    number: int
-    """Of the stroke, in order of capture."""
-    bad: dict[int, str]
-    """See `Recording.marked_bad`: remarks lie beside a recording, not in it."""
-    calibration: Calibration | None
-    view: Field
-
-
-@dataclass(frozen=True, slots=True)
 class Press:
     """A captured press after preparation; `pixels` is empty if it was refused."""
 
@@ -104,17 +89,6 @@ def prepare_job(job: PrepareJob) -> Press:
     return Press(stroke.stroke_id, height, tilt, again, pixels, measured, prepared.cut, prepared.flags, "")
 
 
-def read_job(job: ReadJob) -> Press | None:
-    """Read a capture and prepare it; None if it cannot be read alone, as in a recording of ours."""
-    from brushloop.calibrate.validate.sources import opened  # not needed by jobs that get their photograph
-
-    try:
-        capture = opened(job.session, job.sha256).capture(job.number, job.bad)
-    except SessionDamaged:
-        return None
-    return prepare_job(PrepareJob(capture, job.calibration, job.view))
-
-
 def key_of(session: LoadedSession, view: Field) -> str:
     """The beginning of the keys of a session's prepared strokes; `:` and the number of the stroke follow."""
     calibration = session.calibration.digest if session.calibration is not None else ""
@@ -139,12 +113,6 @@ def prepared(
         done += 1
         progress(what, done, session.count)
 
-    if waiting.any() and scheduler.opens(session.place, session.sha256):
-        bad, at = session.recording.marked_bad(), (session.place, session.sha256)
-        reading = ((str(k), ReadJob(*at, k, bad, session.calibration, view)) for k in every if waiting[k])
-        for number, read in scheduler.run(read_job, reading):
-            if read is not None:
-                put(number, read)
     if waiting.any():
 
         def jobs() -> Iterator[tuple[str, PrepareJob]]:

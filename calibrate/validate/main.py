@@ -131,7 +131,7 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
         with outcome.store:
             steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
             report, notes = _write(outcome, folder, request, steps, curves, extras, progress)
-            return ValidationOutput(folder, report, notes=(*extras.notes, *scheduler.notes, *notes))
+            return ValidationOutput(folder, report, notes=(*extras.notes, *notes))
 
 
 def check(output: ValidationOutput, request: Request) -> None:

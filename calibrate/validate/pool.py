@@ -41,10 +41,6 @@ class Scheduler(Protocol):
         """Number of jobs that run at a time."""
         ...
 
-    def opens(self, session: str, sha256: str) -> bool:
-        """Whether the jobs should read the recording at this path or URL themselves."""
-        ...
-
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
         """Yield (name, result) as jobs finish. A job is taken from the iterator only when there is room for it."""
         ...
@@ -55,17 +51,12 @@ class Threads(AbstractContextManager["Threads"]):
 
     def __init__(self, workers: int | None = None) -> None:
         self.workers = workers or _cores()
-        self.notes: list[str] = []
         self._pool = ThreadPoolExecutor(self.workers)
         import cv2
 
         # One job per core keeps the cores busy; threads inside a job would only compete with each other.
         self._before = cv2.getNumThreads()
         cv2.setNumThreads(1)
-
-    def opens(self, session: str, sha256: str) -> bool:
-        """Never: threads share what this process reads."""
-        return False
 
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
         """See `Scheduler.run`."""
@@ -112,8 +103,6 @@ class Dask(AbstractContextManager["Dask"]):
             self._client: Any = untyped(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
             raise ClusterError(f"--scheduler {address}: no Dask scheduler there ({one_line(error)})") from None
-        self.notes: list[str] = []
-        """Remarks for the user on how the work was done."""
         try:
             self.workers = self._check(address)
         except BaseException:
@@ -130,19 +119,6 @@ class Dask(AbstractContextManager["Dask"]):
                 words = one_line(answer) if isinstance(answer, BaseException) else f"has {answer}"
                 raise ClusterError(f"--scheduler {address}: worker {worker} {words}; {software()} is needed there")
         return sum(threads.values())
-
-    def opens(self, session: str, sha256: str) -> bool:
-        """Whether every worker has the recording there; if not, photographs are sent and `notes` says why."""
-        from brushloop.calibrate.validate.sources import opened
-
-        found: dict[str, Any] = self._client.run(opened, session, sha256, on_error="return")
-        for worker, answer in found.items():
-            if isinstance(answer, BaseException):
-                self.notes.append(
-                    f"photographs were sent to the workers: {worker} cannot read {session} ({one_line(answer)})"
-                )
-                return False
-        return True
 
     def run(self, function: Callable[[J], R], jobs: Iterator[tuple[str, J]]) -> Iterator[tuple[str, R]]:
         """See `Scheduler.run`."""

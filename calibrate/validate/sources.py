@@ -14,7 +14,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -66,8 +65,6 @@ class LoadedSession:
     fit: BrushFit | None
     kinds: frozenset[str]
     count: int
-    place: str
-    """Path or URL by which workers may open the recording."""
     reached_mm: dict[str, float | None]
     """Depth that the arm reached, by name of stroke; None where the recording does not say it."""
 
@@ -104,7 +101,6 @@ def open_session(place: str, work: Path, calibration: Path | None, fit: Path | N
         load_artefact(found, BrushFit) if found is not None else None,
         kinds,
         count,
-        place if URL.match(place) else str(recording.path.resolve()),
         reached_mm,
     )
 
@@ -171,18 +167,6 @@ def _limits(scheme: str) -> dict[str, Any]:
 def local_path(place: str) -> Path:
     """The path, or that of a copy of the recording at a URL in this machine's temporary folder."""
     return fetched(place, Path(tempfile.gettempdir()) / "brushloop-recordings") if URL.match(place) else Path(place)
-
-
-@lru_cache(maxsize=8)
-def opened(session: str, sha256: str) -> Recording:
-    """The recording as a file of this machine, checked once; a URL is copied. Raises what reading it raises."""
-    if URL.match(session):
-        address = session.partition("#")[0]
-        return Recording(fetched(f"{address}#sha256={sha256}", Path(tempfile.gettempdir()) / "brushloop-recordings"))
-    recording = Recording(Path(session))
-    if recording.sha256 != sha256:
-        raise SessionDamaged(recording.path, "is another recording there: its SHA-256 differs")
-    return recording
 
 
 def _backend_errors() -> tuple[type[Exception], ...]:

@@ -147,48 +147,6 @@ def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     assert "(work of tomorrow) is needed there" in said
 
 
-def test_workers_open_the_recording_themselves_or_are_sent_the_photographs(
-    cluster: Cluster, session: Path, tmp_path: Path
-) -> None:
-    program = f"""
-from dataclasses import replace
-from pathlib import Path
-from brushloop.calibrate.compare.field import Field
-from brushloop.calibrate.validate import jobs
-from brushloop.calibrate.validate.pool import Dask, Threads
-from brushloop.calibrate.validate.sources import open_session, opened
-from brushloop.calibrate.validate.store import Store
-
-def prepared(scheduler, session, name):
-    ran = []
-    run = scheduler.run
-    scheduler.run = lambda function, jobs: (ran.append(function.__name__), run(function, jobs))[1]
-    with Store(Path({str(tmp_path)!r}) / name) as store:
-        presses = list(jobs.prepared(session, Field(), scheduler, store, lambda *_: None))
-        base = jobs.key_of(session, Field())
-        return ran, [(press, store.get(f"{{base}}:{{k}}")["pixels"]) for k, press in enumerate(presses)]
-
-there = open_session({str(session)!r}, Path({str(tmp_path)!r}), None, None)
-with Threads(1) as pool:
-    expected = prepared(pool, there, "here")[1]
-with Dask({cluster.address!r}) as pool:
-    ran, found = prepared(pool, there, "read")
-    print(ran, found == expected, pool.notes)
-    print({{info.currsize for info in pool._client.run(opened.cache_info).values()}})
-with Dask({cluster.address!r}) as pool:
-    ran, found = prepared(pool, replace(there, place="/nowhere/a.mcap"), "sent")
-    print(ran, found == expected, len(pool.notes))
-    print(pool.notes[0])
-"""
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
-    read, opened, sent, note = ran.stdout.splitlines() or [ran.stderr]
-    assert read == "['read_job'] True []"
-    assert opened == "{1}"
-    assert sent == "['prepare_job'] True 1"
-    assert "photographs were sent to the workers" in note
-    assert "/nowhere/a.mcap: no such session" in note
-
-
 def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, session: Path) -> None:
     program = f"""
 import os, signal
