@@ -104,25 +104,22 @@ class McapFile:
         """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
         return str(self.notes.get(HEADER_NOTE, {}).get("session_id", ""))
 
-    def may_hold(self, part: Part, *topics: str) -> bool:
-        """Whether a chunk holds messages on any of these topics; True also where its index does not say."""
-        numbers = part.counts or (part.index.message_index_offsets if part.index is not None else {})
-        return not numbers or any(n in self.channels and self.channels[n][1].topic in topics for n in numbers)
-
-    def messages(self, topics: Iterable[str] | None = None, parts: Iterable[Part] | None = None) -> Iterator[Record]:
+    def messages(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
         """Messages in the order in which they were written, all or those on some topics, every CRC checked.
 
         They are not sorted by log time: a stroke would precede its still if the host's clock was set back between them.
-        Without `parts`, all chunks are read but those that `check` found damaged. Raises `SessionDamaged`.
+        Chunks that `check` found damaged are left out. Raises `SessionDamaged`.
         """
         wanted = None if topics is None else frozenset(topics)
+        numbers = {n for n, (_, channel) in self.channels.items() if wanted is None or channel.topic in wanted}
         with self._reading() as file:
-            for part in self.parts if parts is None else parts:
-                if not part.sound or (wanted is not None and not self.may_hold(part, *wanted)):
+            for part in self.parts:
+                inside = part.counts or (part.index.message_index_offsets if part.index is not None else None)
+                if not part.sound or (inside and numbers.isdisjoint(inside)):
                     continue
                 for message in _messages(_chunk(file, part.offset)):
                     schema, channel = self.channels[message.channel_id]
-                    if wanted is None or channel.topic in wanted:
+                    if message.channel_id in numbers:
                         yield schema, channel, message
 
     def packed_chunks(self) -> Iterator[tuple[bytes, ChunkIndex, Counter[int]]]:
