@@ -66,7 +66,7 @@ def run(*arguments: object) -> str:
 def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A page of every command but `train` (tests/model/train/test_commands.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
-    session = photographed(folder / "2026-<u>", SPEC, [board()], sheet_mm=(100.0, 80.0))
+    session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
         "calibrate": run("calibrate", session),
         "camera": _lens(folder),
@@ -183,7 +183,7 @@ def test_the_page_of_a_calibration_draws_every_corner_with_its_residual(pages: d
     assert page.count('class="arrow"') == 48
     assert 'class="sheet-edge"' in page
     assert "simulated brush, ink and camera" in page
-    assert "2026-&lt;u&gt;" in page
+    assert "2026-03-02-board-01" in page
 
 
 def test_the_page_of_a_fit_draws_both_outlines_over_the_ink_of_each_cell(pages: dict[str, str]) -> None:
