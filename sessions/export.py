@@ -209,7 +209,7 @@ class Export:
                 if on == Topic.STEP:
                     event = StepEvent.model_validate_json(message.data)
                     pressed = event.phase == "begin" and event.kind != "capture"
-                    current, frame = numbers.get(str(event.params.get("stroke_id")), -1) if pressed else -1, 0
+                    current, frame = numbers.get(event.stroke_id or "", -1) if pressed else -1, 0
                 elif current >= 0:
                     when.append((current, frame, message.publish_time, message.log_time, message.sequence))
                     values.append(series.values(message.data))

@@ -80,7 +80,8 @@ class StepEvent(Event):
     index: int
     attempt: int
     phase: Literal["begin", "end"]
-    params: dict[str, float | int | str | bool | None]
+    stroke_id: str | None = None
+    """The stroke that the step presses, draws or photographs."""
 
 
 class Stroke(Event):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from brushloop.collect.planning.walk import walk
-from brushloop.collect.protocols.steps import StepKind
+from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.quality.measure import Mark
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_quality import QualityConfig
@@ -72,7 +72,7 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
 
 def test_a_protocol_kind_is_one_class() -> None:
     stairs = recipe("protocol_kind").StairsConfig(kind="stairs", from_mm=10.0, to_mm=14.0, count=3, repeats=2)
-    assert [stroke.depth_mm for stroke in stairs.planned()] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
+    assert [stroke.condition.depth_mm for stroke in stairs.planned()] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
     steps = [
         walked.step
         for walked in walk(
@@ -86,8 +86,8 @@ def test_a_protocol_kind_is_one_class() -> None:
             stairs,
         )
     ]
-    presses = [step for step in steps if step.kind == StepKind.PRESS]
-    assert [step.params["depth_mm"] for step in presses] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
+    presses = [step.press for step in steps if isinstance(step, PressStep)]
+    assert [press.condition.depth_mm for press in presses] == [10.0, 12.0, 14.0, 10.0, 12.0, 14.0]
     assert len({step.key for step in steps}) == len(steps)
 
 

@@ -25,10 +25,11 @@ from brushloop.collect.protocols.steps import (
     Step,
     TouchStep,
     ZeroTouchStep,
+    press_of,
 )
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.errors import ArmMoved
-from brushloop.sessions.events import DipResult, Press, StepKind, StepResult
+from brushloop.sessions.events import DipResult, StepKind, StepResult
 from brushloop.sessions.records import StepEvent
 
 HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
@@ -64,12 +65,13 @@ class Performer:
         patch = free if marks else None
         more = partners(run.sheet, patch, used) if patch is not None and isinstance(step, SelfCheckStep) else ()
         index = None if patch is None else patch.index
+        planned = press_of(step)
         attempt = store.begin(
             step.key,
             step.kind,
             patch=index,
             more_patches=tuple(other.index for other in more),
-            press=_press_of(step),
+            press=planned,
         )
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
@@ -81,7 +83,7 @@ class Performer:
             index=step.index,
             attempt=attempt.begin.attempt,
             phase="begin",
-            params=step.params,
+            stroke_id=None if planned is None else planned.stroke_id,
         )
         try:
             recorder.step(event)
@@ -137,10 +139,6 @@ class Performer:
                 return await retake.review(context.run)
 
 
-def _press_of(step: Step) -> Press | None:
-    return step.press if isinstance(step, PressStep | DrawStep | CaptureStep) else None
-
-
 def _in_words(step: Step) -> str:
-    made = _press_of(step)
+    made = press_of(step)
     return step.kind.replace("_", " ") if made is None else f"{step.kind} {made.stroke_id}"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from brushloop.collect.errors import ConfigError, StepError
@@ -15,7 +16,7 @@ from brushloop.collect.planning.walk import as_planned, moves_of, sheet_of, step
 from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.presses import GridConfig
-from brushloop.collect.protocols.steps import MARKING, CaptureStep, SelfCheckStep, Step
+from brushloop.collect.protocols.steps import MARKING, CaptureStep, DrawStep, PressStep, SelfCheckStep, Step, press_of
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
@@ -49,15 +50,26 @@ def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step
     try:
         step = next(generator)
         while True:
-            params = {} if isinstance(step, CaptureStep) else step.params
-            names = sorted(set(params) - {"stroke_id", "again_of", "dwell_s"})
-            asked = (step.kind, *(params[name] for name in names))
+            asked = step.kind, _moved(step)
             if asked not in seen:
                 seen.add(asked)
                 yield step
             step = generator.send(as_planned(step, 0, 0))
     except StopIteration:
         return
+
+
+def _moved(step: Step) -> object:
+    """What the moves of a step depend on."""
+    match step:
+        case PressStep(press=press):
+            return press.condition
+        case DrawStep(drawn=drawn):
+            return repr(drawn)
+        case CaptureStep():
+            return None
+        case _:
+            return replace(step, index=0)
 
 
 def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
@@ -86,7 +98,8 @@ def _depths(protocol: ProtocolConfig) -> Iterator[tuple[float, float, str]]:
                 yield from ((point[2], point[3], f"{figure.name}: ") for point in stroke.points)
     else:
         for stroke in protocol.planned():
-            yield stroke.depth_mm, stroke.tilt_deg, "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
+            name = "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
+            yield stroke.condition.depth_mm, stroke.condition.tilt_deg, name
 
 
 def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
@@ -176,7 +189,7 @@ def all_poses(
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     for step in distinct_steps(rig, protocol):
         for patch, more in _places(step, patches):
-            name = str(step.params.get("stroke_id", step.kind))
+            name = str(step.kind) if (press := press_of(step)) is None else press.stroke_id
             where = f"{name} on patch {patch.index}" if patch is not None else name
             moves = moves_of(rig, plane, step, patch, more, dips=dips)
             yield from ((pose, speed, where) for pose, speed in moves.poses)

@@ -22,6 +22,7 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.records import Condition
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,15 +183,15 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
             for figure in protocol.figures
         ]
     anchor_x, anchor_y = patch.anchor_mm[0] - patch.x_mm, patch.anchor_mm[1] - patch.y_mm
-    found: dict[tuple[float, float], tuple[float, str]] = {}
+    found: dict[Condition, tuple[float, str]] = {}
     for stroke in protocol.planned():
-        reach = reach_of(config.brush, stroke.depth_mm, stroke.tilt_deg)
+        reach = reach_of(config.brush, stroke.condition.depth_mm, stroke.condition.tilt_deg)
         beyond_mm = max(
             reach.behind_mm - anchor_x,
             anchor_x + reach.ahead_mm - patch.size_x_mm,
             reach.side_mm - min(anchor_y, patch.size_y_mm - anchor_y),
         )
-        found.setdefault((stroke.depth_mm, stroke.tilt_deg), (beyond_mm, stroke.stroke_id))
+        found.setdefault(stroke.condition, (beyond_mm, stroke.stroke_id))
     return list(found.values())
 
 

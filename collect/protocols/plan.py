@@ -42,10 +42,8 @@ class Planned:
     """One press, or one figure of several strokes."""
 
     stroke_id: str
-    depth_mm: float
-    """Depth of the press; of a figure, its greatest depth."""
-    tilt_deg: float
-    """Tilt of the press; of a figure, at its deepest point."""
+    condition: Condition
+    """What is commanded; of a figure, at its deepest point."""
     repeat: int
     """Round, from 1."""
     index: int = 0
@@ -56,11 +54,6 @@ class Planned:
     """The figure; None for a press."""
     again_of: str | None = None
     """The stroke of another session that this one repeats."""
-
-    @property
-    def condition(self) -> Condition:
-        """What is commanded."""
-        return Condition(depth_mm=self.depth_mm, tilt_deg=self.tilt_deg)
 
     def press(self, take: int = 1) -> Press:
         """The press of one take."""
@@ -112,7 +105,7 @@ def numbered(rounds: list[list[Planned]], seed: int | None, layout: Layout | Non
             strokes[k] = replace(stroke, index=index)
             index += 1
     if seed is not None and layout is not None and layout.capacity > 0:
-        conditions = [[(s.depth_mm, s.tilt_deg) for s in strokes] for strokes in rounds]
+        conditions = [[stroke.condition for stroke in strokes] for strokes in rounds]
         orders = balanced(conditions, layout, seed)
         rounds = [[strokes[i] for i in order] for strokes, order in zip(rounds, orders, strict=True)]
     return [stroke for strokes in rounds for stroke in strokes]

@@ -26,6 +26,7 @@ from brushloop.collect.protocols.plan import Planned, numbered, shuffled
 from brushloop.collect.protocols.steps import TiltDeg
 from brushloop.collect.rig.config_file import Config
 from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.records import Condition
 
 
 class GridConfig(ProtocolBase):
@@ -66,7 +67,10 @@ class GridConfig(ProtocolBase):
         for repeat in range(1, self.repeats + 1):
             rng.shuffle(cells)
             rounds.append(
-                [Planned(f"H{h:g}-a{a:g}-r{repeat:02d}", h, a, repeat, dwell_s=self.dwell_s) for h, a in cells]
+                [
+                    Planned(f"H{h:g}-a{a:g}-r{repeat:02d}", Condition(h, a), repeat, dwell_s=self.dwell_s)
+                    for h, a in cells
+                ]
             )
         return numbered(rounds, self.seed, layout)
 
@@ -95,7 +99,7 @@ class FewStrokesConfig(ProtocolBase):
         """The presses in the order of the design, which does not depend on the sheet."""
         order = spread_out(self.depths_mm, self.tilts_deg)
         return [
-            Planned(f"H{h:g}-a{a:g}-r{repeat + 1:02d}", h, a, repeat + 1, number, dwell_s=self.dwell_s)
+            Planned(f"H{h:g}-a{a:g}-r{repeat + 1:02d}", Condition(h, a), repeat + 1, number, dwell_s=self.dwell_s)
             for number in range(self.strokes)
             for repeat, (h, a) in [(number // len(order), order[number % len(order)])]
         ]
@@ -155,8 +159,7 @@ class ListConfig(ProtocolBase):
             [
                 Planned(
                     name,
-                    row.depth_mm,
-                    row.tilt_deg,
+                    Condition(row.depth_mm, row.tilt_deg),
                     repeat,
                     dwell_s=self.dwell_s if row.dwell_s is None else row.dwell_s,
                 )
@@ -217,8 +220,7 @@ class ReplayConfig(ProtocolBase):
             [
                 Planned(
                     f"{row.stroke_id}~{repeat}",
-                    row.depth_mm,
-                    row.tilt_deg,
+                    Condition(row.depth_mm, row.tilt_deg),
                     repeat,
                     dwell_s=self.dwell_s,
                     again_of=row.stroke_id,

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 from collections.abc import Generator
-from dataclasses import asdict, dataclass, fields
-from typing import Annotated, ClassVar
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, get_args
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from brushloop.sessions.events import Press, StepKind, StepResult
 
-Value = float | int | str | bool | None
+MEASURED = {"reached_mm", "dip_to_touch_s"}
+"""Fields of a press that are measured, and not asked for."""
 InCellMm = Annotated[float, Field(ge=0.0, le=500.0)]
 PathDepthMm = Annotated[float, Field(ge=-20.0, le=100.0)]
 TiltDeg = Annotated[float, Field(ge=0.0, le=30.0)]
@@ -47,15 +47,10 @@ class StepBase:
     index: int
 
     @property
-    def params(self) -> dict[str, Value]:
-        """The parameters by name, as the recording holds them: those that are set, each a plain value."""
-        return _plain({f.name: getattr(self, f.name) for f in fields(self) if f.name != "index"})
-
-    @property
     def key(self) -> str:
-        """Stable across processes: sha256 of kind, parameters and index."""
-        text = json.dumps([self.kind, self.params, self.index], sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        """Stable across processes: sha256 of kind, parameters and index, without what was measured."""
+        text = _ADAPTERS[self.kind].dump_json(self, exclude={"press": MEASURED}, exclude_defaults=True)
+        return hashlib.sha256(f"{self.kind} ".encode() + text).hexdigest()
 
     @property
     def run_scoped(self) -> bool:
@@ -146,6 +141,7 @@ class ReviewStep(StepBase):
 
 
 Step = ZeroTouchStep | BoardStep | TouchStep | SelfCheckStep | DipStep | PressStep | DrawStep | CaptureStep | ReviewStep
+_ADAPTERS = {step.kind: TypeAdapter[Any](step) for step in get_args(Step)}
 MARKING = frozenset({StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK})
 """Steps that leave ink on a paper patch of their own."""
 
@@ -168,26 +164,6 @@ def with_self_check(protocol: Protocol) -> Protocol:
             step = protocol.send((yield step))
 
 
-def strokes_text(strokes: list[list[TrajectoryPoint]]) -> str:
-    """Trajectories as text for the recording: JSON, [stroke][point][x, y, depth, tilt, heading]."""
-    return json.dumps(strokes, separators=(",", ":"))
-
-
-def _plain(values: dict[str, object]) -> dict[str, Value]:
-    plain: dict[str, Value] = {}
-    for name, value in values.items():
-        match value:
-            case Press():
-                # What was measured does not belong to what was asked for.
-                plain |= {"stroke_id": value.stroke_id, **asdict(value.condition)}
-                plain |= value.model_dump(include={"take", "sheet", "patch"}, exclude_defaults=True)
-            case Drawn():
-                plain |= {"strokes": strokes_text(value.strokes)}
-                plain |= {"cell_w_mm": value.cell_mm[0], "cell_h_mm": value.cell_mm[1]}
-                plain |= {name: getattr(value, name) for name in ("speed_mm_s", "blend_mm", "dip_every_strokes")}
-            case float() | int() | str():
-                if value is not False and (name, value) != ("take", 1):
-                    plain[name] = value
-            case _:
-                pass
-    return plain
+def press_of(step: Step) -> Press | None:
+    """The press that a step makes or photographs; None for the other kinds."""
+    return step.press if isinstance(step, PressStep | DrawStep | CaptureStep) else None

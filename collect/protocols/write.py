@@ -27,6 +27,7 @@ from brushloop.collect.protocols.steps import (
 )
 from brushloop.collect.rig.config_file import Config
 from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.records import Condition
 
 MAX_POINTS = 10_000
 """Most points in all trajectories of one protocol together."""
@@ -148,7 +149,7 @@ class WriteConfig(ProtocolBase):
                     self.dip_every_strokes,
                 )
                 name = f"{figure.name}-r{repeat:02d}"
-                strokes.append(Planned(name, depth_mm, tilt_deg, repeat, index, drawn=drawn))
+                strokes.append(Planned(name, Condition(depth_mm, tilt_deg), repeat, index, drawn=drawn))
                 index += 1
             rounds.append(strokes)
         return [stroke for strokes in shuffled(rounds, self.seed) for stroke in strokes]

@@ -82,7 +82,7 @@ def _photographed(
 
 def _take(store: SessionStore, number: int, messages: list[Outgoing], result: StepResult) -> None:
     attempt = store.begin(f"{result.kind} {number}", result.kind)
-    event: dict[str, Any] = {"key": "k", "kind": result.kind, "index": number, "attempt": 1, "params": {}}
+    event: dict[str, Any] = {"key": "k", "kind": result.kind, "index": number, "attempt": 1}
     begin, end = (
         Outgoing(Topic.STEP, message.log_ns, message.log_ns, number, StepEvent(**event, phase=phase))
         for message, phase in ((messages[0], "begin"), (messages[-1], "end"))

@@ -65,7 +65,7 @@ class Make:
 
     def step(self, number: int, kind: str, phase: str) -> Outgoing:
         t_ns = self.t0_ns + number * 1000 + (2 if phase == "end" else -2)
-        values = {"key": "k", "kind": kind, "index": number, "attempt": 1, "phase": phase, "params": {"dwell_s": 0.5}}
+        values = {"key": "k", "kind": kind, "index": number, "attempt": 1, "phase": phase}
         return Outgoing(Topic.STEP, t_ns, t_ns, number, StepEvent.model_validate(values))
 
     def record(self, path: Path, *messages: Outgoing) -> Path:

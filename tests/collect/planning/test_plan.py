@@ -15,7 +15,7 @@ from brushloop.collect.planning.limit_check import all_poses, check_poses, check
 from brushloop.collect.planning.summary import Plan, make_plan
 from brushloop.collect.planning.walk import moves_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.steps import MARKING, DrawStep, StepKind
+from brushloop.collect.protocols.steps import MARKING, DrawStep, PressStep, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane
@@ -191,9 +191,9 @@ def test_the_walk_goes_where_the_steps_say(tmp_path: Path) -> None:
         if before.step.kind in MARKING:
             assert after.step.kind == StepKind.CAPTURE
             assert (after.patch, after.sheet) == (before.patch, before.sheet)
-    press = next(w for w in walked if w.step.kind == StepKind.PRESS)
-    deepest = min(pose.z_mm for pose, _ in press.moves.poses)
-    assert deepest == pytest.approx(config.paper.touch_z_mm - float(press.step.params["depth_mm"] or 0))
+    step, moves = next((w.step, w.moves) for w in walked if isinstance(w.step, PressStep))
+    deepest = min(pose.z_mm for pose, _ in moves.poses)
+    assert deepest == pytest.approx(config.paper.touch_z_mm - step.press.condition.depth_mm)
 
 
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) -> None:

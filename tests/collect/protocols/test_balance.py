@@ -9,19 +9,20 @@ import pytest
 from brushloop.collect.protocols.plan import Planned
 from brushloop.collect.protocols.presses import GridConfig
 from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.records import Condition
 
 PAPER = {"depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
 
 
-def thirds(plan: list[Planned], layout: Layout) -> dict[tuple[float, float], list[float]]:
+def thirds(plan: list[Planned], layout: Layout) -> dict[Condition, list[float]]:
     """Of each (H, alpha): how many of its strokes lie in each third of rows, then of columns, less the fair number."""
-    found: dict[tuple[float, float], list[float]] = defaultdict(lambda: [0.0] * 6)
+    found: dict[Condition, list[float]] = defaultdict(lambda: [0.0] * 6)
     fair = [0.0] * 6
-    conditions = len({(s.depth_mm, s.tilt_deg) for s in plan})
+    conditions = len({s.condition for s in plan})
     for place, stroke in enumerate(plan):
         row, column = divmod(place % layout.capacity, layout.columns)
         for band in (3 * row // layout.rows, 3 + 3 * column // layout.columns):
-            found[stroke.depth_mm, stroke.tilt_deg][band] += 1
+            found[stroke.condition][band] += 1
             fair[band] += 1 / conditions
     return {key: [count - want for count, want in zip(counts, fair, strict=True)] for key, counts in found.items()}
 
@@ -40,7 +41,7 @@ def test_each_condition_is_within_one_or_two_strokes_of_its_share_of_every_third
 def test_rounds_stay_whole() -> None:
     plan = GridConfig(kind="grid", **PAPER, repeats=4).planned(Layout(6, 7))
     for first in range(0, len(plan), 15):
-        assert len({(s.depth_mm, s.tilt_deg) for s in plan[first : first + 15]}) == 15
+        assert len({s.condition for s in plan[first : first + 15]}) == 15
 
 
 def test_another_seed_is_another_order() -> None:

@@ -9,7 +9,9 @@ GRID = {"kind": "few-strokes", "depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "til
 
 
 def pressed(**changed: object) -> list[tuple[float, float]]:
-    return [(p.depth_mm, p.tilt_deg) for p in FewStrokesConfig.model_validate(GRID | changed).planned()]
+    return [
+        (p.condition.depth_mm, p.condition.tilt_deg) for p in FewStrokesConfig.model_validate(GRID | changed).planned()
+    ]
 
 
 def test_the_first_four_presses_are_the_corners_of_the_grid() -> None:

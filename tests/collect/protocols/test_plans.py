@@ -15,7 +15,16 @@ from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
-from brushloop.collect.protocols.steps import MARKING, Step, StepKind
+from brushloop.collect.protocols.steps import (
+    MARKING,
+    CaptureStep,
+    DrawStep,
+    PressStep,
+    Step,
+    StepKind,
+    TouchStep,
+    press_of,
+)
 from brushloop.collect.protocols.write import DrawnStroke, Figure, WriteConfig
 from brushloop.collect.rig.paper import Layout
 
@@ -91,8 +100,8 @@ def test_every_planned_stroke_is_dipped_for_marked_and_captured_exactly_once(
     plan, walked = config.planned(layout), run(config, layout)
     ids = [stroke.stroke_id for stroke in plan]
     assert len(set(ids)) == len(ids)
-    assert [str(s.params["stroke_id"]) for s in walked if s.kind in MARKING] == ids
-    assert [str(s.params["stroke_id"]) for s in walked if s.kind == StepKind.CAPTURE] == ids
+    assert [press.stroke_id for s in walked if s.kind in MARKING and (press := press_of(s))] == ids
+    assert [s.press.stroke_id for s in walked if isinstance(s, CaptureStep)] == ids
     assert Counter(s.kind for s in walked)[StepKind.DIP] == len(ids)
     assert sorted(stroke.index for stroke in plan) == list(range(len(plan)))
     assert len({step.key for step in walked}) == len(walked)
@@ -148,21 +157,21 @@ def test_a_replayed_stroke_is_found_by_the_one_that_it_repeats() -> None:
     assert isinstance(config, ReplayConfig)
     assert (config.of, config.ignored_columns) == ("2026-11-21-grid-01", ("depth_sd_mm",))
     for step in run(config):
-        if step.kind in (StepKind.PRESS, StepKind.CAPTURE):
-            assert str(step.params["stroke_id"]).rpartition("~")[0] == step.params["again_of"]
+        if isinstance(step, PressStep | CaptureStep):
+            assert step.press.stroke_id.rpartition("~")[0] == step.again_of
     assert {s.again_of for s in config.planned()} == {"H11-a0-r01", "H13-a5-r01", "H20-a10-r01"}
 
 
 def test_a_figure_is_one_step_that_holds_its_trajectories() -> None:
     config = load_protocol(EXAMPLES / "protocol-write.toml")
     assert isinstance(config, WriteConfig)
-    drawn = [step for step in run(config) if step.kind == StepKind.DRAW]
-    assert [step.params["stroke_id"] for step in drawn] == ["shi-r01", "shi-r02"]
-    strokes = json.loads(str(drawn[0].params["strokes"]))
+    drawn = [step for step in run(config) if isinstance(step, DrawStep)]
+    assert [step.press.stroke_id for step in drawn] == ["shi-r01", "shi-r02"]
+    strokes = drawn[0].drawn.strokes
     assert [len(stroke) for stroke in strokes] == [6, 6]
     assert tuple(map(tuple, strokes[0])) == config.figures[0].strokes[0].points
     assert config.own_patch_mm == (80.0, 80.0)
-    assert config.planned()[0].depth_mm == 9.0
+    assert config.planned()[0].condition.depth_mm == 9.0
 
 
 def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
@@ -172,6 +181,6 @@ def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
     assert config.planned() == []
     assert Counter(step.kind for step in walked) == {StepKind.ZERO_TOUCH: 1, StepKind.TOUCH: 15, StepKind.BOARD: 6}
     assert len({step.key for step in walked}) == len(walked)
-    assert walked[1].params == {"x_mm": 20.0, "y_mm": 20.0}
+    assert walked[1] == TouchStep(walked[1].index, 20.0, 20.0)
     again = [step.kind for step in walked if step.run_scoped]
     assert again == [StepKind.ZERO_TOUCH, StepKind.BOARD], "each process touches the paper and looks at the board first"
