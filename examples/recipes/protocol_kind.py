@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from brushloop.collect.protocols.base import DeepMm, ProtocolBase, Repeats, check_count
 from brushloop.collect.protocols.plan import Planned
 from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.records import Condition
 
 
 class StairsConfig(ProtocolBase):
@@ -41,6 +42,6 @@ class StairsConfig(ProtocolBase):
         depths_mm = [self.from_mm + step_mm * number for number in range(self.count)]
         rounds = [(repeat, depth_mm) for repeat in range(1, self.repeats + 1) for depth_mm in depths_mm]
         return [
-            Planned(f"H{depth_mm:g}-r{repeat:02d}", depth_mm, 0.0, repeat, index)
+            Planned(f"H{depth_mm:g}-r{repeat:02d}", Condition(depth_mm, 0.0), repeat, index)
             for index, (repeat, depth_mm) in enumerate(rounds)
         ]
