@@ -111,8 +111,8 @@ class Make:
         """One step from begin to done, with its step events around the messages."""
         press = result.press if isinstance(result, PressResult | CaptureResult) else None
         attempt = store.begin(key, result.kind, patch=patch, press=press)
-        params = {} if press is None else {"stroke_id": press.stroke_id}
-        event = {"key": key, "kind": result.kind, "index": 0, "attempt": attempt.begin.attempt, "params": params}
+        stroke_id = None if press is None else press.stroke_id
+        event = {"key": key, "kind": result.kind, "index": 0, "attempt": attempt.begin.attempt, "stroke_id": stroke_id}
         times = (messages[0].log_ns - 1, messages[-1].log_ns + 1)
         begin, end = (
             Outgoing(Topic.STEP, t_ns, t_ns, attempt.serial, StepEvent.model_validate({**event, "phase": phase}))
