@@ -20,7 +20,6 @@ from brushloop.sessions.messages import (
     MAX_IMAGE_BYTES,
     PNG_START,
     CompressedImage,
-    decode_gray,
     image_message,
     upright,
 )
@@ -120,7 +119,7 @@ def _photograph(path: Path, t_ns: int) -> CompressedImage:
     """A photograph that can be decoded, as it is recorded. Raises `InputError`."""
     data = read_bounded(path, MAX_IMAGE_BYTES)
     try:
-        data = upright(data, decode_gray(data, str(path)))
+        data = upright(data, str(path))
     except SessionDamaged as error:
         raise InputError(path, error.what) from None
     return image_message(t_ns, data, "png" if data.startswith(PNG_START) else "jpeg")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
+import io
 import struct
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -18,22 +17,18 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
 
-from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.errors import SessionDamaged, in_one_line
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 MAX_IMAGE_BYTES = 256 * 1024 * 1024
-MAX_IMAGE_PIXELS = 200_000_000
+MAX_IMAGE_PIXELS = 80_000_000
+"""Fewer than the limit above which Pillow warns."""
 MAX_JPEG_SCANS = 100
-MAX_SCANNED_PIXELS = 4_000_000_000
-"""Limit of pixels times scans: each scan of a progressive JPEG covers the whole image, at about 1 ns a pixel."""
-PNG_START, PNG_CHUNKS = b"\x89PNG\r\n\x1a\n", (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
-EXIF = b"Exif\0\0"
-JPEG_START = b"\xff\xd8"
-_MARKER = re.compile(rb"\xff+([^\x00\x01\xd0-\xd8\xff])")
-"""Marker that begins a segment or ends the file; within a scan 0xFF is followed only by 0 or a restart marker."""
+"""Each scan of a progressive JPEG takes ten bytes or more of the file, and covers the whole image."""
+PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,95 +135,44 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
-    """Decode to (h, w) uint8 gray, turned as the orientation in a JPEG says, so that pixels count as viewers show them.
+    """Decode a PNG or JPEG to (h, w) uint8 gray, turned as its orientation says, so that pixels count as viewers show.
 
     Raises `SessionDamaged` for other formats, and for cut or absurdly large images.
     """
-    import cv2
+    import numpy as np
+    from PIL import Image, ImageOps
 
     if len(data) > MAX_IMAGE_BYTES:
         raise SessionDamaged(where, f"image of {len(data)} bytes exceeds {MAX_IMAGE_BYTES}")
-    # Checked before decoding: a PNG of one megabyte can unpack to a gigabyte of pixels.
-    data = _pixels_of_png(data) if data.startswith(PNG_START) else data
-    size = _png_size(data) or _jpeg_size(data)
-    if size is None:
-        raise SessionDamaged(where, "is not a complete PNG or JPEG image")
-    width, height, scans = size
-    if width * height > MAX_IMAGE_PIXELS:
-        raise SessionDamaged(where, f"image of {width} x {height} pixels exceeds {MAX_IMAGE_PIXELS}")
-    # An empty scan takes ten bytes, so a small file could take minutes to decode.
-    most = min(MAX_JPEG_SCANS, MAX_SCANNED_PIXELS // max(width * height, 1))
-    if scans > most:
-        raise SessionDamaged(where, f"JPEG of {width} x {height} pixels in more than {most} scans")
-    image = _decoded(data, cv2.IMREAD_GRAYSCALE, where)
-    if image is None or image.size == 0:
-        raise SessionDamaged(where, "cannot decode the image")
-    return image
+    if data.count(b"\xff\xda") > MAX_JPEG_SCANS and not data.startswith(PNG_START):
+        raise SessionDamaged(where, f"JPEG image in more than {MAX_JPEG_SCANS} scans")
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            image.verify()  # the CRCs of a PNG, before anything is unpacked
+        with Image.open(io.BytesIO(data)) as image:
+            if image.width * image.height > MAX_IMAGE_PIXELS:
+                what = f"image of {image.width} x {image.height} pixels exceeds {MAX_IMAGE_PIXELS}"
+                raise SessionDamaged(where, what)
+            image.draft("L", image.size)
+            upright = ImageOps.exif_transpose(image)
+            if upright.mode.startswith("I"):
+                return (np.asarray(upright) >> 8).astype(np.uint8)  # 16 bits
+            return np.asarray(upright.convert("L"))
+    except (Warning, Image.DecompressionBombError) as error:
+        raise SessionDamaged(where, f"image too large: {in_one_line(error)}") from None
+    except (OSError, SyntaxError, ValueError, struct.error):
+        raise SessionDamaged(where, "is not a complete PNG or JPEG image") from None
 
 
-def upright(data: bytes, image: NDArray[np.uint8]) -> bytes:
-    """The photograph itself, or `image`, what `decode_gray` made of it, as PNG, where a JPEG says that it is turned.
+def upright(data: bytes, where: str) -> bytes:
+    """The photograph itself, or, where its orientation says that it is turned, what is decoded of it, as PNG.
 
     Readers differ in whether they turn a picture: without the mark every reader sees the same pixels, and a point
-    measured in a viewer lies where it was measured.
+    measured in a viewer lies where it was measured. Raises `SessionDamaged`.
     """
-    import cv2
-    import numpy as np
+    from PIL import ExifTags, Image
 
-    if EXIF not in data or data.startswith(PNG_START):
-        return data
-    stored = _decoded(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION, "")
-    return data if stored is not None and np.array_equal(stored, image) else encode_png(image)
-
-
-def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | None:
-    import cv2
-    import numpy as np
-
-    try:
-        return cast("NDArray[np.uint8] | None", cv2.imdecode(np.frombuffer(data, np.uint8), flags))
-    except cv2.error as error:
-        if error.code == cv2.Error.StsNoMem:
-            raise MemoryError from None
-        raise SessionDamaged(where, f"cannot decode the image: {error.err}") from None
-
-
-def _pixels_of_png(data: bytes) -> bytes:
-    """Only the chunks that make the picture; empty where a chunk fails its CRC or the end is missing.
-
-    libpng prints to stderr what it finds in the others, such as the name of a colour profile.
-    """
-    pieces, at = [PNG_START], len(PNG_START)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        name, end = data[at + 4 : at + 8], at + 12 + length
-        if data[end - 4 : end] != zlib.crc32(memoryview(data)[at + 4 : end - 4]).to_bytes(4, "big"):
-            return b""
-        if name in PNG_CHUNKS:
-            pieces.append(data[at:end])
-        if name == PNG_CHUNKS[-1]:
-            return b"".join(pieces)
-        at = end
-    return b""
-
-
-def _png_size(data: bytes) -> tuple[int, int, int] | None:
-    """Width, height and 1 scan, from the header."""
-    return (*struct.unpack_from(">II", data, 16), 1) if data[12:16] == PNG_CHUNKS[0] and len(data) >= 33 else None
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int, int] | None:
-    """Width, height and number of scans, counted up to the limit; None for a file without an end mark."""
-    size, scans, at = None, 0, len(JPEG_START)
-    while data.startswith(JPEG_START) and (found := _MARKER.search(data, at)) and scans <= MAX_JPEG_SCANS:
-        marker, at = found[1][0], found.end()
-        if marker == 0xD9:  # end of the image; a thumbnail's lies inside a segment
-            break
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and len(data) >= at + 7:
-            size = struct.unpack_from(">HH", data, at + 3)
-        scans += marker == 0xDA
-        at += int.from_bytes(data[at : at + 2], "big")
-    else:
-        # cv2 would pad the rest of a cut photograph with gray.
-        size = size if scans > MAX_JPEG_SCANS else None
-    return (size[1], size[0], scans) if size is not None else None
+    image = decode_gray(data, where)
+    with Image.open(io.BytesIO(data)) as stored:
+        turned = stored.getexif().get(ExifTags.Base.Orientation, 1) != 1
+    return encode_png(image) if turned else data

@@ -6,6 +6,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from PIL import ImageFile
 
 from brushloop.sessions import messages
 from brushloop.sessions.errors import SessionDamaged
@@ -39,41 +40,27 @@ def progressive(scans):
     return gray[:-2] + last * (scans - have) + gray[-2:]
 
 
-def comment(data, text):
-    """The same JPEG with a comment before its first scan."""
-    at = data.index(b"\xff\xda")
-    return data[:at] + b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text + data[at:]
-
-
 @pytest.mark.parametrize(
     ("bomb", "message"),
     [
-        (png_stating(30_000, 30_000), "image of 30000 x 30000 pixels exceeds 200000000"),
-        (jpeg_stating(30_000, 30_000), "image of 30000 x 30000 pixels exceeds 200000000"),
-        (comment(progressive(60_000), b"names an end \xff\xd9"), "JPEG of 64 x 64 pixels in more than 100 scans"),
+        (png_stating(30_000, 30_000), "900000000 pixels"),
+        (jpeg_stating(30_000, 30_000), "900000000 pixels"),
+        (progressive(60_000), "JPEG image in more than 100 scans"),
     ],
     ids=["png", "jpeg", "scans"],
 )
 def test_a_bomb_is_refused_by_its_header(bomb, message, monkeypatch):
-    monkeypatch.setattr(cv2, "imdecode", None)  # nothing is decoded
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)  # nothing is decoded
     with pytest.raises(SessionDamaged, match=message):
         decode_gray(bomb, "a still")
 
 
-@pytest.mark.parametrize(
-    ("limit", "most", "data"),
-    [
-        ("MAX_IMAGE_BYTES", 10, jpeg()),
-        ("MAX_IMAGE_PIXELS", 100, jpeg()),
-        ("MAX_SCANNED_PIXELS", 81_920, progressive(21)),
-    ],
-    ids=["bytes", "pixels", "pixels times scans"],
-)
-def test_each_limit_holds(monkeypatch, limit, most, data):
-    decode_gray(data, "a still")
+@pytest.mark.parametrize(("limit", "most"), [("MAX_IMAGE_BYTES", 10), ("MAX_IMAGE_PIXELS", 100)])
+def test_each_limit_holds(monkeypatch, limit, most):
+    decode_gray(jpeg(), "a still")
     monkeypatch.setattr(messages, limit, most)
-    with pytest.raises(SessionDamaged, match=r"exceeds|more than 20 scans"):
-        decode_gray(data, "a still")
+    with pytest.raises(SessionDamaged, match="exceeds"):
+        decode_gray(jpeg(), "a still")
 
 
 @pytest.mark.parametrize(
@@ -98,9 +85,13 @@ def test_a_png_cut_at_any_byte_or_with_a_wrong_bit_is_refused_by_us_and_not_by_a
 
 
 @pytest.mark.parametrize(
-    "data",
-    [jpeg(), comment(progressive(12), b"\xff\xda" * 200) + b"\xff\xda film " * 2000],
-    ids=["plain", "a film behind it, and a comment that looks like scans"],
+    ("data", "gray"),
+    [
+        (progressive(12) + b"\xff\xd9 film ", 200),
+        (cv2.imencode(".png", np.full((64, 64), 51_234, np.uint16))[1].tobytes(), 51_234 >> 8),
+        (cv2.imencode(".png", np.full((64, 64, 4), (0, 0, 255, 9), np.uint8))[1].tobytes(), 76),
+    ],
+    ids=["a film behind a JPEG", "16 bits", "red, almost transparent"],
 )
-def test_a_jpeg_is_read(data):
-    assert decode_gray(data, "a still").shape == (64, 64)
+def test_an_image_is_read_as_gray(data, gray):
+    np.testing.assert_array_equal(decode_gray(data, "a still"), np.full((64, 64), gray))

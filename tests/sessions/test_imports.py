@@ -247,14 +247,6 @@ def test_a_disk_without_room_is_refused(rows, photos, refusal, monkeypatch, call
     assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"
 
 
-def test_every_photograph_is_decoded_once(rows, run, monkeypatch):
-    decoded = []
-    imdecode = cv2.imdecode
-    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(1) or imdecode(*args))
-    run()
-    assert len(decoded) == 2
-
-
 def test_the_command_imports(rows, photos, out):
     arguments = ["import", str(photos), "--csv", str(rows), "--out", str(out), "--kind", "press"]
     ran = CliRunner().invoke(app, arguments)
