@@ -43,6 +43,7 @@ from brushloop.drivers.samples import Frame, Stamp
 from brushloop.drivers.sim.camera.scene import STRIP_PX, read_strip
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.sessions.records import Condition
 
 EACH = 30
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.12, fps=20.0, stamp_strip=True)
@@ -109,7 +110,7 @@ async def photograph(path: Path, seed: int) -> None:
             try:
                 if procedures.photographer.delay is not None:
                     cell = cells.patch(rng.randrange(cells.capacity))
-                    down, up = press_moves(config, procedures.plane, cell, rng.uniform(11.0, 20.0), 0.0)
+                    down, up = press_moves(config, procedures.plane, cell, Condition(rng.uniform(11.0, 20.0), 0.0))
                     for move in [*down, *up]:
                         await procedures.go(move)
                 left_s = time.time()

@@ -118,6 +118,7 @@ def busy_engine(values: Values) -> Any:
 
     from brushloop.collect.engine.control import State
     from brushloop.collect.engine.snapshot import CellCount, Picture, Snapshot
+    from brushloop.sessions.records import Condition
 
     class Busy:
         def __init__(self) -> None:
@@ -140,7 +141,9 @@ def busy_engine(values: Values) -> Any:
                 step=f"press {int(now) % 30}",
                 strokes_done=13,
                 strokes_planned=150,
-                grid=tuple(CellCount(float(h), float(a), 3, 10) for h in (11, 13, 15, 17, 20) for a in (0, 5, 10)),
+                grid=tuple(
+                    CellCount(Condition(float(h), float(a)), 3, 10) for h in (11, 13, 15, 17, 20) for a in (0, 5, 10)
+                ),
                 voids=0,
                 elapsed_s=now - self._began,
                 eta_s=100.0,

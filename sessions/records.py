@@ -200,7 +200,7 @@ class Header(Event):
     """For imports: the folder's name and its table."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, order=True)
 class Condition:
     """Depth H below the paper, tilt alpha of the brush axis from the vertical, and heading of the mark."""
 

@@ -16,6 +16,8 @@ from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.collect.rig.paper import Patch
 from brushloop.model.fitted import FittedPress
+from brushloop.sessions.events import Press
+from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,9 +34,7 @@ FINE = 8
 class LastCapture:
     """One capture, as a screen shows it."""
 
-    stroke_id: str
-    depth_mm: float
-    tilt_deg: float
+    press: Press
     still: int
     kept: bool
     verdict: Verdict | None
@@ -59,17 +59,15 @@ def likeness(captured: NDArray[np.bool_] | None, predicted: NDArray[np.bool_] | 
     return csim(captured.astype(float), predicted.astype(float))
 
 
-def published_mark(depth_mm: float, tilt_deg: float, *, radius_mm: float, length_mm: float) -> NDArray[np.bool_] | None:
-    """Mark of CCD-BSM as published, (128, 128) on the default field; None if the model gives none. Takes a few ms."""
-    return mark_of(FittedPress(radius_mm, length_mm), depth_mm, tilt_deg)
+def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | None:
+    """Mark of a brush, (128, 128) on the default field; None if the model gives none there. Takes a few ms.
 
-
-def mark_of(press: FittedPress, depth_mm: float, tilt_deg: float) -> NDArray[np.bool_] | None:
-    """Mark of a brush, (128, 128) on the default field; None if the model gives none there. Takes a few ms."""
+    A brush of which only radius and length are given leaves the mark of CCD-BSM as published.
+    """
     left, top = FIELD.anchor_mm
     centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
     try:
-        upper, lower = press.edges_at(depth_mm, tilt_deg, np.asarray(centres - left, np.float64))
+        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres - left, np.float64))
     except ValueError:
         return None
     up_mm = (top - centres)[:, None]

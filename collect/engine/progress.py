@@ -188,8 +188,7 @@ class Progress:
             counts = Counter(p.condition for p in self._plan)
             grid = tuple(
                 CellCount(
-                    asked.depth_mm,
-                    asked.tilt_deg,
+                    asked,
                     tally.done[asked],
                     count,
                     tally.bad[asked],
@@ -197,7 +196,7 @@ class Progress:
                     current is not None and asked == current.condition,
                     following is not None and asked == following.condition,
                 )
-                for asked, count in sorted(counts.items(), key=lambda item: (item[0].depth_mm, item[0].tilt_deg))
+                for asked, count in sorted(counts.items())
             )
             return Snapshot(
                 session_id=self._session_id,

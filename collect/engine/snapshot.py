@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from brushloop.collect.protocols.steps import Step
 from brushloop.sessions.events import StepKind
+from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,10 +21,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CellCount:
-    """Strokes of one patch of the grid: one depth H at one tilt alpha."""
+    """Strokes of one condition."""
 
-    depth_mm: float
-    tilt_deg: float
+    condition: Condition
     done: int
     planned: int
     bad: int = 0
@@ -31,9 +31,9 @@ class CellCount:
     left_out: int = 0
     """Strokes that were given up."""
     now: bool = False
-    """The stroke in progress belongs to this patch."""
+    """The stroke in progress has this condition."""
     next: bool = False
-    """The next planned stroke belongs to this patch."""
+    """The next planned stroke has this condition."""
 
     @property
     def over(self) -> bool:

@@ -11,6 +11,7 @@ from brushloop.collect.rig.config import RigConfig, WashConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
 from brushloop.drivers.geometry import brush_pose, interpolate, lean
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.records import Condition
 
 CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
@@ -146,7 +147,7 @@ def wash_moves(config: RigConfig, wash: WashConfig) -> list[Move]:
 
 
 def press_moves(
-    config: RigConfig, plane: PaperPlane, patch: Patch, depth_mm: float, tilt_deg: float, dwell_s: float = 0.0
+    config: RigConfig, plane: PaperPlane, patch: Patch, condition: Condition, dwell_s: float = 0.0
 ) -> tuple[list[Move], list[Move]]:
     """Two lists: over the patch and tilt about the tip at clearance; down to touch height and by H, dwell, up again.
 
@@ -154,6 +155,7 @@ def press_moves(
     Tilting about the tip just above the paper gives the same pose at touch as tilting on it, without a smear.
     """
     motion, paper = config.motion, config.paper
+    depth_mm, tilt_deg = condition.depth_mm, condition.tilt_deg
     above = over(config, *patch.anchor_mm)
 
     def pose(above_mm: float, tilt: float) -> Pose:

@@ -25,6 +25,7 @@ from brushloop.collect.rig.paper import PaperPlane, Patch, to_paper
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.protocols import Robot
 from brushloop.drivers.samples import Frame, QueuedLine
+from brushloop.sessions.records import Condition
 
 DEPTH_TOLERANCE_MM = 0.1
 """How far the depth at the end of the dwell may be from the requested one."""
@@ -93,17 +94,17 @@ class Procedures:
             await self.go(move)
         self._dips += 1
 
-    async def press(self, patch: Patch, depth_mm: float, tilt_deg: float, dwell_s: float) -> float:
+    async def press(self, patch: Patch, condition: Condition, dwell_s: float) -> float:
         """Press once; returns the depth reached below the paper along its normal, in mm."""
-        before, pressing = press_moves(self._config, self.plane, patch, depth_mm, tilt_deg, dwell_s)
+        before, pressing = press_moves(self._config, self.plane, patch, condition, dwell_s)
         for move in before:
             await self.go(move)
         # From here on the arm lifts by itself, whatever happens to this program.
         lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in pressing]
         seen = await self._rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
         reached_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
-        if abs(reached_mm - depth_mm) > DEPTH_TOLERANCE_MM:
-            raise StepVoid(f"the depth was {reached_mm:.3f} mm, {depth_mm:g} mm was commanded")
+        if abs(reached_mm - condition.depth_mm) > DEPTH_TOLERANCE_MM:
+            raise StepVoid(f"the depth was {reached_mm:.3f} mm, {condition.depth_mm:g} mm was commanded")
         return reached_mm
 
     async def capture(self) -> Frame:

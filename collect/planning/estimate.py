@@ -12,6 +12,7 @@ from brushloop.collect.rig.config_devices import ModbusPumpConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.records import Condition
 
 SETTLE_S = 0.12
 """Time from the end of a ramp to the next command: the controller's lag in reporting rest, half a poll, the calls.
@@ -118,14 +119,14 @@ class Reach:
     side_mm: float
 
 
-def reach_of(brush: BrushConfig, depth_mm: float, tilt_deg: float) -> Reach:
+def reach_of(brush: BrushConfig, condition: Condition) -> Reach:
     """Estimate by the closed-form stroke model (CCD-BSM), Eq. 1-5, lambda = pi: good for a warning, not a measurement.
 
     theta = atan(R / L), O3A = H (tan a - tan(a - theta)), O4O3 = H / cos(a - theta) + O3A, O3C = H R / (L cos a).
     The mark lies from -O4O3 to O3A, pi O3C to each side.
     """
-    alpha, theta = math.radians(tilt_deg), math.atan2(brush.radius_mm, brush.length_mm)
-    depth_mm = max(depth_mm, 0.0)
+    alpha, theta = math.radians(condition.tilt_deg), math.atan2(brush.radius_mm, brush.length_mm)
+    depth_mm = max(condition.depth_mm, 0.0)
     o3a = depth_mm * (math.tan(alpha) - math.tan(alpha - theta))
     o4o3 = depth_mm / math.cos(alpha - theta) + o3a
     o3c = depth_mm * brush.radius_mm / (brush.length_mm * math.cos(alpha))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from brushloop.collect.planning.summary import PlacedStroke, Plan
+from brushloop.collect.planning.summary import Plan
 from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn
@@ -41,7 +40,7 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
     _place(axes[0], config, plan, sheet)
     drawn = {p.stroke_id: p.drawn for p in protocol.planned() if p.drawn is not None}
     for number, panel in enumerate(axes[1 : shown + 1], 1):
-        _sheet(panel, config, sheet, number, [p for p in plan.placed if p.sheet == number], plan, drawn)
+        _sheet(panel, config, sheet, number, plan, drawn)
     for panel in axes[shown + 1 :]:
         panel.set_axis_off()
     if plan.sheets > shown > 0:
@@ -79,30 +78,31 @@ def _sheet(
     config: RigConfig,
     sheet: Sheet,
     number: int,
-    placed: Sequence[PlacedStroke],
     plan: Plan,
     drawn: dict[str, Drawn],
 ) -> None:
     from matplotlib import colormaps
 
-    heights = [p.depth_mm for p in plan.placed]
-    low, high = min(heights), max(heights)
+    depths_mm = [press.condition.depth_mm for press in plan.placed]
+    low, high = min(depths_mm), max(depths_mm)
     axes.add_patch(_outline((0.0, 0.0, *config.paper.size_mm), "black"))
-    for stroke in placed:
-        patch = sheet.patch(stroke.patch)
-        share = 0.5 if high == low else (stroke.depth_mm - low) / (high - low)
+    placed = [(order, press) for order, press in enumerate(plan.placed, 1) if press.sheet == number - 1]
+    for order, press in placed:
+        assert press.patch is not None
+        patch, asked, figure = sheet.patch(press.patch), press.condition, drawn.get(press.stroke_id)
+        share = 0.5 if high == low else (asked.depth_mm - low) / (high - low)
         shade = colormaps["cividis"](0.25 + 0.75 * (1.0 - share))
-        axes.add_patch(_outline(patch.rect_mm, GREY, None if stroke.drawn else shade))
-        ink = "white" if not stroke.drawn and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
+        axes.add_patch(_outline(patch.rect_mm, GREY, shade if figure is None else None))
+        ink = "white" if figure is None and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
         points = max(4.0, min(0.34 * patch.size_y_mm, 0.17 * patch.size_x_mm) * 498.0 / config.paper.size_mm[0])
-        if stroke.drawn:
-            _figure(axes, patch.rect_mm, drawn[stroke.stroke_id])
-            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{stroke.order} {_plain(stroke.stroke_id)}", fontsize=8)
+        if figure is not None:
+            _figure(axes, patch.rect_mm, figure)
+            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{order} {_plain(press.stroke_id)}", fontsize=8)
         else:
             axes.text(
                 patch.x_mm + 0.36 * patch.size_x_mm,
                 patch.y_mm + 0.5 * patch.size_y_mm,
-                f"#{stroke.order}\nH{stroke.depth_mm:g} a{stroke.tilt_deg:g}",
+                f"#{order}\nH{asked.depth_mm:g} a{asked.tilt_deg:g}",
                 fontsize=min(points, 9.0),
                 color=ink,
                 ha="center",
@@ -117,11 +117,7 @@ def _sheet(
     axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
     axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
     axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)
-    note = (
-        ""
-        if placed and placed[0].drawn
-        else ": # order, H mm, a deg; darker is deeper; + where the tip meets the paper"
-    )
+    note = "" if drawn else ": # order, H mm, a deg; darker is deeper; + where the tip meets the paper"
     finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
+from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -22,21 +23,8 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.events import Press
 from brushloop.sessions.records import Condition
-
-
-@dataclass(frozen=True, slots=True)
-class PlacedStroke:
-    """One stroke and where it goes."""
-
-    order: int
-    """From 1."""
-    stroke_id: str
-    depth_mm: float
-    tilt_deg: float
-    sheet: int
-    patch: int
-    drawn: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +34,8 @@ class Plan:
     kind: str
     steps: dict[str, int]
     """Number of steps of each kind."""
-    placed: tuple[PlacedStroke, ...]
+    placed: tuple[Press, ...]
+    """Every press or figure in order, on its sheet and patch."""
     patches_per_sheet: int
     sheets: int
     sheet_changes: tuple[str, ...]
@@ -62,19 +51,20 @@ class Plan:
 
     def as_json(self) -> dict[str, Any]:
         """Return every field, to be written as JSON."""
-        return asdict(self) | {"seconds_omit": OMITTED}
+        return TypeAdapter(Plan).dump_python(self, mode="json", exclude_none=True) | {"seconds_omit": OMITTED}
 
 
 def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
     """Walk the protocol and add up strokes, sheets, ink and time. `check_protocol` must have passed."""
     sheet = sheet_of(config, protocol)
-    placed: list[PlacedStroke] = []
+    placed: list[Press] = []
     changes: list[str] = []
     kinds: Counter[str] = Counter()
     seconds: dict[str, float] = {}
     measured = config.touch.method != "taught" and config.touch.points_mm
     touches = list(measured or [config.paper.touch_point_mm])
     dips = poses = 0
+    sheets = 1
     here = park_moves(config)[-1].target
     for walked in walk(config, protocol):
         step = walked.step
@@ -89,26 +79,16 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         if isinstance(step, TouchStep):
             touches.append((step.x_mm, step.y_mm))
         if isinstance(step, PressStep | DrawStep) and walked.patch is not None:
-            stroke_id, condition = step.press.stroke_id, step.press.condition
-            if placed and walked.sheet != placed[-1].sheet:
-                changes.append(stroke_id)
-            placed.append(
-                PlacedStroke(
-                    len(placed) + 1,
-                    stroke_id,
-                    condition.depth_mm,
-                    condition.tilt_deg,
-                    walked.sheet,
-                    walked.patch.index,
-                    isinstance(step, DrawStep),
-                )
-            )
+            if placed and walked.sheet != sheets:
+                changes.append(step.press.stroke_id)
+            sheets = walked.sheet
+            placed.append(step.press.model_copy(update={"sheet": sheets - 1, "patch": walked.patch.index}))
     return Plan(
         kind=protocol.kind,
         steps=dict(kinds),
         placed=tuple(placed),
         patches_per_sheet=sheet.capacity,
-        sheets=placed[-1].sheet if placed else 1,
+        sheets=sheets,
         sheet_changes=tuple(changes),
         dips=dips,
         ink=ink_need(config, dips),
@@ -185,7 +165,7 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
     anchor_x, anchor_y = patch.anchor_mm[0] - patch.x_mm, patch.anchor_mm[1] - patch.y_mm
     found: dict[Condition, tuple[float, str]] = {}
     for stroke in protocol.planned():
-        reach = reach_of(config.brush, stroke.condition.depth_mm, stroke.condition.tilt_deg)
+        reach = reach_of(config.brush, stroke.condition)
         beyond_mm = max(
             reach.behind_mm - anchor_x,
             anchor_x + reach.ahead_mm - patch.size_x_mm,
@@ -198,7 +178,7 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
 def _figure_overhang(config: RigConfig, patch: Patch, point: tuple[float, float, float, float, float]) -> float:
     """How far the line, half its width to either side of a drawn point, reaches beyond the patch."""
     x_mm, y_mm, depth_mm, tilt_deg, _ = point
-    side_mm = reach_of(config.brush, depth_mm, tilt_deg).side_mm
+    side_mm = reach_of(config.brush, Condition(depth_mm, tilt_deg)).side_mm
     return side_mm - min(x_mm, y_mm, patch.size_x_mm - x_mm, patch.size_y_mm - y_mm)
 
 
@@ -236,11 +216,12 @@ def duration(seconds: float) -> str:
 
 def _conditions(plan: Plan) -> Table:
     table = Table("H mm", "alpha deg", "strokes", "on each sheet")
-    counts = Counter((p.depth_mm, p.tilt_deg, p.sheet) for p in plan.placed)
-    patches = sorted({(p.depth_mm, p.tilt_deg) for p in plan.placed})
-    for depth_mm, tilt_deg in patches[:MOST_ROWS]:
-        by_sheet = [counts[depth_mm, tilt_deg, sheet] for sheet in range(1, plan.sheets + 1)]
-        table.add_row(f"{depth_mm:g}", f"{tilt_deg:g}", str(sum(by_sheet)), " ".join(map(str, by_sheet[:20])))
-    if len(patches) > MOST_ROWS:
-        table.add_row("...", "...", f"{len(patches) - MOST_ROWS} more", "")
+    counts = Counter((press.condition, press.sheet) for press in plan.placed)
+    conditions = sorted({press.condition for press in plan.placed})
+    for asked in conditions[:MOST_ROWS]:
+        by_sheet = [counts[asked, sheet] for sheet in range(plan.sheets)]
+        sheets = " ".join(map(str, by_sheet[:20]))
+        table.add_row(f"{asked.depth_mm:g}", f"{asked.tilt_deg:g}", str(sum(by_sheet)), sheets)
+    if len(conditions) > MOST_ROWS:
+        table.add_row("...", "...", f"{len(conditions) - MOST_ROWS} more", "")
     return table

@@ -87,7 +87,7 @@ def moves_of(
             return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
         case PressStep(press=press, dwell_s=dwell_s):
             assert patch is not None
-            down, up = press_moves(config, plane, patch, press.condition.depth_mm, press.condition.tilt_deg)
+            down, up = press_moves(config, plane, patch, press.condition)
             return StepMoves([*down, *up], dwell_s=dwell_s)
         case SelfCheckStep():
             assert patch is not None

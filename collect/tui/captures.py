@@ -23,12 +23,12 @@ from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
-from brushloop.sessions.events import CaptureResult, Remark
+from brushloop.sessions.events import CaptureResult, Press, Remark
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import merged_file, remarks_of, unlike, waits_of
-from brushloop.sessions.records import Check, Quality, Stroke, Topic
+from brushloop.sessions.records import Check, Condition, Quality, Stroke, Topic
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,25 +43,21 @@ NO_FIT = "no fit yet: run `brushloop fit`"
 class ReviewCapture:
     """One capture of a session."""
 
-    stroke_id: str
-    depth_mm: float
-    tilt_deg: float
-    still: int
-    kept: bool
-    """False for a take that was pressed again, or left out."""
-    verdict: str
-    """Name of the check that it failed; empty if it passed."""
+    result: CaptureResult
     file: str
     remark: Remark | None
-    waited_s: float | None = None
-    """From dip to touch; None if the session did not record it."""
     unlike: str = ""
-    """How `waited_s` differs from that of the session's other strokes; empty if it does not differ."""
+    """How its time from dip to touch differs from that of the session's other strokes; empty if it does not differ."""
+
+    @property
+    def press(self) -> Press:
+        """The press in it."""
+        return self.result.press
 
     @property
     def counts(self) -> bool:
         """Whether it counts: kept by the run, and not marked bad afterwards."""
-        return self.kept and not (self.remark is not None and self.remark.bad)
+        return self.result.kept and not (self.remark is not None and self.remark.bad)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +104,7 @@ class Review:
         self.open = state.is_open
         odd = unlike(waits_of(state))
         self.captures = tuple(
-            ReviewCapture(
-                result.press.stroke_id,
-                result.press.condition.depth_mm,
-                result.press.condition.tilt_deg,
-                result.still,
-                result.kept,
-                result.verdict,
-                step.file,
-                remarks.get(result.still),
-                result.press.dip_to_touch_s,
-                odd.get(result.still, ""),
-            )
+            ReviewCapture(result, step.file, remarks.get(result.still), odd.get(result.still, ""))
             for step in state.files.values()
             if isinstance(result := step.result, CaptureResult)
         )
@@ -129,19 +114,20 @@ class Review:
 
         Raises `SessionDamaged` if the still is missing.
         """
-        if capture.still not in self._pictures:
-            self._pictures[capture.still] = self._make_pictures(capture)
-        return self._pictures[capture.still]
+        still = capture.result.still
+        if still not in self._pictures:
+            self._pictures[still] = self._make_pictures(capture)
+        return self._pictures[still]
 
-    def repeatability(self, depth_mm: float, tilt_deg: float) -> tuple[float, int] | None:
-        """(mean CSIM of every pair, captures) of the counted presses of one patch; None for fewer than two.
+    def repeatability(self, condition: Condition) -> tuple[float, int] | None:
+        """(mean CSIM of every pair, captures) of the counted presses of one condition; None for fewer than two.
 
         CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
         """
         binaries = [
             pictures.binary.astype("float32")
             for capture in self.captures
-            if (capture.depth_mm, capture.tilt_deg) == (depth_mm, tilt_deg) and capture.counts
+            if capture.press.condition == condition and capture.counts
             if (pictures := self.pictures(capture)).binary is not None
         ]
         if len(binaries) < 2:
@@ -157,13 +143,14 @@ class Review:
         try:
             if (found := current(self.folder, FITS)) is not None:
                 fit = load_artefact(found, BrushFit)
-                predicted = mark_of(fit.press(), capture.depth_mm, capture.tilt_deg)
+                predicted = mark_of(fit.press(), capture.press.condition)
                 model = f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
         except CalibrationError as error:
             model = str(error)
-        title = title_of(capture.stroke_id, capture.depth_mm, capture.tilt_deg)
         alike = likeness(pictures.binary, predicted)
-        return LargeCapture(title, pictures.photo, pictures.binary, predicted, model, alike, pictures.checks)
+        return LargeCapture(
+            title_of(capture.press), pictures.photo, pictures.binary, predicted, model, alike, pictures.checks
+        )
 
     def _make_pictures(self, capture: ReviewCapture) -> CapturePictures:
         path = self.folder / capture.file
@@ -171,7 +158,7 @@ class Review:
         image, log_ns, stroke = None, 0, None
         checks: tuple[Check, ...] = ()
         for _schema, channel, message in open_mcap(path).messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
-            if message.sequence != capture.still:
+            if message.sequence != capture.result.still:
                 continue
             if channel.topic == Topic.STILL:
                 image, log_ns = decode_gray(decode_still(message.data, path), str(path)), message.log_time
@@ -180,7 +167,7 @@ class Review:
             else:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
-            raise SessionDamaged(path, f"holds no still {capture.still}")
+            raise SessionDamaged(path, f"holds no still {capture.result.still}")
         patch = self._cell(stroke)
         if patch is None or self._board is None:
             return CapturePictures(image, None, log_ns, checks)

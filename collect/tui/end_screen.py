@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-Cell = tuple[float, float]
-"""Depth H in mm and tilt alpha in degrees."""
+    from brushloop.sessions.records import Condition
+
 LABEL = 15
 MARGIN_PX = 4
 KEYS = (("v", "look through the captures"), ("f", "check, calibrate, fit, report"), ("q", "leave"), ("escape", "back"))
@@ -82,16 +82,16 @@ class EndScreen(ModalScreen[str]):
 
         try:
             review = await asyncio.to_thread(Review, Path(self._now.folder))
-            first = {(c.depth_mm, c.tilt_deg): c for c in reversed(review.captures) if c.counts}
-            marks: dict[Cell, NDArray[np.bool_]] = {}
+            first = {c.press.condition: c for c in reversed(review.captures) if c.counts}
+            marks: dict[Condition, NDArray[np.bool_]] = {}
             alike: list[tuple[float, int]] = []
-            for number, cell in enumerate(sorted(first), 1):
+            for number, asked in enumerate(sorted(first), 1):
                 self._show_alike(f"comparing, cell {number} of {len(first)} ...")
-                pictures = await asyncio.to_thread(review.pictures, first[cell])
+                pictures = await asyncio.to_thread(review.pictures, first[asked])
                 if pictures.binary is not None:
-                    marks[cell] = pictures.binary
+                    marks[asked] = pictures.binary
                     self._marks.show(binary_picture(contact_sheet(marks)))
-                if (found := await asyncio.to_thread(review.repeatability, *cell)) is not None:
+                if (found := await asyncio.to_thread(review.repeatability, asked)) is not None:
                     alike.append(found)
         except SessionError as error:
             self._show_alike(plain(str(error)))
@@ -121,20 +121,21 @@ def alike_text(cells: list[tuple[float, int]]) -> str:
     return f"mean CSIM {statistics.fmean(mean for mean, _ in cells):.3f} of {presses} presses in {len(cells)} {where}"
 
 
-def contact_sheet(marks: dict[Cell, NDArray[np.bool_]]) -> NDArray[np.bool_]:
+def contact_sheet(marks: dict[Condition, NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """One mark of each cell, depths from left to right and tilts downward, all cut to where any has ink."""
     import numpy as np
 
-    heights, tilts = sorted({h for h, _ in marks}), sorted({a for _, a in marks})
+    depths_mm, tilts_deg = sorted({asked.depth_mm for asked in marks}), sorted({asked.tilt_deg for asked in marks})
     any_ink = np.logical_or.reduce(list(marks.values()))
     if not any_ink.any():
         return any_ink
     rows, columns = np.flatnonzero(any_ink.any(axis=1)), np.flatnonzero(any_ink.any(axis=0))
     cut = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     high, wide = rows[-1] + 1 - rows[0] + 2 * MARGIN_PX, columns[-1] + 1 - columns[0] + 2 * MARGIN_PX
-    sheet = np.zeros((high * len(tilts), wide * len(heights)), np.bool_)
-    for (height, tilt), mark in marks.items():
-        top, left = high * tilts.index(tilt) + MARGIN_PX, wide * heights.index(height) + MARGIN_PX
+    sheet = np.zeros((high * len(tilts_deg), wide * len(depths_mm)), np.bool_)
+    for asked, mark in marks.items():
+        top = high * tilts_deg.index(asked.tilt_deg) + MARGIN_PX
+        left = wide * depths_mm.index(asked.depth_mm) + MARGIN_PX
         ink = mark[cut]
         sheet[top : top + ink.shape[0], left : left + ink.shape[1]] = ink
     return sheet

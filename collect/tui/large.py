@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Protocol
 
 from brushloop.collect.tui.levels import Coloured, grays
 from brushloop.collect.tui.pictures import binary_picture
+from brushloop.collect.tui.text import condition_text
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from brushloop.collect.engine.last_capture import LastCapture
+    from brushloop.sessions.events import Press
 
 WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
 """Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
@@ -80,15 +82,15 @@ class LargeCapture:
 
 def of_last(last: LastCapture) -> LargeCapture:
     """The newest capture of a run, with CCD-BSM as published."""
-    title = title_of(last.stroke_id, last.depth_mm, last.tilt_deg)
+    title = title_of(last.press)
     model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
     checks = () if last.verdict is None else last.verdict.checks
     return LargeCapture(title, last.photo, last.binary, last.model, model, last.likeness, checks)
 
 
-def title_of(stroke_id: str, depth_mm: float, tilt_deg: float) -> str:
+def title_of(press: Press) -> str:
     """The stroke and its command."""
-    return f"{stroke_id}   H {depth_mm:g} mm  α {tilt_deg:g}°"
+    return f"{press.stroke_id}   {condition_text(press.condition)}"
 
 
 def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> Coloured:

@@ -19,8 +19,9 @@ from brushloop.collect.quality.verdict import Check
 from brushloop.collect.tui.force_text import scale_n, spark
 from brushloop.collect.tui.large import limit_sign, number_text
 from brushloop.collect.tui.pictures import Pictures, binary_picture
-from brushloop.collect.tui.text import age_text, bar_text, one_line, tip_text
+from brushloop.collect.tui.text import age_text, bar_text, condition_text, one_line, tip_text
 from brushloop.collect.tui.widgets import Line, entitle
+from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.last_capture import LastCapture
@@ -139,11 +140,11 @@ def grid_content(cells: tuple[CellCount, ...], room: int) -> Content:
 
 
 def _table(cells: tuple[CellCount, ...], *, tilts_down: bool) -> list[Content]:
-    by_place = {(cell.depth_mm, cell.tilt_deg): cell for cell in cells}
-    heights = sorted({cell.depth_mm for cell in cells})
-    tilts = sorted({cell.tilt_deg for cell in cells})
-    names, heads, corner = [f"{a:g}°" for a in tilts], [f"{h:g} mm" for h in heights], "α \\ H"
-    rows = [[by_place.get((h, a)) for h in heights] for a in tilts]
+    counts = {cell.condition: cell for cell in cells}
+    depths_mm = sorted({cell.condition.depth_mm for cell in cells})
+    tilts_deg = sorted({cell.condition.tilt_deg for cell in cells})
+    names, heads, corner = [f"{a:g}°" for a in tilts_deg], [f"{h:g} mm" for h in depths_mm], "α \\ H"
+    rows = [[counts.get(Condition(h, a)) for h in depths_mm] for a in tilts_deg]
     if not tilts_down:
         names, heads, corner = heads, names, "H \\ α"
         rows = [list(column) for column in zip(*rows, strict=True)]
@@ -250,7 +251,7 @@ class CapturePane(Vertical):
 def _capture_words(last: LastCapture) -> Content:
     """Name, verdict, and the score of each check."""
     kept = ("✓ counts", "bold $text-success") if last.kept else ("! does not count", "bold $text-warning")
-    lines = [Content.assemble((last.stroke_id, "bold"), f"  H {last.depth_mm:g} mm  α {last.tilt_deg:g}°  ", kept)]
+    lines = [Content.assemble((last.press.stroke_id, "bold"), f"  {condition_text(last.press.condition)}  ", kept)]
     if last.verdict is None:
         lines.append(Content.styled("not judged: [quality] is switched off", "dim"))
     else:

@@ -21,11 +21,12 @@ from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCaptur
 from brushloop.collect.tui.finish_screen import FinishScreen
 from brushloop.collect.tui.keys import LABELS
 from brushloop.collect.tui.pictures import Pictures, binary_picture
-from brushloop.collect.tui.text import SOFTWARE_STOP, one_line, plain
+from brushloop.collect.tui.text import SOFTWARE_STOP, condition_text, one_line, plain
 from brushloop.collect.tui.widgets import KeyBar, Line, Rows, app_of
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.events import Remark
 from brushloop.sessions.recording import add_remark, merged_file
+from brushloop.sessions.records import Condition
 
 KEYS = (
     ("escape", "back"),
@@ -83,7 +84,7 @@ class ReviewScreen(Screen[None]):
         self._rows: tuple[ReviewCapture, ...] = ()
         self._capture: ReviewCapture | None = None
         self._pictures: CapturePictures | None = None
-        self._alike: dict[tuple[float, float], tuple[float, int] | None] = {}
+        self._alike: dict[Condition, tuple[float, int] | None] = {}
         self._title, self._words = Line("review-title"), Line("words")
         self._options = Rows("captures")
         self._photo, self._binary = pictures.make("review-photo"), pictures.make("review-binary")
@@ -149,14 +150,14 @@ class ReviewScreen(Screen[None]):
 
     def action_mark(self) -> None:
         """Mark the capture bad, or good again."""
-        if self._capture is not None and not self._capture.kept:
-            self.notify(f"{self._capture.stroke_id}: the run did not count it; there is nothing to mark.")
+        if self._capture is not None and not self._capture.result.kept:
+            self.notify(f"{self._capture.press.stroke_id}: the run did not count it; there is nothing to mark.")
         elif self._capture is not None:
             note = self._capture.remark.note if self._capture.remark is not None else ""
             bad = self._capture.counts
             self._remark(bad=bad, note=note)
             if bad and self._review.open:
-                self.notify(f"{self._capture.stroke_id}: pressed again after the planned strokes")
+                self.notify(f"{self._capture.press.stroke_id}: pressed again after the planned strokes")
 
     def action_note(self) -> None:
         """Let the operator type a note."""
@@ -195,17 +196,25 @@ class ReviewScreen(Screen[None]):
         try:
             add_remark(
                 self._review.folder,
-                Remark(t_ns=self._now_ns(), still=capture.still, stroke_id=capture.stroke_id, bad=bad, note=note),
+                Remark(
+                    t_ns=self._now_ns(),
+                    still=capture.result.still,
+                    stroke_id=capture.press.stroke_id,
+                    bad=bad,
+                    note=note,
+                ),
             )
             self._review.read()
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
-        self._alike.pop(_cell(capture), None)
+        self._alike.pop(capture.press.condition, None)
         self._list(self._options.highlighted or 0)
 
     def _list(self, at: int) -> None:
-        self._rows = tuple(sorted(self._review.captures, key=lambda c: (*_cell(c), c.stroke_id, c.still)))
+        self._rows = tuple(
+            sorted(self._review.captures, key=lambda c: (c.press.condition, c.press.stroke_id, c.result.still))
+        )
         good = sum(row.counts for row in self._rows)
         state = "open" if self._review.open else "closed"
         self._title.show(f"Review   {one_line(self._review.folder.name)} ({state})   {good} of {len(self._rows)} count")
@@ -227,63 +236,59 @@ class ReviewScreen(Screen[None]):
             self._photo.show(self._pictures.photo)
             self._binary.show(None if self._pictures.binary is None else binary_picture(self._pictures.binary))
             self._show_words()
-            cell = _cell(capture)
-            if cell not in self._alike:
-                self._alike[cell] = await asyncio.to_thread(self._review.repeatability, *cell)
+            asked = capture.press.condition
+            if asked not in self._alike:
+                self._alike[asked] = await asyncio.to_thread(self._review.repeatability, asked)
                 self._show_words()
         except SessionError as error:
             self._words.show(Content.styled(plain(str(error)), "$text-error"))
-
-
-def _cell(capture: ReviewCapture) -> tuple[float, float]:
-    return capture.depth_mm, capture.tilt_deg
 
 
 def _row_content(capture: ReviewCapture) -> Content:
     sign, style = ("✓", "") if capture.counts else ("!", "bold $text-warning")
     noted = " ✎" if capture.remark is not None and capture.remark.note else ""
     waited = " dip?" if capture.unlike else ""
-    return Content.assemble((sign, style), f" {one_line(capture.stroke_id)}{noted}", (waited, "bold $text-warning"))
+    return Content.assemble(
+        (sign, style), f" {one_line(capture.press.stroke_id)}{noted}", (waited, "bold $text-warning")
+    )
 
 
 def _words(
     capture: ReviewCapture,
     pictures: CapturePictures | None,
-    alike: dict[tuple[float, float], tuple[float, int] | None],
+    alike: dict[Condition, tuple[float, int] | None],
     review: Review,
 ) -> Content:
     why = ""
-    if not capture.kept:
-        why = f"  not counted by the run{f': {capture.verdict}' if capture.verdict else ''}"
+    result, press = capture.result, capture.press
+    if not result.kept:
+        why = f"  not counted by the run{f': {result.verdict}' if result.verdict else ''}"
     elif not capture.counts:
         why = "  marked bad"
-    place = f"  H {capture.depth_mm:g} mm  α {capture.tilt_deg:g}°"
     rows: list[tuple[str, str | tuple[str, str]]] = [
         ("MCAP", _where(capture, pictures, review.folder)),
-        ("Repeats", _alike_text(alike, _cell(capture), review.not_compared)),
+        ("Repeats", _alike_text(alike, press.condition, review.not_compared)),
     ]
     if capture.unlike:
         rows.append(("Waited", (f"! {capture.unlike}", "bold $text-warning")))
-    elif capture.waited_s is not None:
-        rows.append(("Waited", f"{capture.waited_s:.1f} s from dip to touch"))
+    elif press.dip_to_touch_s is not None:
+        rows.append(("Waited", f"{press.dip_to_touch_s:.1f} s from dip to touch"))
     if capture.remark is not None and capture.remark.note:
         rows.append(("Note", plain(capture.remark.note)))
-    lines = [Content.assemble((capture.stroke_id, "bold"), place, (why, "bold"))]
+    lines = [Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold"))]
     lines += [Content.assemble((name.ljust(10), "dim"), text) for name, text in rows]
     return Content("\n").join(lines)
 
 
 def _where(capture: ReviewCapture, pictures: CapturePictures | None, folder: Path) -> str:
     file = capture.file if (folder / capture.file).is_file() else merged_file(folder).name
-    return f"{file}  still {capture.still}" + ("" if pictures is None else f"  at {pictures.log_ns / 1e9:.3f} s")
+    return f"{file}  still {capture.result.still}" + ("" if pictures is None else f"  at {pictures.log_ns / 1e9:.3f} s")
 
 
-def _alike_text(
-    alike: dict[tuple[float, float], tuple[float, int] | None], cell: tuple[float, float], not_compared: str
-) -> str:
+def _alike_text(alike: dict[Condition, tuple[float, int] | None], asked: Condition, not_compared: str) -> str:
     if not_compared:
         return f"not compared: {plain(not_compared)}"
-    if cell not in alike:
+    if asked not in alike:
         return "comparing ..."
-    found = alike[cell]
+    found = alike[asked]
     return "one press only" if found is None else f"mean CSIM {found[0]:.3f} of every pair of {found[1]} presses"

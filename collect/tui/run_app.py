@@ -103,12 +103,12 @@ class RunApp(PlainApp):
         if self._now is None or last is None or not last.kept or self.screen is not self._main:
             return
         try:
-            bad = mark_bad_or_good(Path(self._now.folder), last.still, last.stroke_id, time.time_ns())
+            bad = mark_bad_or_good(Path(self._now.folder), last.still, last.press.stroke_id, time.time_ns())
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
         mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
-        self.notify(f"{last.stroke_id}: {mark}")
+        self.notify(f"{last.press.stroke_id}: {mark}")
 
     def action_help(self) -> None:
         """Show every key."""

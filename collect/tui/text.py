@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from brushloop.collect.tui.force_text import EMPTY, FULL
 from brushloop.sessions import terminal
+from brushloop.sessions.records import Condition
 
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
 SHORT_STOP = "s: software stop; red button: emergency stop"
@@ -33,6 +34,11 @@ def age_text(age_s: float) -> str:
     if age_s < 60.0:
         return f"{10 * int(age_s / 10.0)} s ago"
     return f"{int(age_s / 60.0)} min ago" if age_s < 3600.0 else f"{int(age_s / 3600.0)} h ago"
+
+
+def condition_text(condition: Condition) -> str:
+    """`H 13 mm  α 5°`."""
+    return f"H {condition.depth_mm:g} mm  α {condition.tilt_deg:g}°"
 
 
 def tip_text(tip_mm: tuple[float, float, float] | None) -> str:

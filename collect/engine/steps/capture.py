@@ -12,7 +12,7 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.view import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.params import Gray
-from brushloop.collect.engine.last_capture import LastCapture, pictures_of, published_mark
+from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of
 from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.engine.steps.retake import decide
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
@@ -22,6 +22,7 @@ from brushloop.collect.quality.verdict import Check, Family, Verdict
 from brushloop.collect.rig.optics import undistorted
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.samples import Frame
+from brushloop.model.fitted import FittedPress
 from brushloop.sessions import records
 from brushloop.sessions.events import BoardResult, CaptureResult, Press
 from brushloop.sessions.recording import limit_s, unlike, waits_of
@@ -264,12 +265,10 @@ def _show(context: StepContext, step: CaptureStep, verdict: Verdict | None, imag
     photo = binary = None
     with contextlib.suppress(BadPicture):
         photo, binary = pictures_of(image, context.run.image_plane(image), patch)
-    stroke_id, still = step.press.stroke_id, context.attempt.serial
-    depth_mm, tilt_deg = step.press.condition.depth_mm, step.press.condition.tilt_deg
-    brush = context.run.rig.config.brush
-    sizes = {"radius_mm": brush.radius_mm, "length_mm": brush.length_mm}
-    model = None if step.drawn else published_mark(depth_mm, tilt_deg, **sizes)
-    context.run.progress.show(LastCapture(stroke_id, depth_mm, tilt_deg, still, True, verdict, photo, binary, model))
+    brush, press = context.run.rig.config.brush, step.press
+    published = FittedPress(brush.radius_mm, brush.length_mm)
+    model = None if step.drawn else mark_of(published, press.condition)
+    context.run.progress.show(LastCapture(press, context.attempt.serial, True, verdict, photo, binary, model))
 
 
 def _stroke(step: CaptureStep, patch: Patch, still: int) -> records.Stroke:

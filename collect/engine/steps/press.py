@@ -18,11 +18,10 @@ from brushloop.sessions.events import DrawResult, Press, PressResult
 async def press(context: StepContext, step: PressStep) -> PressResult:
     """The PRESS step."""
     patch, procedures = await _ready(context), context.run.procedures
-    depth_mm, tilt_deg = step.press.condition.depth_mm, step.press.condition.tilt_deg
-    down, _ = press_moves(context.run.rig.config, procedures.plane, patch, depth_mm, tilt_deg)
+    down, _ = press_moves(context.run.rig.config, procedures.plane, patch, step.press.condition)
     with DipToTouch(context).watching() as timing:
         await timing.begin(down[0])
-        pressing = procedures.press(patch, depth_mm, tilt_deg, step.dwell_s)
+        pressing = procedures.press(patch, step.press.condition, step.dwell_s)
         reached_mm = await context.guard.guarded(pressing)
     made = _made(context, step.press, reached_mm, timing)
     return PressResult(press=made, peak_force_n=_peak_n(context, context.guard.peak_n))

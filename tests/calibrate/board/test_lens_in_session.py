@@ -29,7 +29,7 @@ from brushloop.calibrate.session import FITTED, calibrate_session
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Stroke
+from brushloop.sessions.records import Condition, Stroke
 
 if TYPE_CHECKING:
     from conftest import Photographed
@@ -201,7 +201,7 @@ def test_the_review_looks_through_the_lens_that_the_session_recorded(
         anchor = shot.anchors_mm[review.captures.index(seen)]
         truth = true_mask(shot, Field().window_mm(anchor), 1.0 / Field().mm_per_px)
         assert (looked.binary & truth).sum() / (looked.binary | truth).sum() >= 0.9
-    alike = review.repeatability(13.0, 5.0)
+    alike = review.repeatability(Condition(13.0, 5.0))
     assert alike is not None
     assert alike[1] == 2
 
@@ -210,9 +210,9 @@ def test_the_review_follows_the_calibration_in_use(
     photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
 ) -> None:
     session = collected(photographed, tmp_path / "without", shot)
-    assert Review(session).repeatability(13.0, 5.0) is None
+    assert Review(session).repeatability(Condition(13.0, 5.0)) is None
     calibrate_session(session, lens)
-    assert Review(session).repeatability(13.0, 5.0) is not None
+    assert Review(session).repeatability(Condition(13.0, 5.0)) is not None
 
 
 def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp_path: Path, shot: Shot) -> None:

@@ -14,6 +14,7 @@ from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, make_robot
 from brushloop.collect.rig.paper import Sheet
 from brushloop.drivers.clock import HostClock
+from brushloop.sessions.records import Condition
 
 
 async def press_for_ever(path: Path, seed: int) -> None:
@@ -30,7 +31,9 @@ async def press_for_ever(path: Path, seed: int) -> None:
     sheet = Sheet(config.paper)
     for number in itertools.count():
         patch = sheet.patch(number % sheet.capacity)
-        await procedures.press(patch, rng.uniform(5.0, 20.0), rng.uniform(0.0, 14.0), rng.choice([0.0, 0.2, 0.5]))
+        await procedures.press(
+            patch, Condition(rng.uniform(5.0, 20.0), rng.uniform(0.0, 14.0)), rng.choice([0.0, 0.2, 0.5])
+        )
 
 
 if __name__ == "__main__":

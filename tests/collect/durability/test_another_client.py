@@ -23,6 +23,7 @@ from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import ArmMoved, PathDisturbed
 from brushloop.drivers.geometry import brush_pose, to_wire
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.records import Condition
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ async def pressed(lab: Lab, seed: int, presses: int) -> Counter[str]:
             intruder.begin(to_base(config.paper, *patch.anchor_mm))
             named, counted = False, False
             try:
-                await procedures.press(patch, DEPTH_MM, 0.0, 0.2)
+                await procedures.press(patch, Condition(DEPTH_MM, 0.0), 0.2)
                 counted = True
                 await rig.robot.confirm()  # as a run does before its next step
             except (PathDisturbed, ArmMoved) as error:

@@ -7,17 +7,20 @@ import pytest
 
 from brushloop.calibrate.compare.field import Alignment, Field, Tone
 from brushloop.calibrate.compare.images import simulated
-from brushloop.collect.engine.last_capture import LastCapture, published_mark
+from brushloop.collect.engine.last_capture import LastCapture, mark_of
+from brushloop.model.fitted import FittedPress
 from brushloop.model.strokes import stroke_model
+from brushloop.sessions.events import Press
+from brushloop.sessions.records import Condition
 
-BRUSH = {"radius_mm": 6.0, "length_mm": 48.0}
+BRUSH = FittedPress(6.0, 48.0)
 
 
 @pytest.mark.parametrize("depth_mm", [11.0, 15.0, 20.0])
 @pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
 def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float) -> None:
-    mark = published_mark(depth_mm, tilt_deg, **BRUSH)
-    model = stroke_model("ccd-bsm", type("Brush", (), BRUSH)())
+    mark = mark_of(BRUSH, Condition(depth_mm, tilt_deg))
+    model = stroke_model("ccd-bsm", BRUSH)
     exact = simulated(model, depth_mm, tilt_deg, Field())[Alignment.MM, Tone.BINARY] > 0.5
     assert mark is not None
     assert exact.sum() > 100
@@ -25,15 +28,16 @@ def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float
 
 
 def test_beyond_the_domain_there_is_none() -> None:
-    assert published_mark(0.0, 0.0, **BRUSH) is None
-    assert published_mark(11.0, 85.0, **BRUSH) is None
+    assert mark_of(BRUSH, Condition(0.0, 0.0)) is None
+    assert mark_of(BRUSH, Condition(11.0, 85.0)) is None
 
 
 def test_likeness_is_a_cosine_and_needs_ink_on_both() -> None:
-    mark = published_mark(11.0, 0.0, **BRUSH)
+    mark = mark_of(BRUSH, Condition(11.0, 0.0))
 
     def capture(binary: np.ndarray | None) -> LastCapture:
-        return LastCapture("H11-a0-r00", 11.0, 0.0, 1, True, None, None, binary, mark)
+        press = Press(stroke_id="H11-a0-r00", condition=Condition(11.0, 0.0))
+        return LastCapture(press, 1, True, None, None, binary, mark)
 
     assert capture(mark).likeness == pytest.approx(1.0)
     assert capture(np.roll(mark, 60, axis=0)).likeness == pytest.approx(0.0)

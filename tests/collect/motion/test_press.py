@@ -18,6 +18,7 @@ from brushloop.collect.rig.paper import Sheet
 from brushloop.drivers.samples import Identity, Pose, QueuedLine
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.sessions.records import Condition
 
 NOBODY = Identity("robot", "made up", "", True)
 
@@ -53,7 +54,7 @@ def made(rig_file: Path, robot: MadeUpRobot) -> Procedures:
 
 async def pressed(rig_file: Path, robot: MadeUpRobot, depth_mm: float = 13.0, dwell_s: float = 0.2) -> float:
     procedures = made(rig_file, robot)
-    return await procedures.press(Sheet(load_rig(rig_file).paper).patch(7), depth_mm, 10.0, dwell_s)
+    return await procedures.press(Sheet(load_rig(rig_file).paper).patch(7), Condition(depth_mm, 10.0), dwell_s)
 
 
 async def test_the_way_into_the_paper_and_out_again_is_handed_over_as_one(rig_file: Path):
@@ -93,7 +94,7 @@ async def test_a_depth_that_nobody_saw_is_not_believed(rig_file: Path, seen: sli
 def test_every_move_of_a_press_lies_within_the_limits_and_ends_high(rig_file: Path):
     config = load_rig(rig_file)
     before, pressing = press_moves(
-        config, made(rig_file, MadeUpRobot()).plane, Sheet(config.paper).patch(0), 20.0, 15.0
+        config, made(rig_file, MadeUpRobot()).plane, Sheet(config.paper).patch(0), Condition(20.0, 15.0)
     )
     for move in before + pressing:
         limits_of(config).check("robot", move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)

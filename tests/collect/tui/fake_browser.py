@@ -13,7 +13,8 @@ from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.sessions.events import Remark
+from brushloop.sessions.events import CaptureResult, Press, Remark
+from brushloop.sessions.records import Condition
 from brushloop.sessions.show import Details, Summary
 from tests.collect.tui.fake import blot
 
@@ -77,6 +78,11 @@ class FakeBrowser(SessionBrowser):
         return "30 strokes on 1 sheet, about 21 min"
 
 
+def captured(stroke_id: str, still: int, waited_s: float | None = None, verdict: str = "") -> CaptureResult:
+    press = Press(stroke_id=stroke_id, condition=Condition(13.0, 0.0), dip_to_touch_s=waited_s)
+    return CaptureResult(press=press, still=still, kept=not verdict, verdict=verdict)
+
+
 class FakeReview(Review):
     """Three captures of one cell, one of them marked bad."""
 
@@ -89,16 +95,16 @@ class FakeReview(Review):
         self.open = False
         bad = Remark(t_ns=1, still=7, stroke_id="H13-a0-r02", bad=True, note="smudged, 墨 ran")
         self.captures = (
-            ReviewCapture("H13-a0-r01", 13.0, 0.0, 4, True, "", "0004-capture-a.mcap", None, 1.24),
-            ReviewCapture("H13-a0-r02", 13.0, 0.0, 7, True, "", "0007-capture-b.mcap", bad),
-            ReviewCapture("H13-a0-r03", 13.0, 0.0, 10, False, "split", "0010-capture-c.mcap", None, 10.2, LATE),
+            ReviewCapture(captured("H13-a0-r01", 4, 1.24), "0004-capture-a.mcap", None),
+            ReviewCapture(captured("H13-a0-r02", 7), "0007-capture-b.mcap", bad),
+            ReviewCapture(captured("H13-a0-r03", 10, 10.2, "split"), "0010-capture-c.mcap", None, LATE),
         )
 
     def pictures(self, capture: ReviewCapture) -> CapturePictures:
         binary = blot()
         return CapturePictures(np.where(binary, 40, 210).astype(np.uint8), binary, 1_795_273_966_402_000_000)
 
-    def repeatability(self, depth_mm: float, tilt_deg: float) -> tuple[float, int] | None:
+    def repeatability(self, condition: Condition) -> tuple[float, int] | None:
         return 0.914, 9
 
 

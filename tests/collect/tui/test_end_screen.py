@@ -11,6 +11,7 @@ import pytest
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.end_screen import EndScreen, alike_text, contact_sheet
 from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.sessions.records import Condition
 from brushloop.sessions.verify import Verdict
 from tests.collect.tui.fake import DONE, FakeEngine, marked_grid, picture
 from tests.collect.tui.fake_browser import FakeReview
@@ -46,11 +47,11 @@ async def test_a_finished_session_is_shown_on_a_card(tmp_path: Path, monkeypatch
 def test_a_contact_sheet_has_a_mark_of_each_cell_cut_to_the_ink() -> None:
     small, large = np.zeros((128, 128), bool), np.zeros((128, 128), bool)
     small[60:64, 60:70] = large[50:70, 60:100] = True
-    sheet = contact_sheet({(11.0, 0.0): small, (13.0, 0.0): large, (13.0, 10.0): small})
+    sheet = contact_sheet({Condition(11.0, 0.0): small, Condition(13.0, 0.0): large, Condition(13.0, 10.0): small})
     assert sheet.shape == (2 * (20 + 8), 2 * (40 + 8))
     assert sheet[4 + 10, 4:14].all()
     assert not sheet[28:, :48].any(), "not pressed"
-    assert not contact_sheet({(11.0, 0.0): np.zeros((8, 8), bool)}).any()
+    assert not contact_sheet({Condition(11.0, 0.0): np.zeros((8, 8), bool)}).any()
 
 
 def test_repeatability_is_the_mean_of_the_cells() -> None:

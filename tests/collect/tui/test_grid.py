@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from brushloop.collect.engine.snapshot import CellCount
 from brushloop.collect.tui.panes import BAD, COMPLETE, LEFT_OUT, NEXT, NOW, grid_content
+from brushloop.sessions.records import Condition
 from tests.collect.tui.fake import grid_of, marked_grid
 
 
@@ -33,7 +34,7 @@ def test_every_state_has_a_sign_as_well_as_a_colour() -> None:
 
 
 def test_a_cell_that_is_not_planned_is_a_dash() -> None:
-    cells = (CellCount(11.0, 0.0, 0, 2), CellCount(13.0, 5.0, 2, 2))
+    cells = (CellCount(Condition(11.0, 0.0), 0, 2), CellCount(Condition(13.0, 5.0), 2, 2))
     lines = grid_content(cells, 78).plain.splitlines()
     assert lines[1].split() == ["0°", "0/2", "-"]
     assert lines[2].split() == ["5°", "-", "2/2", "✓"]

@@ -26,7 +26,7 @@ async def test_b_marks_the_last_capture_and_takes_it_back(tmp_path: Path) -> Non
     async with app.run_test(size=(120, 40)) as pilot:
         await pilot.press("b")
         remark = remarks_of(tmp_path)[last.still]
-        assert (remark.stroke_id, remark.bad) == (last.stroke_id, True)
+        assert (remark.stroke_id, remark.bad) == (last.press.stroke_id, True)
         await pilot.press("b")
         assert not remarks_of(tmp_path)[last.still].bad
 
