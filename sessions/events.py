@@ -141,20 +141,13 @@ class DipResult(Value):
 
 
 class PressResult(Value):
-    """A press that was made."""
+    """A press that was made, or a figure that was drawn."""
 
-    kind: Literal[StepKind.PRESS] = StepKind.PRESS
+    kind: Literal[StepKind.PRESS, StepKind.DRAW] = StepKind.PRESS
     press: Press
     peak_force_n: Number | None = None
-
-
-class DrawResult(Value):
-    """A figure that was drawn, and the depth that the arm reached in each of its strokes."""
-
-    kind: Literal[StepKind.DRAW] = StepKind.DRAW
-    press: Press
-    peak_force_n: Number | None = None
-    depths_mm: tuple[Number, ...]
+    depths_mm: tuple[Number, ...] = ()
+    """Depth that the arm reached in each stroke of a figure."""
 
 
 class CaptureResult(Value):
@@ -188,8 +181,9 @@ class ReviewResult(Value):
 
 
 SetUpResult = ZeroTouchResult | BoardResult | TouchResult | SelfCheckResult
-MarkResult = PressResult | DrawResult
-StepResult = Annotated[SetUpResult | MarkResult | DipResult | CaptureResult | ReviewResult, Field(discriminator="kind")]
+StepResult = Annotated[
+    SetUpResult | PressResult | DipResult | CaptureResult | ReviewResult, Field(discriminator="kind")
+]
 
 
 class _Event(Value):
@@ -244,7 +238,7 @@ class Done(_Event):
     def press(self) -> Press | None:
         """The press that the step made, photographed or left out."""
         result = self.result
-        if isinstance(result, PressResult | DrawResult | CaptureResult):
+        if isinstance(result, PressResult | CaptureResult):
             return result.press
         return result.skipped if isinstance(result, DipResult) else None
 
@@ -263,13 +257,6 @@ class FreshSheet(_Event):
 
     event: Literal["sheet"] = "sheet"
     sheet: Whole
-
-
-class Torn(_Event):
-    """A half-written line, left by a crash, was set aside."""
-
-    event: Literal["torn"] = "torn"
-    hex: str
 
 
 class Ended(_Event):
@@ -325,7 +312,7 @@ class Remark(_Event):
     note: str = ""
 
 
-_OfSession = Open | Process | FreshSheet | Ended | Closed | Torn | Remark
+_OfSession = Open | Process | FreshSheet | Ended | Closed | Remark
 _OfStep = Begin | Done | Void | Repaired | Lost | Doubt
 Event = Annotated[_OfSession | _OfStep, Field(discriminator="event")]
 _EVENTS: TypeAdapter[Event] = TypeAdapter(Event)

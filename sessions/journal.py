@@ -91,7 +91,7 @@ class RunState:
         waiting: dict[tuple[str, int], Press] = {}
         for step in self.files.values():
             match step.result:
-                case events.PressResult(press=press) | events.DrawResult(press=press):
+                case events.PressResult(press=press):
                     waiting[press.stroke_id, press.take] = press
                 case events.CaptureResult(press=press):
                     waiting.pop((press.stroke_id, press.take), None)
@@ -127,8 +127,8 @@ class RunState:
             case events.Doubt(sheet=sheet, file=file):
                 self.doubtful_sheets.add(sheet)
                 self.begun = max(self.begun, serial_of(file) + 1)
-            case events.Torn() | events.Remark():
-                pass  # for people who read the journal
+            case events.Remark():
+                pass  # of a journal of its own
 
     def _begin(self, begin: Begin) -> None:
         # Serials also number stills, so that of a lost line must not be used again.
@@ -188,7 +188,7 @@ class Reading:
     unread_at_end: int = 0
     """Number of lines behind all others that cannot be read."""
     torn: bytes = b""
-    """Last line, cut off by a crash: the next process sets it aside."""
+    """Last line, cut off by a crash: the next process removes it."""
     next_seq: int = 1
     """Number of the next line."""
 
@@ -325,16 +325,15 @@ def _more(problems: Sequence[object]) -> str:
 class Journal:
     """Writer that appends to one journal file. The caller holds the session's lock, so only one process writes.
 
-    `t_ns`, the time of opening, dates the note about a torn tail. Raises `SessionError` where the disk fails, and
-    `InputError` where the file is a link.
+    Raises `SessionError` where the disk fails, and `InputError` where the file is a link.
     """
 
-    def __init__(self, path: Path, t_ns: int, session: str = "") -> None:
+    def __init__(self, path: Path, session: str = "") -> None:
         self.path = path
         self._session = session
         try:
             created = not check_file(path)
-            self._seq = 1 if created else _whole_lines(path, t_ns, session)
+            self._seq = 1 if created else _whole_lines(path)
             self._fd = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
             self._size = os.fstat(self._fd).st_size
             if created:
@@ -362,21 +361,18 @@ class Journal:
         os.close(self._fd)
 
 
-def _whole_lines(path: Path, t_ns: int, session: str) -> int:
-    """Make the journal end with a whole line, and return the number of the next one."""
+def _whole_lines(path: Path) -> int:
+    """Make the journal end with a whole line, and return the number of the next one.
+
+    A half-written line is cut off: nothing has happened yet that depends on it.
+    """
     data = read_journal(path)
     reading = read(data)
-    seq = reading.next_seq
-    keep = data.rfind(b"\n") + 1
-    if keep == len(data):
-        return seq
-    if reading.torn:
-        # Longer than the tail that it overwrites, and written in one call: a crash leaves the tail or the note.
-        note, at = encode_line(t_ns, {"event": "torn", "hex": data[keep:].hex()}, seq, session), keep
-    else:
-        note, at = b"\n", len(data)  # only the newline was cut off
     with path.open("r+b", buffering=0) as file:
-        file.seek(at)
-        file.write(note)
+        if reading.torn:
+            file.truncate(len(data) - len(reading.torn))
+        elif not data.endswith(b"\n"):  # only the newline was cut off
+            file.seek(len(data))
+            file.write(b"\n")
         os.fsync(file.fileno())
-    return seq + bool(reading.torn)
+    return reading.next_seq

@@ -225,7 +225,7 @@ def unlike(waits: Mapping[_K, float]) -> dict[_K, str]:
 
 def add_remark(folder: Path, remark: Remark) -> None:
     """Append a remark and wait until it is on disk. Raises `SessionError` where that fails."""
-    journal = Journal(folder / REMARKS_NAME, remark.t_ns)
+    journal = Journal(folder / REMARKS_NAME)
     try:
         journal.append(remark.t_ns, line_of(remark))
     finally:

@@ -111,7 +111,7 @@ class _FolderRepair:
         report, state = self._report, self._state
         if self._evidence.reading.faults or self._evidence.rebuilt:
             self._rewrite_journal()
-        self._journal = Journal(self._folder / JOURNAL_NAME, self._now_ns(), self._header.session_id)
+        self._journal = Journal(self._folder / JOURNAL_NAME, self._header.session_id)
         try:
             self._doubt()
             self._snapshots()
@@ -216,7 +216,7 @@ class _FolderRepair:
             return
         # If its sheet was removed, the stroke cannot be photographed again: its press is lost too.
         for done in list(self._state.files.values()):
-            press = done.press if isinstance(done.result, events.PressResult | events.DrawResult) else None
+            press = done.press if isinstance(done.result, events.PressResult) else None
             if press is None or press.stroke_id != step.result.press.stroke_id:
                 continue
             if press.sheet is not None and press.sheet != self._state.sheet:

@@ -6,7 +6,6 @@ The engine writes only through this.
 from __future__ import annotations
 
 import datetime as dt
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +70,7 @@ class SessionStore:
             if self.state.closed is not None:
                 raise InputError(folder, "is closed; a finished recording is never changed")
             self.header = header or read_header(folder, self.state)
-            self._journal = Journal(folder / JOURNAL_NAME, now_ns(), self.header.session_id)
+            self._journal = Journal(folder / JOURNAL_NAME, self.header.session_id)
             if header is not None:
                 self._log(events.Open(t_ns=now_ns(), header=header, snapshots=snapshots or {}))
             self._check_serials()
@@ -205,12 +204,10 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
 
     The file includes the configuration and a note of any repairs, so that it can be shared alone. It gets its name
     once it was read back with correct CRCs and the journal's counts. A file of that name, left by an interrupted close,
-    is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts, and
-    for a sound file of that name with messages that the steps do not have.
+    is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts.
     """
     final = merged_file(folder, state)
     if final.exists():
-        _check_not_emptier(final, state, header)
         set_aside(final, tag)
     part = final.with_name(final.name + ".part")
     expected = state.counts()
@@ -231,16 +228,6 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
     except OSError as error:
         raise disk_error(part, "cannot write", error) from error
     return final
-
-
-def _check_not_emptier(final: Path, state: RunState, header: Header) -> None:
-    try:
-        found = scan_sound(final)
-    except SessionError:
-        return
-    more = found.counts - Counter(state.counts())
-    if more and found.session == header.session_id:
-        raise SessionDamaged(final, f"holds {more.total()} messages that the steps in the journal do not have")
 
 
 def next_session_id(root: Path, label: str, today: dt.date) -> str:

@@ -327,7 +327,7 @@ def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
     elif reading.faults:
         verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
     if reading.torn:
-        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process sets it aside")
+        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process removes it")
     for event in evidence.rebuilt:
         match event:
             case Begin(file=file):

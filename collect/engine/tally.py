@@ -11,7 +11,6 @@ from brushloop.sessions.events import (
     CaptureResult,
     Condition,
     DipResult,
-    DrawResult,
     Press,
     PressResult,
     ReviewResult,
@@ -49,7 +48,7 @@ def tally_of(state: RunState) -> Tally:
     kept: dict[str, Press] = {}
     for step in state.files.values():
         match step.result:
-            case PressResult(press=press) | DrawResult(press=press):
+            case PressResult(press=press):
                 _mark(tally, press, Mark.WAITING)
             case SelfCheckResult(sheet=sheet, patches=patches):
                 tally.marks |= {(sheet, patch): Mark.CHECK for patch in patches}

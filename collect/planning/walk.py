@@ -42,7 +42,7 @@ from brushloop.collect.touch.heights import lowest_z_mm
 from brushloop.collect.touch.places import patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.samples import Pose
-from brushloop.sessions.events import DrawResult, PressResult, StepResult
+from brushloop.sessions.events import PressResult, StepKind, StepResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +185,7 @@ def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:
         case PressStep(press=press):
             return PressResult(press=press.model_copy(update={"sheet": sheet, "patch": patch}))
         case DrawStep(press=press):
-            return DrawResult(press=press.model_copy(update={"sheet": sheet, "patch": patch}), depths_mm=())
+            return PressResult(kind=StepKind.DRAW, press=press.model_copy(update={"sheet": sheet, "patch": patch}))
         case _:
             return None
 

@@ -28,7 +28,6 @@ from brushloop.sessions.events import (
     CaptureResult,
     Condition,
     DipResult,
-    DrawResult,
     Press,
     PressResult,
     ReviewResult,
@@ -91,7 +90,7 @@ def takes(stroke: Planned) -> Protocol:
         press = stroke.press(take)
         step = PressStep(index, press, stroke.dwell_s, again_of) if drawn is None else DrawStep(index, press, drawn)
         marked = yield step
-        assert isinstance(marked, PressResult | DrawResult)
+        assert isinstance(marked, PressResult)
         seen = yield CaptureStep(index, marked.press, again_of, drawn is not None)
         if not (isinstance(seen, CaptureResult) and seen.retake):
             break

@@ -4,11 +4,9 @@ import shutil
 
 import pytest
 
-from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.repair import repair_session
-from brushloop.sessions.store import SessionStore
 from brushloop.sessions.verify import verify_session
 
 OTHER = "2026-01-03-grid-01"
@@ -100,21 +98,3 @@ def test_the_merged_file_of_another_session_is_told_and_replaced(make, ours, oth
     assert final.name in told(verify_session(ours))
     repair_session(ours, make.clock())
     assert (len(make.stroke_names(final)), verify_session(ours).sound) == (3, True)
-
-
-def test_a_merged_file_is_not_replaced_by_an_emptier_one(make, ours):
-    """The last lines of the journal are gone, and with them the files of their steps."""
-    final = ours / f"{ours.name}.mcap"
-    before = final.read_bytes()
-    last = make.events(ours, "done")[-1]["file"]
-    journal = (ours / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
-    at = next(n for n, line in enumerate(journal) if last.encode() in line)
-    (ours / JOURNAL_NAME).write_bytes(b"".join(journal[:at]))
-    (ours / last).unlink()
-    store = SessionStore(ours, None, make.clock())
-    with pytest.raises(SessionDamaged, match="messages that the steps in the journal do not have"):
-        store.close()
-    store.release()
-    assert repair_session(ours, make.clock()).strokes == 3
-    assert final.read_bytes() == before
-    assert verify_session(ours).sound

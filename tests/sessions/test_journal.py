@@ -25,7 +25,7 @@ DONE = {
 
 
 def written(path, *lines, t_ns=1):
-    journal = Journal(path, t_ns, "s")
+    journal = Journal(path, "s")
     for line in lines:
         journal.append(t_ns, line)
     journal.close()
@@ -44,7 +44,7 @@ def test_lines_survive_closing_and_opening_again(path):
 
 
 def test_every_line_is_on_disk_before_append_returns(path, monkeypatch):
-    journal = Journal(path, 1)
+    journal = Journal(path)
     synced = []
     fsync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda fd: (fsync(fd), synced.append(path.read_bytes().count(b"\n"))))
@@ -54,16 +54,14 @@ def test_every_line_is_on_disk_before_append_returns(path, monkeypatch):
     assert synced == [1, 2, 3]
 
 
-def test_a_last_line_torn_at_any_byte_is_set_aside_and_the_rest_reads(path):
+def test_a_last_line_torn_at_any_byte_is_removed_and_the_rest_reads(path):
     whole = written(path, BEGIN, DONE).read_bytes()
     last_line_at = whole.index(b"\n") + 1
     for cut in range(last_line_at + 1, len(whole) - 1):
         path.write_bytes(whole[:cut])
         assert len(list(read_lines(path))) == 1
-        written(path, DONE, t_ns=7)
-        first, torn, again = read_lines(path)
-        assert (first["event"], again["event"]) == ("begin", "done")
-        assert torn == {"t_ns": 7, "event": "torn", "hex": whole[last_line_at:cut].hex()}
+        written(path, DONE)
+        assert path.read_bytes() == whole
 
 
 def test_a_last_line_without_only_its_end_is_a_whole_line(path):
@@ -72,13 +70,6 @@ def test_a_last_line_without_only_its_end_is_a_whole_line(path):
     assert [line["event"] for line in read_lines(path)] == ["begin", "done"]
     written(path, {"event": "sheet", "sheet": 1})
     assert [line["event"] for line in read_lines(path)] == ["begin", "done", "sheet"]
-
-
-def test_a_journal_that_is_only_a_torn_line_is_set_aside_too(path):
-    path.write_bytes(b'{"t_ns":1,"ev')
-    written(path)
-    [torn] = read_lines(path)
-    assert bytes.fromhex(torn["hex"]) == b'{"t_ns":1,"ev'
 
 
 def test_each_line_says_its_number_and_its_session(path):
@@ -187,7 +178,7 @@ def test_a_press_that_was_begun_and_never_done_has_used_its_cell(path):
 
 
 def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, monkeypatch):
-    journal = Journal(path, 1)
+    journal = Journal(path)
     journal.append(1, BEGIN)
     write = os.write
 
@@ -208,6 +199,6 @@ def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, mon
 
 def test_a_journal_that_cannot_be_opened_is_a_session_error(tmp_path):
     with pytest.raises(SessionError, match="is not a file"):
-        Journal(tmp_path, 1)
+        Journal(tmp_path)
     with pytest.raises(SessionError, match="is not a file"):
         replay(tmp_path)

@@ -197,7 +197,7 @@ def test_counts_that_do_not_agree_leave_the_merged_file_unnamed(make, store, res
 
 def test_a_session_that_died_before_its_first_line_is_not_offered_to_go_on(make, tmp_path):
     (tmp_path / "s").mkdir()
-    Journal(tmp_path / "s" / JOURNAL_NAME, 1).close()
+    Journal(tmp_path / "s" / JOURNAL_NAME).close()
     assert open_sessions(tmp_path) == []
     with pytest.raises(SessionDamaged, match="no `open` event"):
         SessionStore(tmp_path / "s", None, make.clock())
@@ -205,7 +205,7 @@ def test_a_session_that_died_before_its_first_line_is_not_offered_to_go_on(make,
 
 @pytest.mark.parametrize("opened", [{}, {"header": {"session_id": 3}}])
 def test_a_header_that_cannot_be_read_is_damage_in_one_line(make, tmp_path, opened):
-    journal = Journal(tmp_path / JOURNAL_NAME, 1)
+    journal = Journal(tmp_path / JOURNAL_NAME)
     journal.append(1, {"event": "open", **opened})
     journal.close()
     with pytest.raises(SessionDamaged, match="header") as caught:

@@ -12,7 +12,7 @@ from brushloop.collect.motion.procedures import check_drawn, draw_stroke
 from brushloop.collect.protocols.steps import DrawStep, PressStep
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Patch
-from brushloop.sessions.events import DrawResult, Press, PressResult
+from brushloop.sessions.events import Press, PressResult, StepKind
 
 
 async def press(context: StepContext, step: PressStep) -> PressResult:
@@ -27,7 +27,7 @@ async def press(context: StepContext, step: PressStep) -> PressResult:
     return PressResult(press=made, peak_force_n=_peak_n(context, context.guard.peak_n))
 
 
-async def draw(context: StepContext, step: DrawStep) -> DrawResult:
+async def draw(context: StepContext, step: DrawStep) -> PressResult:
     """The DRAW step: every stroke of a figure, with dips in between if the protocol asks for them."""
     run, drawn = context.run, step.drawn
     patch = await _ready(context)
@@ -54,7 +54,9 @@ async def draw(context: StepContext, step: DrawStep) -> DrawResult:
             depths_mm.append(await context.guard.guarded(stroke))
             peaks_n.append(context.guard.peak_n)
     made = _made(context, step.press, max(depths_mm), timing)
-    return DrawResult(press=made, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm))
+    return PressResult(
+        kind=StepKind.DRAW, press=made, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm)
+    )
 
 
 async def _ready(context: StepContext) -> Patch:

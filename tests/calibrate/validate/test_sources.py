@@ -211,7 +211,7 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
     (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
     header = Recording(session).header.model_copy(update={"session_id": "presses"})
     closed = {"event": "closed", "file": "presses.mcap", "sha256": "0" * 64, "counts": {}}
-    journal = Journal(folder / "journal.jsonl", 1, "presses")
+    journal = Journal(folder / "journal.jsonl", "presses")
     for line in (line_of(Open(t_ns=1, header=header)), closed):
         journal.append(1, line)
     journal.close()

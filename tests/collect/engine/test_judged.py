@@ -14,7 +14,7 @@ from brushloop.collect.errors import CollectAborted, NeedsOperator, Parked
 from brushloop.collect.quality.checks import check_drawing
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.drivers.sim.brush.flaws import Flaw
-from brushloop.sessions.events import DrawResult
+from brushloop.sessions.events import PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
 from tests.collect.until import until, wait_for_end
@@ -159,7 +159,7 @@ def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab
     (sharp_lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
     run(sharp_lab.engine())
     [folder] = sharp_lab.sessions.iterdir()
-    [drawn] = replay(folder / JOURNAL_NAME).results(DrawResult)
+    [drawn] = replay(folder / JOURNAL_NAME).results(PressResult)
     assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
 
 
