@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,17 +28,6 @@ MAX_IMAGE_PIXELS = 80_000_000
 MAX_JPEG_SCANS = 100
 """Each scan of a progressive JPEG takes ten bytes or more of the file, and covers the whole image."""
 PNG_START = b"\x89PNG\r\n\x1a\n"
-
-
-@dataclass(frozen=True, slots=True)
-class Transform:
-    """Transform from a child frame's coordinates to its parent's."""
-
-    parent: str
-    child: str
-    translation_mm: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-    """x, y, z, w."""
 
 
 def pose_message(
@@ -70,15 +58,20 @@ def joints_message(t_ns: int, names: Sequence[str], positions_rad: Sequence[floa
     return message
 
 
-def transforms_message(t_ns: int, transforms: Iterable[Transform]) -> FrameTransforms:
-    """Transforms between frames; metres on disk."""
+def transform_message(
+    t_ns: int,
+    parent: str,
+    child: str,
+    translation_mm: tuple[float, float, float],
+    quaternion: tuple[float, float, float, float],
+) -> FrameTransforms:
+    """The transform (x, y, z, w) from a child frame's coordinates to its parent's; metres on disk."""
     message = FrameTransforms()
-    for transform in transforms:
-        added = message.transforms.add(parent_frame_id=transform.parent, child_frame_id=transform.child)
-        added.timestamp.FromNanoseconds(t_ns)
-        there, turned = added.translation, added.rotation
-        there.x, there.y, there.z = (v / 1e3 for v in transform.translation_mm)
-        turned.x, turned.y, turned.z, turned.w = transform.quaternion
+    transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+    transform.timestamp.FromNanoseconds(t_ns)
+    there, turned = transform.translation, transform.rotation
+    there.x, there.y, there.z = (v / 1e3 for v in translation_mm)
+    turned.x, turned.y, turned.z, turned.w = quaternion
     return message
 
 
@@ -90,20 +83,17 @@ def calibration_message(
 ) -> CameraCalibration:
     """Intrinsics of a single, unrectified camera: R is the identity, P is [K | 0].
 
-    `camera_matrix` is K, 3 x 3 in pixels; `distortion` is k1, k2, p1, p2, k3. Raises `ValueError`.
+    `camera_matrix` is K, 3 x 3 in pixels; `distortion` is k1, k2, p1, p2, k3.
     """
-    rows = [list(map(float, row)) for row in camera_matrix]
-    if [len(row) for row in rows] != [3, 3, 3]:
-        raise ValueError(f"a camera matrix is 3 x 3, got rows of {[len(row) for row in rows]}")
     message = CameraCalibration(
         frame_id="camera",
         width=size_px[0],
         height=size_px[1],
         distortion_model="plumb_bob",
         D=distortion,
-        K=[v for row in rows for v in row],
+        K=[v for row in camera_matrix for v in row],
         R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        P=[v for row in rows for v in [*row, 0.0]],
+        P=[v for row in camera_matrix for v in [*row, 0.0]],
     )
     message.timestamp.FromNanoseconds(t_ns)
     return message

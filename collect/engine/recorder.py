@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
 from brushloop.drivers.clock import Clock
@@ -11,14 +11,13 @@ from brushloop.drivers.samples import ForceSample, Frame, PoseSample, Stamp
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import (
-    Transform,
     calibration_message,
     encode_png,
     image_message,
     joints_message,
     log_message,
     pose_message,
-    transforms_message,
+    transform_message,
 )
 from brushloop.sessions.records import (
     Cadence,
@@ -94,10 +93,11 @@ class Recorder:
         """Record the state of the well before a dip."""
         self._now(Topic.INK, InkState(level=level, dosed_ml=dosed_ml, light=light))
 
-    def frames(self, transforms: Iterable[Transform]) -> None:
-        """Record where the coordinate frames lie."""
+    def paper(self, origin_mm: tuple[float, float, float], quaternion: tuple[float, float, float, float]) -> None:
+        """Record where the paper's frame lies in the base frame."""
         now_ns = self._clock.now_ns()
-        self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, transforms_message(now_ns, transforms))
+        message = transform_message(now_ns, "base", "paper", origin_mm, quaternion)
+        self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, message)
 
     def optics(self, used: LensUsed) -> None:
         """Record the lens with which photographs are undistorted before they are judged."""

@@ -14,12 +14,11 @@ from mcap_protobuf.decoder import DecoderFactory
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import (
-    Transform,
     calibration_message,
     image_message,
     joints_message,
     log_message,
-    transforms_message,
+    transform_message,
 )
 from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, Topic, Wrench
 
@@ -34,7 +33,7 @@ def each(make):
     jpeg = cv2.imencode(".jpg", np.full((32, 32), 200, np.uint8))[1].tobytes()
     messages = {
         Topic.JOINTS: joints_message(t_ns, JOINTS, range(6)),
-        Topic.TRANSFORMS: transforms_message(t_ns, [Transform("base", "paper", (400, -100, 5), (0, 0, 0, 1))]),
+        Topic.TRANSFORMS: transform_message(t_ns, "base", "paper", (400, -100, 5), (0, 0, 0, 1)),
         Topic.CALIBRATION: calibration_message(t_ns, (2048, 1536), K, [0.1, 0, 0, 0, 0]),
         Topic.PREVIEW: image_message(t_ns, jpeg, "jpeg"),
         Topic.LOG: log_message(t_ns, "brush is dry", warning=True),
@@ -107,7 +106,6 @@ def test_quality_passes_where_every_check_does():
         lambda: InkState(level=1.2),
         lambda: Cadence(topic="/x", expected_hz=0, received=0, missed=0),
         lambda: joints_message(0, JOINTS, [0.0] * 5),
-        lambda: calibration_message(0, (1, 1), [[1.0] * 4] * 3, []),
     ],
 )
 def test_what_cannot_be_is_not_recorded(wrong):

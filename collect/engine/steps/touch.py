@@ -22,7 +22,6 @@ from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
 from brushloop.drivers.samples import Frame
 from brushloop.sessions.events import SelfCheckResult, TouchResult, ZeroTouchResult
-from brushloop.sessions.messages import Transform
 
 
 async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResult:
@@ -49,7 +48,7 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         await _accepted(context, moved_mm)
     run.procedures.plane = found.plane
     origin_mm, quaternion = found.plane.frame(rig.config.paper)
-    context.recorder.frames([Transform("base", "paper", origin_mm, quaternion)])
+    context.recorder.paper(origin_mm, quaternion)
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
     return found.result(moved_mm)
