@@ -255,7 +255,7 @@ class Engine:
             await self._permitted(rig)
             store = self._store = self._open_store(rig)
             try:
-                self._progress.opened(store, sheet_of(self._rig_config, self._protocol_config))
+                self._progress.opened(store)
                 if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
                     self._progress.log(UNCHECKED, warning=True)
                 async with (

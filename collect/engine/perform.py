@@ -47,7 +47,7 @@ class Performer:
 
     async def retreat(self) -> None:
         """Lift the arm and move it away from wherever it is; belongs to no step and is not recorded."""
-        self._run.memory.left_ink_ns = None
+        self._run.left_ink_ns = None
         await self._run.procedures.retreat()
 
     async def perform(self, step: Step) -> StepResult:
@@ -104,13 +104,13 @@ class Performer:
             recorder.cadence(lag_ms)
             recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
-            run.memory.left_ink_ns = None
+            run.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
-            progress.cut()
+            progress.finished(step, None)
             raise
         if isinstance(result, DipResult) and run.requests.take(OperatorRequest.SKIP):
-            left_out = progress.planned(step).press()
+            left_out = progress.planned(step.index).press()
             result = result.model_copy(update={"skipped": left_out})
             progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)

@@ -1,25 +1,34 @@
-"""Progress of a run, kept for snapshots: counts, times, and the newest lines of the log."""
+"""Progress of a run, kept for snapshots: what the journal says of the plan, and the newest lines of the log."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 from collections import Counter, deque
-from collections.abc import Generator
-from dataclasses import replace
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.last_capture import LastCapture
-from brushloop.collect.engine.snapshot import CellCount, Snapshot, in_set_up
-from brushloop.collect.engine.tally import Tally, tally_of
+from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot, in_set_up
 from brushloop.collect.operator import Prompt
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.plan import AGAIN, Planned, with_review
+from brushloop.collect.protocols.plan import Planned, with_review
 from brushloop.collect.protocols.steps import MARKING, Step
-from brushloop.collect.rig.paper import Layout, Sheet
+from brushloop.collect.rig.paper import Layout
 from brushloop.drivers.clock import Clock
-from brushloop.sessions.events import ReviewResult, StepKind, StepResult
+from brushloop.sessions.events import (
+    CaptureResult,
+    Condition,
+    DipResult,
+    Press,
+    PressResult,
+    ReviewResult,
+    SelfCheckResult,
+    StepKind,
+    StepResult,
+)
 from brushloop.sessions.journal import RunState
 from brushloop.sessions.store import SessionStore
 
@@ -35,23 +44,15 @@ class Progress:
         """`layout` is that of the sheet; it determines the order of the strokes. `resumes` is the session's folder."""
         self._clock = clock
         self._lock = threading.Lock()
-        self._plan = protocol.planned(layout)
-        self._by_index = {p.index: p for p in self._plan}
-        self._first_free_index = 1 + max(self._by_index, default=0)
-        self._tally = Tally()
-        self._state = RunState()
-        self._sheet: Sheet | None = None
-        self._done_at_start = 0
+        self._planned = protocol.planned(layout)
+        self._layout = layout
+        self._resumes = resumes
+        self._store: SessionStore | None = None
+        self._tally = _Tally(self._planned)
         self._started_ns = clock.now_ns()
-        self._first_stroke_ns: int | None = None
-        self._last_stroke_ns: int | None = None
         self._over_ns: int | None = None
-        self._session_id = "" if resumes is None else resumes.name
-        self._source = ""
-        self._folder = "" if resumes is None else str(resumes)
         self._step = ""
         self._index: int | None = None
-        self._ink_level: float | None = None
         self._error = ""
         self._logged = 0
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
@@ -63,20 +64,13 @@ class Progress:
         self.set_up_over = False
         """Whether this process has begun a step after the set-up."""
 
-    def opened(self, store: SessionStore, sheet: Sheet) -> None:
-        """Begin with what a new or resumed session holds. `sheet` is how the paper is divided into patches."""
+    def opened(self, store: SessionStore) -> None:
+        """Begin with what a new or resumed session holds."""
         with self._lock:
-            self._folder = str(store.folder)
-            self._sheet = sheet
-            self._state = store.state
-            self._session_id = store.header.session_id
-            self._source = store.header.source
-            self._tally = tally_of(store.state)
-            for review in store.state.results(ReviewResult):
-                self._reviewed(review)
-            self._done_at_start = self._tally.done.total()
-        verb = f"resumed with {self._done_at_start} strokes" if self._done_at_start else "session"
-        self.log(f"{verb}: {store.folder}")
+            self._store = store
+            self._count()
+            done = self._tally.done.total()
+        self.log(f"{f'resumed with {done} strokes' if done else 'session'}: {store.folder}")
 
     def doing(self, what: str) -> None:
         """Say what the run is doing, in words."""
@@ -94,50 +88,34 @@ class Progress:
     def begun(self, step: Step) -> None:
         """Note that a step begins."""
         with self._lock:
-            self._tally = tally_of(self._state)
+            self._count()
             self.set_up_over = self.set_up_over or not in_set_up(step)
             if in_set_up(step):
                 self.set_up = step.kind
             elif step.kind in (StepKind.DIP, StepKind.CAPTURE) or step.kind in MARKING:
                 self._index = step.index
 
-    def finished(self, step: Step, result: StepResult) -> None:
-        """Note that a step is done."""
+    def finished(self, step: Step, result: StepResult | None) -> None:
+        """Note that a step is done, or was cut short (None)."""
         with self._lock:
-            self._tally = tally_of(self._state)
-            if isinstance(result, ReviewResult):
-                self._reviewed(result)
+            self._count()
             self.set_up = None
-            if in_set_up(step):
+            if in_set_up(step) and result is not None:
                 self.found[step.kind] = result
-            elif step.kind is StepKind.CAPTURE:
-                self._last_stroke_ns = self._clock.now_ns()
-                self._first_stroke_ns = self._first_stroke_ns or self._last_stroke_ns
-
-    def cut(self) -> None:
-        """Note that a step was cut short."""
-        with self._lock:
-            self._tally = tally_of(self._state)
-            self.set_up = None
 
     @property
     def first_free_index(self) -> int:
         """The lowest index above all steps of the protocol; the steps of repeated strokes begin there."""
-        return self._first_free_index
+        return 1 + max((stroke.index for stroke in self._planned), default=0)
 
     def more_than(self, stroke_id: str) -> bool:
         """Whether a stroke other than this one is still to be made."""
         with self._lock:
-            return any(p.stroke_id != stroke_id and p.stroke_id not in self._tally.over for p in self._plan)
+            return any(stroke.stroke_id != stroke_id for stroke in self._tally.left)
 
-    def made_again(self, stroke_id: str) -> Planned:
-        """Return the stroke that replaces `stroke_id`."""
-        with self._lock:
-            return next(p for p in self._plan if p.stroke_id == f"{stroke_id}{AGAIN}")
-
-    def planned(self, step: Step) -> Planned:
-        """The stroke that a step belongs to."""
-        return self._by_index[step.index]
+    def planned(self, index: int) -> Planned:
+        """The stroke whose steps have this index."""
+        return next(stroke for stroke in self._tally.plan if stroke.index == index)
 
     def show(self, last: LastCapture) -> None:
         """Show the newest capture."""
@@ -148,11 +126,6 @@ class Progress:
         """Show that the newest capture does not count."""
         with self._lock:
             self._last = None if self._last is None else replace(self._last, kept=False)
-
-    def inked(self, level: float | None) -> None:
-        """Show the level of the well before a dip, 0 to 1; None if nothing measures it."""
-        with self._lock:
-            self._ink_level = level
 
     def log(self, text: str, *, warning: bool = False) -> None:
         """Add a line to the operator's log."""
@@ -181,64 +154,141 @@ class Progress:
     ) -> Snapshot:
         """One consistent snapshot; values that only the engine knows keep their defaults."""
         with self._lock:
-            tally = self._tally
-            current = self._current()
-            waiting = (p for p in self._plan if p.stroke_id not in tally.over and p is not current)
-            following = next(waiting, None)
-            counts = Counter(p.condition for p in self._plan)
-            grid = tuple(
-                CellCount(
-                    asked,
-                    tally.done[asked],
-                    count,
-                    tally.bad[asked],
-                    tally.left_out[asked],
-                    current is not None and asked == current.condition,
-                    following is not None and asked == following.condition,
-                )
-                for asked, count in sorted(counts.items())
-            )
+            tally, store = self._tally, self._store
+            current = next((p for p in tally.left if p.index == self._index), None) if self._over_ns is None else None
+            following = next((p for p in tally.left if p is not current), None)
+            folder = self._resumes if store is None else store.folder
             return Snapshot(
-                session_id=self._session_id,
-                source=self._source,
+                session_id="" if folder is None else folder.name,
+                source="" if store is None else store.header.source,
                 state=state,
                 step=self._step,
                 strokes_done=tally.done.total(),
-                strokes_planned=len(self._plan),
-                grid=grid,
-                voids=len(self._state.cut),
+                strokes_planned=len(tally.plan),
+                grid=tally.grid(current, following),
+                voids=tally.voids,
                 given_up=tally.left_out.total(),
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
-                eta_s=self._eta_s(),
+                eta_s=tally.eta_s(),
                 tip_mm=tip_mm,
                 force_n=force_n,
                 prompt=prompt,
-                ink_level=self._ink_level,
+                ink_level=tally.ink_level,
                 messages=tuple(self._messages),
                 error=self._error,
                 messages_before=self._logged - len(self._messages),
-                sheet=None if self._sheet is None else tally.sheet(self._state.sheet, self._sheet.layout),
+                sheet=None if store is None or self._layout is None else tally.sheet(self._layout),
                 last=self._last,
                 stroke="" if current is None else current.stroke_id,
-                folder=self._folder,
+                folder="" if folder is None else str(folder),
             )
 
-    def _reviewed(self, result: ReviewResult) -> None:
-        """Replace each stroke that was marked bad by its repeat."""
-        self._plan = with_review(self._plan, result)
-        self._by_index = {p.index: p for p in self._plan}
+    def _count(self) -> None:
+        """Count again what the journal holds: its state is changed by the engine's thread only."""
+        assert self._store is not None
+        self._tally = _tally_of(self._store.state, self._planned, self._started_ns)
 
-    def _current(self) -> Planned | None:
-        """The stroke in progress."""
-        if self._index is None or self._over_ns is not None:
-            return None
-        stroke = self._by_index.get(self._index)
-        return None if stroke is None or stroke.stroke_id in self._tally.over else stroke
 
-    def _eta_s(self) -> float | None:
-        left = sum(p.stroke_id not in self._tally.over for p in self._plan)
-        timed = self._tally.done.total() - self._done_at_start - 1
-        if self._first_stroke_ns is None or self._last_stroke_ns is None or timed < 1:
-            return 0.0 if left == 0 else None
-        per_stroke_s = (self._last_stroke_ns - self._first_stroke_ns) / 1e9 / timed
-        return left * per_stroke_s
+@dataclass(slots=True)
+class _Tally:
+    """What the journal says of the plan at one moment."""
+
+    plan: list[Planned]
+    """After the reviews."""
+    sheet_number: int = 0
+    voids: int = 0
+    marks: dict[tuple[int, int], Mark] = field(default_factory=dict[tuple[int, int], Mark])
+    """State of patches, by (sheet, patch)."""
+    done: Counter[Condition] = field(default_factory=Counter[Condition])
+    """Captures that count."""
+    bad: Counter[Condition] = field(default_factory=Counter[Condition])
+    """Captures that do not count."""
+    left_out: Counter[Condition] = field(default_factory=Counter[Condition])
+    """Strokes that were given up."""
+    over: set[str] = field(default_factory=set[str])
+    """Names of finished strokes, kept or given up."""
+    captured_ns: list[int] = field(default_factory=list[int])
+    """Times of this process's captures that count."""
+    ink_level: float | None = None
+
+    @property
+    def left(self) -> Iterable[Planned]:
+        """Strokes that are still to be made, in order."""
+        return (stroke for stroke in self.plan if stroke.stroke_id not in self.over)
+
+    def grid(self, current: Planned | None, following: Planned | None) -> tuple[CellCount, ...]:
+        """The strokes of each condition."""
+        return tuple(
+            CellCount(
+                asked,
+                self.done[asked],
+                count,
+                self.bad[asked],
+                self.left_out[asked],
+                current is not None and asked == current.condition,
+                following is not None and asked == following.condition,
+            )
+            for asked, count in sorted(Counter(stroke.condition for stroke in self.plan).items())
+        )
+
+    def sheet(self, layout: Layout) -> SheetMap:
+        """The map of the sheet that is in."""
+        marks = tuple(self.marks.get((self.sheet_number, patch)) for patch in range(layout.capacity))
+        return SheetMap(self.sheet_number + 1, layout.columns, layout.rows, marks)
+
+    def eta_s(self) -> float | None:
+        """Remaining time; None until two strokes of this process give a time per stroke."""
+        left, timed = sum(1 for _ in self.left), len(self.captured_ns) - 1
+        if not left:
+            return 0.0
+        return left * (self.captured_ns[-1] - self.captured_ns[0]) / 1e9 / timed if timed > 0 else None
+
+    def mark(self, press: Press, mark: Mark) -> None:
+        """Note the state of the press's patch."""
+        if press.sheet is not None and press.patch is not None:
+            self.marks[press.sheet, press.patch] = mark
+
+    def leave_out(self, press: Press) -> None:
+        """Count a stroke that was given up."""
+        self.left_out[press.condition] += 1
+        self.over.add(press.stroke_id)
+
+
+def _tally_of(state: RunState, planned: list[Planned], since_ns: int) -> _Tally:
+    """Count what the journal holds; of the strokes that were pressed again after a review, only the repetition."""
+    tally = _Tally(planned, state.sheet, len(state.cut), dict.fromkeys(state.used_patches, Mark.VOID))
+    for begin in state.running.values():
+        if begin.patch is not None:
+            tally.marks[begin.sheet, begin.patch] = Mark.NOW
+    kept: dict[str, Press] = {}
+    for step in state.files.values():
+        match step.result:
+            case PressResult(press=press):
+                tally.mark(press, Mark.WAITING)
+            case SelfCheckResult(sheet=sheet, patches=patches):
+                tally.marks |= {(sheet, patch): Mark.CHECK for patch in patches}
+            case CaptureResult(press=press, kept=True):
+                tally.mark(press, Mark.KEPT)
+                kept[press.stroke_id] = press
+                tally.done[press.condition] += 1
+                tally.over.add(press.stroke_id)
+                tally.captured_ns += [step.t_ns] if step.t_ns >= since_ns else []
+            case CaptureResult(press=press, retake=retake):
+                tally.mark(press, Mark.BAD)
+                tally.bad[press.condition] += 1
+                if not retake:
+                    tally.leave_out(press)
+            case DipResult(ink_level=level, skipped=skipped):
+                tally.ink_level = level
+                if skipped is not None:
+                    tally.leave_out(skipped)
+            case ReviewResult(again=again) as review:
+                tally.plan = with_review(tally.plan, review)
+                for stroke in again:
+                    press = kept[stroke.stroke_id]
+                    tally.mark(press, Mark.BAD)
+                    tally.bad[press.condition] += 1
+                    tally.done[press.condition] -= 1
+            case _:
+                pass
+    return tally

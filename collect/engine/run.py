@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from brushloop.collect.engine.control import RunControl, State
 from brushloop.collect.engine.perform import Performer
@@ -35,6 +35,8 @@ class Run:
     control: RunControl
     guided: bool = False
     """A person accepts what each set-up step measured before it counts."""
+    done: set[str] = field(default_factory=set[str])
+    """Keys of the steps that this process has done."""
 
     async def protocol(self, protocol: Protocol) -> None:
         """Power on, retreat, do every step that is not in the journal yet, repeat what was marked bad, park."""
@@ -49,7 +51,7 @@ class Run:
             reviewed = await self._result(step)
             assert isinstance(reviewed, ReviewResult)
             for again in reviewed.again:
-                await self._walk(takes(self.context.progress.made_again(again.stroke_id)))
+                await self._walk(takes(self.context.progress.planned(again.index)))
         await self._once_arm_is_free(self._recover)  # the arm may have left for a dip that does not follow
 
     async def _walk(self, protocol: Protocol) -> None:
@@ -78,7 +80,7 @@ class Run:
     async def _result(self, step: Step) -> StepResult:
         """Return the result of a step: from the journal if it is done, else by doing it until it succeeds."""
         known = self.context.store.state.done.get(step.key)
-        if known is not None and (not step.run_scoped or step.key in self.context.memory.done):
+        if known is not None and (not step.run_scoped or step.key in self.done):
             return known.result
         failures, asked = 0, self.guided and in_set_up(step)
         while True:
@@ -87,7 +89,7 @@ class Run:
                 result = await self.performer.perform(step)
                 answer = await self._ask_about(result) if asked else GO_ON
                 if answer == GO_ON:
-                    self.context.memory.done.add(step.key)
+                    self.done.add(step.key)
                     return result
                 self.context.forget_camera()
                 step = by_method(step, answer)

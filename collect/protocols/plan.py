@@ -59,15 +59,16 @@ class Planned:
         return Press(stroke_id=self.stroke_id, condition=self.condition, take=take)
 
 
-def made_again(marked: Planned, index: int) -> Planned:
-    """The same press under a new name: the recording holds both, and the first stays marked bad."""
-    return replace(marked, stroke_id=f"{marked.stroke_id}{AGAIN}", index=index)
-
-
 def with_review(plan: Iterable[Planned], reviewed: ReviewResult) -> list[Planned]:
-    """The plan after a REVIEW step: each stroke that was marked bad is replaced by its repetition."""
+    """The plan after a REVIEW step: each stroke that was marked bad is replaced by the same under another name.
+
+    The recording holds both, and the first stays marked bad.
+    """
     indices = {again.stroke_id: again.index for again in reviewed.again}
-    return [made_again(p, indices[p.stroke_id]) if p.stroke_id in indices else p for p in plan]
+    return [
+        replace(p, stroke_id=f"{p.stroke_id}{AGAIN}", index=indices[p.stroke_id]) if p.stroke_id in indices else p
+        for p in plan
+    ]
 
 
 def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protocol:

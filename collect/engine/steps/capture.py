@@ -57,7 +57,7 @@ def _board(run: RunContext, image: Gray) -> tuple[Plane, tuple[Check, ...]]:
         raise StepError(f"the board is not seen: {error.what}") from None
     if (before := _before_first_mark(run)) is not None:
         _check_view(before, image, plane, run.rig.config.paper.size_mm)
-    run.memory.image_plane = plane
+    run.view = plane
     limits = run.rig.config.quality
     frame = check_frame(image, plane, limits)
     if limits.enabled and frame.cause is not None:
@@ -106,9 +106,9 @@ async def look_at_sheet(context: StepContext) -> None:
     """
     run = context.run
     sheet = run.store.state.sheet
-    if run.memory.looked_at_sheet == sheet or not run.rig.config.quality.enabled:
+    if run.looked_at_sheet == sheet or not run.rig.config.quality.enabled:
         return
-    run.memory.left_ink_ns = None
+    run.left_ink_ns = None
     with run.progress.meanwhile("check that the sheet is blank"):
         image = await photograph(context)
         inked = await uninterrupted(
@@ -119,7 +119,7 @@ async def look_at_sheet(context: StepContext) -> None:
             f"{len(inked)} patches of sheet {sheet + 1} that should be blank are not: {inked[0]} "
             "Put in a blank sheet, or the one that belongs here."
         )
-    run.memory.looked_at_sheet = sheet
+    run.looked_at_sheet = sheet
 
 
 def _inked_patches(run: RunContext, image: Gray, begun: int | None) -> list[str]:
@@ -198,7 +198,7 @@ async def _looked_at(
     """Record the frame, judge the stroke in it, and show both; nothing moves here."""
     image = await _recorded(context, frame)
     verdict = await _judged(context, step, image, patch, waited)
-    context.run.memory.sound_frame = image
+    context.run.sound_frame = image
     if context.run.asker.watched:
         await uninterrupted(_show, context, step, verdict, image, patch)
     return image, verdict
@@ -247,7 +247,7 @@ def _recorded_checks(checks: Iterable[Check]) -> tuple[records.Check, ...]:
 
 def _judge(run: RunContext, step: CaptureStep, image: Gray, patch: Patch) -> Verdict:
     depth_mm = step.press.condition.depth_mm
-    config, previous, plane = run.rig.config, run.memory.sound_frame, run.image_plane(image)
+    config, previous, plane = run.rig.config, run.sound_frame, run.image_plane(image)
     if step.drawn:
         return check_drawing(image, plane, patch, depth_mm=depth_mm, limits=config.quality, previous=previous)
     return check_capture(

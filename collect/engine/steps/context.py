@@ -30,16 +30,25 @@ _R = TypeVar("_R")
 
 
 @dataclass(slots=True)
-class RunMemory:
-    """What this process has seen and done on the rig; a new process starts without it."""
+class RunContext:
+    """The rig, the session and the operator, for the length of a run, and in what state brush, well and view are.
 
-    done: set[str] = field(default_factory=set[str])
-    """Keys of the steps that this process has done."""
+    A new process knows nothing of that state.
+    """
+
+    rig: Rig
+    store: SessionStore
+    progress: Progress
+    asker: Asker
+    procedures: Procedures
+    sheet: Sheet
+    protocol: ProtocolConfig
+    requests: OperatorRequests = field(default_factory=OperatorRequests)
     left_ink_ns: int | None = None
     """Host time at which the brush left the ink; None if it has marked since or may have lost its ink."""
-    image_plane: Plane | None = None
-    """Plane of the newest frame in which the board was seen."""
-    plane_of: tuple[Gray, Plane] | None = None
+    view: Plane | None = None
+    """Where the paper lies in the newest frame in which the board was seen."""
+    view_of: tuple[Gray, Plane] | None = None
     """The frame that was last searched for the board, and its plane: a capture is judged, then shown."""
     sound_frame: Gray | None = None
     """Newest valid gray photograph of the current sheet."""
@@ -52,21 +61,6 @@ class RunMemory:
     light: float | None = None
     """Light of the ink station as it was set; None without one."""
 
-
-@dataclass(frozen=True, slots=True)
-class RunContext:
-    """The rig, the session and the operator, for the length of a run."""
-
-    rig: Rig
-    store: SessionStore
-    progress: Progress
-    asker: Asker
-    procedures: Procedures
-    sheet: Sheet
-    protocol: ProtocolConfig
-    requests: OperatorRequests = field(default_factory=OperatorRequests)
-    memory: RunMemory = field(default_factory=RunMemory)
-
     def used_patches(self) -> set[int]:
         """Cells of the current sheet on which any mark was started, or which zero touch may ink."""
         state, config = self.store.state, self.rig.config
@@ -78,15 +72,15 @@ class RunContext:
 
         Raises `BadPicture` if none did.
         """
-        if self.memory.plane_of is not None and self.memory.plane_of[0] is image:
-            return self.memory.plane_of[1]
+        if self.view_of is not None and self.view_of[0] is image:
+            return self.view_of[1]
         try:
-            self.memory.image_plane = see_board(image, self.rig.config.board)
+            self.view = see_board(image, self.rig.config.board)
         except CalibrationError as error:
-            if self.memory.image_plane is None:
+            if self.view is None:
                 raise BadPicture(f"the board is not seen: {error.what}") from None
-        self.memory.plane_of = image, self.memory.image_plane
-        return self.memory.image_plane
+        self.view_of = image, self.view
+        return self.view
 
     def forget_camera(self) -> None:
         """Measure the camera's delay again before the next photograph: a person may have changed what it sees."""
@@ -95,7 +89,7 @@ class RunContext:
     def fresh_sheet(self) -> None:
         """Record that a person has put a fresh sheet in."""
         self.store.fresh_sheet()
-        self.memory.sound_frame = None
+        self.sound_frame = None
         self.forget_camera()
 
 

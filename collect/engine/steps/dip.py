@@ -28,19 +28,18 @@ async def dip(context: StepContext) -> DipResult:
     """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
     level = await fill_brush(context)
-    return DipResult(ink_level=level, dosed_ml=None if level is None else context.run.memory.dosed_ml)
+    return DipResult(ink_level=level, dosed_ml=None if level is None else context.run.dosed_ml)
 
 
 async def fill_brush(context: StepContext) -> float | None:
     """Fill up the well if needed, then dip. Return the level of the well, 0 to 1; None if nothing measures it."""
-    run, memory = context.run, context.run.memory
+    run = context.run
     with run.progress.meanwhile("dip"):
         level = await fill_well(run)
         if run.rig.ink is not None:
-            context.recorder.ink(level, memory.dosed_ml, memory.light)
-            run.progress.inked(level)
+            context.recorder.ink(level, run.dosed_ml, run.light)
         await context.guard.guarded(run.procedures.dip())
-        memory.left_ink_ns = run.rig.clock.now_ns()
+        run.left_ink_ns = run.rig.clock.now_ns()
     return level
 
 
@@ -49,7 +48,7 @@ async def set_light(run: RunContext) -> None:
     config = run.rig.config.ink.device
     light = config.light if isinstance(config, InkStationConfig) else None
     if run.rig.ink is not None and light is not None and await run.rig.ink.light(light):
-        run.memory.light = light
+        run.light = light
 
 
 async def fill_well(run: RunContext) -> float | None:
@@ -57,7 +56,7 @@ async def fill_well(run: RunContext) -> float | None:
 
     Raises `NeedsOperator` if a dose does not arrive, and `DeviceError`.
     """
-    ink, config, memory = run.rig.ink, run.rig.config.ink.device, run.memory
+    ink, config = run.rig.ink, run.rig.config.ink.device
     match config:
         case InkStationConfig():
             assert ink is not None
@@ -72,9 +71,9 @@ async def fill_well(run: RunContext) -> float | None:
                     )
             return level
         case ModbusPumpConfig():
-            if memory.dips % config.every_dips == config.every_dips - 1:
+            if run.dips % config.every_dips == config.every_dips - 1:
                 await _dose(run, config.dose_ml)
-            memory.dips += 1
+            run.dips += 1
         case None:
             pass
     return None
@@ -83,12 +82,12 @@ async def fill_well(run: RunContext) -> float | None:
 async def _dose(run: RunContext, dose_ml: float) -> None:
     assert run.rig.ink is not None
     await run.rig.ink.dose(dose_ml)
-    run.memory.dosed_ml += dose_ml
+    run.dosed_ml += dose_ml
 
 
 def must_dip(context: StepContext) -> bool:
     """Whether the brush must dip before it may press: it is not known to hold ink, or the ink has waited too long."""
-    left_ns = context.run.memory.left_ink_ns
+    left_ns = context.run.left_ink_ns
     return left_ns is None or context.run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9
 
 
@@ -115,7 +114,7 @@ class DipToTouch:
         """Start timing a stroke that begins with the move `first`; wait above the patch if the protocol asks for a
         fixed time after the dip."""
         run = self._context.run
-        left_ns, run.memory.left_ink_ns = run.memory.left_ink_ns, None
+        left_ns, run.left_ink_ns = run.left_ink_ns, None
         assert left_ns is not None
         if (wait_s := run.protocol.wait_after_dip_s) is not None:
             await run.procedures.go(first)

@@ -40,7 +40,7 @@ async def draw(context: StepContext, step: DrawStep) -> PressResult:
         for number, points in enumerate(drawn.strokes):
             if drawn.dips_before(number):
                 await fill_brush(context)
-            if run.memory.left_ink_ns is not None:
+            if run.left_ink_ns is not None:
                 await timing.begin(stroke_moves(config, plane, patch, points, drawn.speed_mm_s).down[0])
             stroke = draw_stroke(
                 run.rig.robot,

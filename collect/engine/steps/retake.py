@@ -57,7 +57,7 @@ async def _after_failure(
 
 def _cut_out(run: RunContext, image: Gray, patch: Patch) -> Gray:
     """The patch and a margin around it."""
-    plane = run.memory.image_plane
+    plane = run.view
     assert plane is not None
     x_mm, y_mm, size_x_mm, size_y_mm = patch.rect_mm
     corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm)])

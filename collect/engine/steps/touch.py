@@ -120,7 +120,7 @@ class _Effector:
     async def dip(self) -> None:
         """Fill the brush. The touch that follows takes ink, so the next press must dip again."""
         await fill_brush(self._context)
-        self._context.run.memory.left_ink_ns = None
+        self._context.run.left_ink_ns = None
 
     async def capture(self) -> Frame:
         """Park, and take a fresh frame."""

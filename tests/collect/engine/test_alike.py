@@ -10,7 +10,6 @@ import pytest
 from brushloop.collect.engine.progress import Progress
 from brushloop.collect.engine.steps import dip as dipping
 from brushloop.collect.engine.steps import touch as touching
-from brushloop.collect.engine.steps.context import RunMemory
 from brushloop.collect.planning.summary import make_plan
 from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import load_protocol
@@ -96,7 +95,7 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets
     recording = Recording(folder)
     [capture] = recording.captures()
     assert capture.stroke.dip_to_touch_s == waits[-1]
-    assert [seen.waited_s for seen in Review(folder).captures] == waits
+    assert [seen.press.dip_to_touch_s for seen in Review(folder).captures] == waits
     *_, (_, _, message) = open_mcap(recording.path).messages([str(Topic.QUALITY)])
     remark = Quality.model_validate_json(message.data).checks[-1]
     assert (remark.name, remark.score, remark.passed) == ("dip_to_touch", waits[-1], True)
@@ -114,14 +113,14 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
 
 
 async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = RunMemory()
+    run = SimpleNamespace(left_ink_ns=None)
 
     async def dipped(_context: Any) -> None:
-        memory.left_ink_ns = 1
+        run.left_ink_ns = 1
 
     monkeypatch.setattr(touching, "fill_brush", dipped)
-    await touching._Effector(cast(Any, SimpleNamespace(run=SimpleNamespace(memory=memory)))).dip()
-    assert memory.left_ink_ns is None
+    await touching._Effector(cast(Any, SimpleNamespace(run=run))).dip()
+    assert run.left_ink_ns is None
 
 
 @pytest.mark.parametrize(("protocol", "kind"), [(LIST, "press"), (FIGURE, "draw")])
@@ -182,5 +181,5 @@ def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     wait_for_end(engine)
     [folder] = lab.sessions.iterdir()
     assert engine.snapshot().strokes_done == 4
-    named = {seen.stroke_id: seen.unlike for seen in Review(folder).captures if seen.unlike}
+    named = {seen.press.stroke_id: seen.unlike for seen in Review(folder).captures if seen.unlike}
     assert "after its dip, the others after" in named["H11-a0-r03"]

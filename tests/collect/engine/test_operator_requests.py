@@ -118,8 +118,8 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
     [folder] = lab.sessions.iterdir()
-    assert mark_bad_or_good(folder, last.still, last.stroke_id, 1)
-    until(first, lambda now: now.stroke == f"{last.stroke_id}-again")
+    assert mark_bad_or_good(folder, last.still, last.press.stroke_id, 1)
+    until(first, lambda now: now.stroke == f"{last.press.stroke_id}-again")
     first.park()
     with pytest.raises(Parked):
         wait_for_end(first)
@@ -133,8 +133,8 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     assert len(lab.rig.world.presses) == 3 + now.voids
     captures = {capture.stroke.stroke_id: capture.bad for capture in Recording(folder).captures()}
     assert len(captures) == 3
-    assert {name for name, bad in captures.items() if bad} == {last.stroke_id}
-    assert f"{last.stroke_id}-again" in captures
+    assert {name for name, bad in captures.items() if bad} == {last.press.stroke_id}
+    assert f"{last.press.stroke_id}-again" in captures
 
 
 def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
@@ -144,7 +144,7 @@ def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
     last = until(engine, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
     [folder] = lab.sessions.iterdir()
-    assert [mark_bad_or_good(folder, last.still, last.stroke_id, n) for n in range(2)] == [True, False]
+    assert [mark_bad_or_good(folder, last.still, last.press.stroke_id, n) for n in range(2)] == [True, False]
     wait_for_end(engine)
     assert len(list(Recording(folder).captures())) == 2
 
