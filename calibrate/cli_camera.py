@@ -61,9 +61,6 @@ def intrinsics(
     marker_mm: Marker = 0.0,
     dictionary: Dictionary = "DICT_5X5_1000",
     limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
-    one_camera: Annotated[
-        bool, typer.Option("--one-camera", help="Continue although the photographs look like those of two cameras.")
-    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
     """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
@@ -93,7 +90,7 @@ def intrinsics(
                 seen.append(find_board(image, made, name))
             except CalibrationError as error:
                 unusable[name] = error.what
-    fitted = fit_lens(seen, limit_px, unusable, one_camera=one_camera)
+    fitted = fit_lens(seen, limit_px, unusable)
     file = lens_file(fitted, describe(made), digests, limit_px, made_by())
     for name, residual in file.residuals_px.items():
         say(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")

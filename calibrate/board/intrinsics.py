@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.cameras import TwoCameras, solve, two_cameras
 from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.lens import Floats, Lens, unknown_lens
 from brushloop.calibrate.board.pix2len import homography
@@ -41,6 +41,59 @@ SAME_SHARE = 0.0015
 """Share of the image's longer side below which two corners differ only by noise: 1 px of 640."""
 DISTINCT_DEG = 5.0
 """Boards turned by less count as one orientation: parallel planes determine a focal length no better than one does."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """A lens, and the pose of each board in front of it."""
+
+    lens: Lens
+    rms_px: float
+    residuals_px: Floats
+    """(views,) root mean square of each."""
+    turns: tuple[Floats, ...]
+    shifts_mm: tuple[Floats, ...]
+    """Rotation vector and translation of each board."""
+
+    @property
+    def normals(self) -> Floats:
+        """(views, 3) unit normals of the boards, toward the camera."""
+        found = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in self.turns])
+        return np.asarray(np.where(found[:, 2:] < 0.0, -found, found), np.float64)
+
+
+def solve(views: Sequence[BoardView], where: str) -> Solved:
+    """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` if none fits the views."""
+    size = views[0].size_px
+    objects = [_flat(view).astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
+    try:
+        rms, matrix, distortion, turns, shifts, _, _, per_view = cv2.calibrateCameraExtended(
+            objects, pixels, size, np.zeros((3, 3)), np.zeros(5)
+        )
+    except cv2.error as error:
+        raise CalibrationError(where, f"no lens explains these views: {error.err}") from None
+    return Solved(
+        Lens(np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).ravel()[:5], size),
+        float(rms),
+        np.asarray(per_view, np.float64).ravel(),
+        tuple(np.asarray(turn, np.float64) for turn in turns),
+        tuple(np.asarray(shift, np.float64) for shift in shifts),
+    )
+
+
+def _flat(view: BoardView) -> Floats:
+    """(n, 3) corners of a view in its board's own plane, z = 0."""
+    return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))])
+
+
+def residuals(lens: Lens, view: BoardView) -> Floats:
+    """(n, 2) px from where the lens puts each corner to where it was found, at the pose of the board that fits best."""
+    board = _flat(view)
+    _, turn, shift = cv2.solvePnP(board, view.pixels, lens.matrix, lens.distortion)
+    turn, shift = cv2.solvePnPRefineLM(board, view.pixels, lens.matrix, lens.distortion, turn, shift)
+    seen, _ = cv2.projectPoints(board, turn, shift, lens.matrix, lens.distortion)
+    return view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +133,10 @@ def fit_lens(
     views: Sequence[BoardView],
     rms_limit_px: float = RMS_LIMIT_PX,
     unusable: Mapping[str, str] | None = None,
-    *,
-    one_camera: bool = False,
 ) -> Fitted:
     """Fit a lens by Zhang's method to the views that fit together; `unusable` says why other photographs have no view.
 
-    Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of two cameras,
-    recognised by their size or (without `one_camera`) by the lens that they fit.
+    Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of several sizes.
     """
     seen, left_out = distinct_views(views)
     left_out = {**(unusable or {}), **left_out}
@@ -99,8 +149,6 @@ def fit_lens(
             problem = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
             raise CalibrationError(where, "; ".join([problem, *reasons(left_out)]))
         solved = solve(kept, where)
-        if not dropped and not one_camera and (two := two_cameras(kept, solved)) is not None:
-            raise CalibrationError(where, _two_cameras(two))
         residuals = solved.residuals_px
         worst = int(np.argmax(residuals))
         # The median of the others: one bad view of four would raise the median of all and be kept.
@@ -117,8 +165,8 @@ def fit_lens(
     slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(solved.normals[:, 2])), strict=True)}
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
     if solved.rms_px > rms_limit_px:
-        problem = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px: is the board flat, sharp and still?"
-        warnings.insert(0, problem)
+        exceeds = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px"
+        warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
     return Fitted(
         solved.lens,
         _focal(kept, ways, where),
@@ -140,14 +188,6 @@ def _one_size(views: Sequence[BoardView], where: str) -> None:
     if len(sizes) > 1:
         problem = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
         raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({problem})")
-
-
-def _two_cameras(two: TwoCameras) -> str:
-    one, other = (", ".join(part) for part in two.parts)
-    return (
-        f"are of two cameras: {one} leave {two.apart_px:.2f} px with a lens of their own, and so do {other}; "
-        f"all together leave {two.together_px:.2f} px. Give each camera's alone, or --one-camera if they are of one"
-    )
 
 
 def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, float] | None:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.board.artefact import LensFile
-from brushloop.calibrate.board.cameras import residuals
 from brushloop.calibrate.board.detect import BoardView
-from brushloop.calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted
+from brushloop.calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted, residuals
 from brushloop.calibrate.board.lens import Gray, Lens, rms
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, printable, render
