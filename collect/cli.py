@@ -121,7 +121,7 @@ def plan(
     from brushloop.collect.rig.paper import PaperPlane
 
     if picture is not None:
-        from brushloop.collect.rig.drawing import check_picture
+        from brushloop.collect.rig.picture import check_picture
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)

@@ -84,15 +84,13 @@ def show(
     import json
 
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.drawing import check_picture
+    from brushloop.collect.rig.picture import check_picture, draw_rig
     from brushloop.collect.rig.show import rig_json, rig_table
 
     if picture is not None:
         check_picture(picture)
     config = load_rig(rig)
     if picture is not None:
-        from brushloop.collect.rig.picture import draw_rig
-
         draw_rig(config, picture)
     say(json.dumps(rig_json(config)) if as_json else rig_table(config))
 

@@ -1,4 +1,4 @@
-"""A picture of the sheets from above: patches with their strokes, touch points, well, park position, board."""
+"""A picture of a plan: the rig from above, then each sheet with its strokes and touch points."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from brushloop.collect.planning.walk import sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
-from brushloop.collect.rig.paper import Sheet, to_paper
+from brushloop.collect.rig.paper import Sheet, to_base
+from brushloop.collect.rig.picture import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
 from brushloop.collect.touch.selfcheck import partners
 
 MOST_SHEETS = 11
@@ -21,7 +21,7 @@ MOST_SHEETS = 11
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `collect.rig.drawing.check_picture` must have passed.
+    """Write the picture, in the format of the file's ending. `collect.rig.picture.check_picture` must have passed.
 
     Raises OSError if it cannot be written.
     """
@@ -37,7 +37,10 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
     )
     axes: list[Axes] = list(picture.subplots(rows, columns, squeeze=False).flat)
     sheet = sheet_of(config, protocol)
-    _place(axes[0], config, plan, sheet)
+    from_above(axes[0], config)
+    touched = [to_base(config.paper, *at) for at in plan.touches_mm]
+    axes[0].plot(*zip(*touched, strict=True), "x", color=ORANGE, markersize=9, mew=2.0)
+    axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=4, frameon=False)
     drawn = {p.stroke_id: p.drawn for p in protocol.planned() if p.drawn is not None}
     for number, panel in enumerate(axes[1 : shown + 1], 1):
         _sheet(panel, config, sheet, number, plan, drawn)
@@ -46,31 +49,6 @@ def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Pat
     if plan.sheets > shown > 0:
         picture.suptitle(f"the first {shown} of {plan.sheets} sheets")
     picture.savefig(path, dpi=110)
-
-
-def _place(axes: Axes, config: RigConfig, plan: Plan, sheet: Sheet) -> None:
-    """Everything around the sheet, without strokes."""
-    from matplotlib.patches import Circle, Rectangle
-
-    board = config.board
-    size = [n * board.square_mm for n in board.squares]
-    axes.add_patch(Rectangle(board.origin_mm, *size, fill=False, edgecolor=GREY, linestyle="--", label="board"))
-    axes.add_patch(Rectangle((0.0, 0.0), *config.paper.size_mm, facecolor=PAPER, edgecolor="black", label="sheet"))
-    for index in range(sheet.capacity if plan.placed else 0):
-        patch = sheet.patch(index)
-        axes.add_patch(_outline(patch.rect_mm, GREY))
-    axes.add_patch(Circle(config.ink.well_mm, 6.0, facecolor=BLUE, edgecolor="black", label="well"))
-    axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=9, mew=2.5, label="touch point")
-    park = to_paper(config.paper, config.motion.park_mm[0], config.motion.park_mm[1])
-    axes.plot(*park, "^", color=GREEN, markersize=11, label="park")
-    axes.annotate("x", (0.0, 0.0), (40.0, 0.0), arrowprops={"arrowstyle": "<-", "color": "black"}, va="center")
-    axes.annotate("y", (0.0, 0.0), (0.0, 40.0), arrowprops={"arrowstyle": "<-", "color": "black"}, ha="center")
-    far = (board.origin_mm[0] + size[0], board.origin_mm[1] + size[1])
-    shown = ((0.0, 0.0), config.paper.size_mm, config.ink.well_mm, park, board.origin_mm, far)
-    for limit, along in zip((axes.set_xlim, axes.set_ylim), zip(*shown, strict=True), strict=True):
-        limit(min(along) - 15.0, max(along) + 15.0)
-    finish(axes, "rig and sheet from above, paper frame")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False)
 
 
 def _sheet(
@@ -97,7 +75,7 @@ def _sheet(
         points = max(4.0, min(0.34 * patch.size_y_mm, 0.17 * patch.size_x_mm) * 498.0 / config.paper.size_mm[0])
         if figure is not None:
             _figure(axes, patch.rect_mm, figure)
-            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{order} {_plain(press.stroke_id)}", fontsize=8)
+            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{order} {shown_name(press.stroke_id)}", fontsize=8)
         else:
             axes.text(
                 patch.x_mm + 0.36 * patch.size_x_mm,
@@ -131,11 +109,6 @@ def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Draw
         first = stroke[0]
         axes.plot(x_mm + first[0], y_mm + first[1], "o", mfc="white", mec=ORANGE, markersize=9)
         axes.text(x_mm + first[0], y_mm + first[1], str(number), fontsize=6, ha="center", va="center")
-
-
-def _plain(name: str) -> str:
-    """A name that every font can show: characters beyond Latin as code points, and nothing that is read as TeX."""
-    return "".join(c if ord(c) < 0x250 else f"U+{ord(c):04X}" for c in name).replace("$", r"\$")
 
 
 def _outline(rect_mm: tuple[float, float, float, float], edge: str, face: object = None) -> Any:

@@ -6,13 +6,12 @@ module of its own, and a member of `ProtocolConfig`.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
-import math
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args
 
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from brushloop.collect.errors import ConfigError
@@ -136,33 +135,6 @@ def read_rows(
     return tuple(rows), tuple(column for column in header if column not in row.model_fields)
 
 
-def allowed(row: type[BaseModel], column: str) -> str:
-    """The range of a column as text."""
-    words: list[str] = []
-    for rule in _rules(row, column):
-        match rule:
-            case Ge(ge=least):
-                words.append(f"at least {least:g}")
-            case Gt(gt=least):
-                words.append(f"more than {least:g}")
-            case Le(le=most):
-                words.append(f"at most {most:g}")
-            case Lt(lt=most):
-                words.append(f"less than {most:g}")
-            case _:
-                pass
-    return f"a number, {' and '.join(words)}" if words else ""
-
-
-def _rules(row: type[BaseModel], column: str) -> list[object]:
-    info = row.model_fields[column]
-    rules = list(info.metadata)
-    for part in getattr(info.annotation, "__args__", ()):
-        for rule in getattr(part, "__metadata__", ()):
-            rules += getattr(rule, "metadata", [rule])
-    return rules
-
-
 def _beside(protocol: Path, field: str, name: object) -> Path:
     if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
         raise ConfigError(protocol, field, f"must be the plain name of a file next to it (given: {name!r:.80})")
@@ -187,23 +159,16 @@ def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others
     return columns
 
 
-def _value(row: type[BaseModel], column: str, cell: str) -> str | float:
-    if not allowed(row, column):
-        return cell
-    try:
-        return number(cell)
-    except ValueError:
-        return math.nan  # outside any range
-
-
 def _checked(path: Path, line: int, row: type[_R], values: dict[str, str]) -> _R:
     try:
-        return row.model_validate({column: _value(row, column, cell) for column, cell in values.items()})
+        return row.model_validate({name: _value(name, cell) for name, cell in values.items()}, strict=True)
     except ValidationError as error:
-        first = error.errors()[0]
-        column = str(first["loc"][0])
-        if first["type"] == "missing":
-            raise ConfigError(path, f"line {line}: {column}", "is empty") from None
-        what = allowed(row, column)
-        what = f"must be {what}" if what else first["msg"].removeprefix("Value error, ")
-        raise ConfigError(path, f"line {line}: {column}", f"{what} (given: {values[column]!r:.80})") from None
+        refused = refusal(path, error, row)
+        raise ConfigError(path, f"line {line}: {refused.field}", refused.what) from None
+
+
+def _value(column: str, cell: str) -> str | float:
+    """The number in a cell; as text where it is none, which validation refuses in every other column."""
+    with contextlib.suppress(ValueError):
+        return cell if column == "stroke_id" else number(cell)
+    return cell

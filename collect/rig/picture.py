@@ -1,4 +1,4 @@
-"""A picture of the rig in the base frame, from above: box, sheet, board, and every place."""
+"""A picture of the rig in the base frame, from above: box, sheet, board, and every place. Plans use it too."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.drawing import BLUE, GREEN, GREY, ORANGE, PAPER, Axes, finish
 from brushloop.collect.rig.paper import to_base
 from brushloop.collect.rig.places import Kind, Place, places_of
 
+Axes = Any
+"""Axes of matplotlib, whose types are incomplete."""
+ENDINGS = (".png", ".svg", ".pdf", ".jpg")
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+"""From the palette of Okabe and Ito, which colour-blind people can tell apart; the marks differ in shape too."""
+PAPER = "#fbf7ea"
 MARKS: dict[Kind, tuple[str, str, str]] = {
     "well": ("o", BLUE, "well"),
     "rim": ("v", BLUE, "wipe, over the rim"),
@@ -23,8 +29,18 @@ MARKS: dict[Kind, tuple[str, str, str]] = {
 MARGIN_MM = 60.0
 
 
+def check_picture(path: Path) -> None:
+    """Raise `ConfigError` if no picture can be written to this path. Called before anything is computed."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ConfigError("--picture", "", f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    if not path.parent.is_dir():
+        raise ConfigError("--picture", "", f"{path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ConfigError("--picture", "", f"{path} is a folder")
+
+
 def draw_rig(config: RigConfig, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `collect.rig.drawing.check_picture` must have passed.
+    """Write the picture, in the format of the file's ending. `check_picture` must have passed.
 
     Raises OSError if it cannot be written.
     """
@@ -35,20 +51,20 @@ def rig_picture(config: RigConfig) -> Any:
     """The figure of matplotlib."""
     from matplotlib.figure import Figure as Picture
 
-    places = places_of(config)
     picture: Any = Picture(figsize=(7.2, 6.4), layout="constrained")
     above = picture.subplots()
-    _from_above(above, config, places)
+    from_above(above, config)
     handles, labels = above.get_legend_handles_labels()
     picture.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    picture.suptitle(f"{_plain(config.name)}: base frame, mm")
+    picture.suptitle(f"{shown_name(config.name)}: base frame, mm")
     return picture
 
 
-def _from_above(axes: Axes, config: RigConfig, places: Sequence[Place]) -> None:
+def from_above(axes: Axes, config: RigConfig) -> None:
+    """Everything that stands on the table, and the box of limits."""
     from matplotlib.patches import Polygon, Rectangle
 
-    limits, board = limits_of(config), config.board
+    limits, board, places = limits_of(config), config.board, places_of(config)
     axes.plot(0.0, 0.0, "+", color="black", markersize=14, mew=2.0, label="base of the arm")
     size = (limits.x_mm[1] - limits.x_mm[0], limits.y_mm[1] - limits.y_mm[0])
     corner = (limits.x_mm[0], limits.y_mm[0])
@@ -90,6 +106,15 @@ def _within(axes: Axes, points: Sequence[tuple[float, ...]]) -> None:
         limit(min(along) - MARGIN_MM, max(along) + MARGIN_MM)
 
 
-def _plain(name: str) -> str:
-    """Escape what matplotlib would read as TeX."""
-    return name.replace("$", r"\$")
+def finish(axes: Axes, title: str, along: tuple[str, str] = ("x mm", "y mm")) -> None:
+    """Equal scales, a title, and labels that say what runs `along` the axes."""
+    axes.set_aspect("equal")
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(along[0], fontsize=8)
+    axes.set_ylabel(along[1], fontsize=8)
+    axes.tick_params(labelsize=8)
+
+
+def shown_name(name: str) -> str:
+    """A name that every font can show: characters beyond Latin as code points, and nothing that is read as TeX."""
+    return "".join(c if ord(c) < 0x250 else f"U+{ord(c):04X}" for c in name).replace("$", r"\$")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from brushloop.collect.tui.levels import Coloured, grays
 from brushloop.collect.tui.pictures import binary_picture
@@ -14,42 +14,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brushloop.collect.engine.last_capture import LastCapture
+    from brushloop.collect.quality.verdict import Check
+    from brushloop.sessions import records
     from brushloop.sessions.events import Press
+
+    AnyCheck = Check | records.Check
+    """A check of a capture, from the running engine or from a recording."""
 
 WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
 """Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
 PHOTO_GRAYS = 12
 OVERLAY_PX = 384
 LINE_PX = 3
-
-
-class AnyCheck(Protocol):
-    """A check of a capture, from the running engine or from a recording."""
-
-    @property
-    def name(self) -> str:
-        """What is checked."""
-        ...
-
-    @property
-    def score(self) -> float | None:
-        """The measured value; None if it could not be measured."""
-        ...
-
-    @property
-    def threshold(self) -> float | None:
-        """Its limit."""
-        ...
-
-    @property
-    def passed(self) -> bool:
-        """Whether it is within the limit."""
-        ...
-
-    @property
-    def reason(self) -> str:
-        """What is wrong and what to do; empty where it passed."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
