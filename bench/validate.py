@@ -31,8 +31,8 @@ from bench.press_sessions import STILL, Presses, pressed, session
 from brushloop.calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
 from brushloop.calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
 from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.validate import pool as pools
 from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prepare_job, score_job
-from brushloop.calibrate.validate.pool import Dask, Threads
 from brushloop.model.brush import Brush as Bundle
 from brushloop.model.strokes import stroke_models
 from brushloop.sessions.recording import Recording
@@ -146,7 +146,7 @@ def _shifted(moving: NDArray[np.float64], fixed: NDArray[np.float64]) -> NDArray
 
 def threads(jobs: Sequence[PrepareJob], seed: int) -> list[Result]:
     """Finding strokes on photographs by threads, beside as many processes that have already started."""
-    with Threads() as pool, ProcessPoolExecutor(pool.workers, multiprocessing.get_context("spawn")) as processes:
+    with pools.threads() as pool, ProcessPoolExecutor(pool.workers, multiprocessing.get_context("spawn")) as processes:
         began = time.perf_counter()
         list(processes.map(prepare_job, jobs[: 4 * pool.workers]))
         start_s = time.perf_counter() - began
@@ -171,7 +171,7 @@ def cluster(under: Path, found: Sequence[PrepareJob], seed: int) -> list[Result]
     jobs = [(str(k), job) for k, job in enumerate(found)]
     taken: dict[int, float] = {}
     for workers in (1, 2):
-        with _workers(under, workers) as address, Dask(address) as pool:
+        with _workers(under, workers) as address, pools.cluster(address) as pool:
             list(pool.run(prepare_job, iter(jobs[: 2 * workers])))  # imports, and what is compiled at the first call
             began = time.perf_counter()
             list(pool.run(prepare_job, iter(jobs)))

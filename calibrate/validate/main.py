@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from brushloop.calibrate.validate.ablation import similarity_by_strokes
 from brushloop.calibrate.validate.candidates import generator_file
 from brushloop.calibrate.validate.extras import Extras, ExtrasRequest, find_extras
 from brushloop.calibrate.validate.gates import check_gates, parse_gate
-from brushloop.calibrate.validate.pool import Dask, Threads
+from brushloop.calibrate.validate.pool import cluster, threads
 from brushloop.calibrate.validate.report.data import Report
 from brushloop.calibrate.validate.report.figures import read_curve
 from brushloop.calibrate.validate.report.outputs import summary, summary_csv, table_3_csv, write_csv, write_parquet
@@ -126,7 +126,7 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
         request.tune_steps,
     )
     (folder / WORK).mkdir(parents=True, exist_ok=True)
-    with _locked(folder), _scheduler(request) as scheduler:
+    with _locked(folder), cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler:
         outcome = validate_presses(sessions, options, scheduler, folder / WORK, progress)
         with outcome.store:
             steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
@@ -238,7 +238,3 @@ def _locked(folder: Path) -> Generator[None]:
         yield
     finally:
         lock.release()
-
-
-def _scheduler(request: Request) -> AbstractContextManager[Threads] | AbstractContextManager[Dask]:
-    return Dask(request.scheduler) if request.scheduler else Threads(request.workers)

@@ -19,7 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.validate.pool import ClusterError, Dask
+from brushloop.calibrate.validate import pool
+from brushloop.calibrate.validate.pool import ClusterError
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [
@@ -132,8 +133,8 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
 def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     program = (
         "import brushloop.calibrate.validate.store as store; store.VERSION = 'of tomorrow'\n"
-        "from brushloop.calibrate.validate.pool import ClusterError, Dask\n"
-        f"try:\n    Dask({cluster.address!r})\nexcept ClusterError as error:\n    print(error)\n"
+        "from brushloop.calibrate.validate.pool import ClusterError, cluster\n"
+        f"try:\n    with cluster({cluster.address!r}):\n        pass\nexcept ClusterError as error:\n    print(error)\n"
     )
     deadline = time.monotonic() + PATIENCE_S
     said = "has no worker"
@@ -153,17 +154,17 @@ import os, signal
 from pathlib import Path
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.validate.jobs import PrepareJob, prepare_job
-from brushloop.calibrate.validate.pool import Dask, Threads
+from brushloop.calibrate.validate.pool import cluster, threads
 from brushloop.sessions.recording import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
 jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
 there = {{}}
-with Dask({cluster.address!r}) as pool:
+with cluster({cluster.address!r}) as pool:
     for name, press in pool.run(prepare_job, iter(jobs)):
         there[name] = press
         if len(there) == 5:
             os.kill({cluster.workers[0].pid}, signal.SIGKILL)
-with Threads(1) as pool:
+with threads(1) as pool:
     here = dict(pool.run(prepare_job, iter(jobs)))
 print(len(there), there == here)
 """
@@ -176,5 +177,5 @@ print(len(there), there == here)
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ClusterError, match=r"brushloop\[cluster\]"):
-        Dask("tcp://127.0.0.1:9")
+    with pytest.raises(ClusterError, match=r"brushloop\[cluster\]"), pool.cluster("tcp://127.0.0.1:9"):
+        pass

@@ -11,7 +11,7 @@ from bench.validate import scoring
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.validate import jobs
 from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
-from brushloop.calibrate.validate.pool import Threads
+from brushloop.calibrate.validate.pool import threads
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Options, validate_presses
 from brushloop.calibrate.validate.sources import open_session
 from brushloop.sessions.recording import Recording
@@ -33,7 +33,7 @@ def test_the_repetition_is_scored_against_its_original_only(
 
     monkeypatch.setattr(jobs, "prepare_job", repeating)
     sessions = [open_session(str(place), tmp_path, None, None) for place in (session, again)]
-    with Threads(1) as pool:
+    with threads(1) as pool:
         outcome = validate_presses(sessions, Options(held_out=False), pool, tmp_path, lambda *_: None)
     with outcome.store:
         found = outcome.scores.of(REPEATED)[:, :, 0]
