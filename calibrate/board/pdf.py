@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from brushloop.calibrate.board.spec import Board, Checkerboard, charuco_board, d
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target
 
-POINTS_PER_MM = 72.0 / 25.4
+MM_PER_INCH = 25.4
 PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "letter": (215.9, 279.4)}
 MARGIN_MM = 8.0
 RULER_MM = 100.0
@@ -30,9 +30,7 @@ def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
         raise CalibrationError(str(path), f"there is no folder {path.parent}")
     if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):
         raise CalibrationError(str(path), "exists and is not a PDF; it is not overwritten")
-    page_mm = _page(board, page)
-    content = _content(board, page_mm)
-    path.write_bytes(_document(page_mm, content))
+    drawn(board, page).savefig(path, format="pdf", metadata={"CreationDate": None})
     return path
 
 
@@ -69,7 +67,14 @@ def _page(board: Board, page: str) -> tuple[float, float]:
     )
 
 
-def _content(board: Board, page_mm: tuple[float, float]) -> bytes:
+def drawn(board: Board, page: str) -> Any:
+    """The page with board and ruler, a matplotlib figure. Raises `CalibrationError` if the board does not fit."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle as Patch
+    from matplotlib.transforms import Affine2D
+
+    page_mm = _page(board, page)
     width, height = size_mm(board)
     left, top = (page_mm[0] - width) / 2.0, (page_mm[1] - height - RULER_ROOM_MM) / 2.0
     black = [(left + x, top + y, w, h) for x, y, w, h in rectangles(board)]
@@ -79,14 +84,16 @@ def _content(board: Board, page_mm: tuple[float, float]) -> bytes:
     black += [
         (left + at - 0.1, below, 0.2, 3.0 if at % 50 == 0 else 2.0) for at in np.arange(0.0, ruler_mm + 1.0, 10.0)
     ]
-    lines = ["0 g"]
-    # From mm with y down to points with y up.
-    lines.append(f"{POINTS_PER_MM:.9f} 0 0 {-POINTS_PER_MM:.9f} 0 {page_mm[1] * POINTS_PER_MM:.6f} cm")
-    lines += [f"{x:.5f} {y:.5f} {w:.5f} {h:.5f} re" for x, y, w, h in black]
-    lines.append("f")
+    figure: Any = Figure(figsize=(page_mm[0] / MM_PER_INCH, page_mm[1] / MM_PER_INCH))
+    # From mm with y down to inches with y up.
+    from_mm = Affine2D().translate(0.0, -page_mm[1]).scale(1.0 / MM_PER_INCH, -1.0 / MM_PER_INCH)
+    patches = [Patch((x, y), w, h) for x, y, w, h in black]
+    figure.add_artist(
+        PatchCollection(patches, color="black", linewidth=0.0, transform=from_mm + figure.dpi_scale_trans)
+    )
     words = f"{describe(board)}. Print at 100 %; the line is {ruler_mm:g} mm long."
-    lines += ["BT", f"/F1 2.6 Tf 1 0 0 -1 {left:.3f} {below + 6.5:.3f} Tm", f"({words}) Tj", "ET"]
-    return "\n".join(lines).encode("ascii")
+    figure.text(left / page_mm[0], 1.0 - (below + 6.5) / page_mm[1], words, fontsize=7.0)
+    return figure
 
 
 def _squares(columns: int, rows: int, side: float) -> list[Rectangle]:
@@ -96,29 +103,3 @@ def _squares(columns: int, rows: int, side: float) -> list[Rectangle]:
 def _runs(black: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[tuple[int, int]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], black, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _document(page_mm: tuple[float, float], content: bytes) -> bytes:
-    """PDF 1.4 with one page (ISO 32000-1, 7.5): five objects, their offsets, the trailer."""
-    width, height = (v * POINTS_PER_MM for v in page_mm)
-    packed = zlib.compress(content)
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] /Contents 4 0 R "
-        f"/Resources << /Font << /F1 5 0 R >> >> >>".encode(),
-        f"<< /Length {len(packed)} /Filter /FlateDecode >>\nstream\n".encode() + packed + b"\nendstream",
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    document, offsets = b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n", list[int]()
-    for number, body in enumerate(objects, start=1):
-        offsets.append(len(document))
-        document += f"{number} 0 obj\n".encode() + body + b"\nendobj\n"
-    table = b"".join(f"{offset:010d} 00000 n \n".encode() for offset in offsets)
-    count = len(objects) + 1
-    return (
-        document
-        + f"xref\n0 {count}\n0000000000 65535 f \n".encode()
-        + table
-        + f"trailer\n<< /Size {count} /Root 1 0 R >>\nstartxref\n{len(document)}\n%%EOF\n".encode()
-    )
