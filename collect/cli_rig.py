@@ -75,9 +75,7 @@ def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
 @app.command()
 def show(
     rig: RigFile,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw it from above and from the side: .png, .svg, .pdf or .jpg.")
-    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
     as_json: Json = False,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import statistics
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import (
@@ -23,9 +22,11 @@ from brushloop.drivers.errors import (
     Stuck,
     too_busy,
 )
-from brushloop.drivers.force.rounds import BITRATE, RoundAssembler, Wrench
-from brushloop.drivers.force.stream import BusSettings, ForceHealth, RoundStream
+from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.force.stream import ForceHealth, RoundStream, SriOptions
 from brushloop.drivers.samples import ForceSample, Identity, Stamp
+
+__all__ = ["SriM8123", "SriOptions"]
 
 DEVICE = "force"
 AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
@@ -36,32 +37,6 @@ MAX_BIAS_S = 60.0
 MORE_BIAS_S = 1.0
 """Extra averaging time if too few rounds arrived."""
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class SriOptions:
-    """Which bus the board is on, and which samples to accept."""
-
-    interface: str = "socketcan"
-    channel: str = "can0"
-    bitrate: int = BITRATE
-    host: str | None = None
-    """Address of a CAN gateway, for the interface `socketcand`."""
-    port: int | None = None
-    stale_after_ms: float = 100.0
-    stuck_after_ms: float = 100.0
-    """Time over which rounds that are equal to the last bit in all six values mean a stuck sensor."""
-    connect_timeout_s: float = 2.0
-    round_ms: float = 5.0
-    """Longest time from the first to the third frame of a round. It must be shorter than the sensor's period:
-    otherwise two rounds that each lost frames can pass for one."""
-    gap_ms: float = 20.0
-    max_n: float = 1000.0
-    max_nm: float = 100.0
-    """Values beyond what the sensor can measure are refused like NaN."""
-    still_n: float = 0.05
-    still_nm: float = 0.01
-    """The largest standard deviation, in each axis, at which the sensor counts as still."""
 
 
 class SriM8123:
@@ -100,10 +75,8 @@ class SriM8123:
                 self._listener(self._sample(stamp, wrench))
 
         stream = RoundStream(
-            BusSettings(options.interface, options.channel, options.bitrate, options.host, options.port),
-            RoundAssembler(round_ms=options.round_ms, max_n=options.max_n, max_nm=options.max_nm),
+            options,
             self._clock,
-            gap_ms=options.gap_ms,
             on_round=on_round,
             on_loss=lambda: in_loop(begun.set),
         )

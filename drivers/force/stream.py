@@ -11,7 +11,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from brushloop.drivers.clock import Clock
-from brushloop.drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, RoundAssembler, Wrench
+from brushloop.drivers.force.rounds import (
+    BITRATE,
+    BUS_OFF,
+    COMMAND_ID,
+    LOOPBACK_CHANNEL,
+    START,
+    STOP,
+    RoundAssembler,
+    Wrench,
+)
 from brushloop.drivers.samples import Stamp
 
 if TYPE_CHECKING:
@@ -24,15 +33,28 @@ SILENT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class BusSettings:
-    """Settings of the bus that python-can opens."""
+class SriOptions:
+    """Which bus the board is on, and which samples to accept."""
 
-    interface: str
-    channel: str
-    bitrate: int
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int = BITRATE
     host: str | None = None
-    """Host of a gateway (`socketcand`); None if the adapter is in this machine."""
+    """Address of a CAN gateway, for the interface `socketcand`."""
     port: int | None = None
+    stale_after_ms: float = 100.0
+    stuck_after_ms: float = 100.0
+    """Time over which rounds that are equal to the last bit in all six values mean a stuck sensor."""
+    connect_timeout_s: float = 2.0
+    round_ms: float = 5.0
+    """Longest time from the first to the third frame of a round. It must be shorter than the sensor's period:
+    otherwise two rounds that each lost frames can pass for one."""
+    max_n: float = 1000.0
+    max_nm: float = 100.0
+    """Values beyond what the sensor can measure are refused like NaN."""
+    still_n: float = 0.05
+    still_nm: float = 0.01
+    """The largest standard deviation, in each axis, at which the sensor counts as still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +68,6 @@ class ForceHealth:
     """Dropped rounds in which a frame was missing, late or malformed."""
     refused: int
     """Dropped complete rounds with NaN, inf or a value beyond the sensor's range."""
-    gaps: int
-    """Pauses between good rounds longer than `gap_ms`."""
     bus_errors: int
 
 
@@ -64,23 +84,20 @@ class RoundStream:
 
     def __init__(
         self,
-        settings: BusSettings,
-        assembler: RoundAssembler,
+        options: SriOptions,
         clock: Clock,
         *,
-        gap_ms: float,
         on_round: Callable[[Stamp, Wrench], None],
         on_loss: Callable[[], None],
     ) -> None:
-        self._settings = settings
-        self._assembler = assembler
+        self._options = options
+        self._assembler = RoundAssembler(round_ms=options.round_ms, max_n=options.max_n, max_nm=options.max_nm)
         self._clock = clock
-        self._gap_ns = round(gap_ms * 1e6)
         self._on_round = on_round
         self._on_loss = on_loss
         self._closing = threading.Event()
         self._arrivals_ns: deque[int] = deque(maxlen=RATE_WINDOW)
-        self._rounds = self._gaps = self._bus_errors = 0
+        self._rounds = self._bus_errors = 0
         self.newest: tuple[Stamp, Wrench] | None = None
         self.alike = 0
         """Number of newest rounds in a row that exactly equal the one before; a strain gauge is never that still."""
@@ -108,7 +125,7 @@ class RoundStream:
         span_ns = arrivals_ns[-1] - arrivals_ns[0] if len(arrivals_ns) > 1 else 0
         rate_hz = (len(arrivals_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
         parts = self._assembler
-        return ForceHealth(rate_hz, self._rounds, parts.torn, parts.refused, self._gaps, self._bus_errors)
+        return ForceHealth(rate_hz, self._rounds, parts.torn, parts.refused, self._bus_errors)
 
     def _run(self) -> None:
         try:
@@ -120,7 +137,7 @@ class RoundStream:
             self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
-            self.channel_info, self.virtual = str(bus.channel_info), _is_virtual(self._settings)
+            self.channel_info, self.virtual = str(bus.channel_info), _is_virtual(self._options)
             bus.send(command(START), timeout=1.0)
             heard, quiet_s = False, 0.0
             while self.loss is None and not self._closing.is_set():
@@ -147,12 +164,12 @@ class RoundStream:
     def _open(self) -> can.BusABC:
         import can
 
-        settings = self._settings
+        options = self._options
         # Use these settings only: python-can would also read can.ini, the environment and the home folder.
         # The library warns of frames that arrive in two pieces, which is harmless; a lost frame shows in the counts.
         logging.getLogger("can").setLevel(logging.ERROR)
-        gateway: dict[str, Any] = {} if settings.host is None else {"host": settings.host, "port": settings.port}
-        return can.Bus(settings.channel, settings.interface, ignore_config=True, bitrate=settings.bitrate, **gateway)
+        gateway: dict[str, Any] = {} if options.host is None else {"host": options.host, "port": options.port}
+        return can.Bus(options.channel, options.interface, ignore_config=True, bitrate=options.bitrate, **gateway)
 
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
@@ -167,8 +184,6 @@ class RoundStream:
             return
         device_ns = round(message.timestamp * 1e9) or None  # 0: the adapter has no clock
         now_ns = self._clock.now_ns()
-        if self._arrivals_ns and now_ns - self._arrivals_ns[-1] > self._gap_ns:
-            self._gaps += 1
         self._arrivals_ns.append(now_ns)
         stamp = Stamp(now_ns, device_ns, self._rounds)
         self._rounds += 1
@@ -183,12 +198,12 @@ class RoundStream:
 
     @property
     def _name(self) -> str:
-        return f"{self._settings.interface} {self._settings.channel}"
+        return f"{self._options.interface} {self._options.channel}"
 
     def _lose_bus(self, what: str) -> None:
         self._lose(
             f"the bus {self._name} {what}",
-            f"Check wiring, termination and that both ends run at {self._settings.bitrate} bit/s; "
+            f"Check wiring, termination and that both ends run at {self._options.bitrate} bit/s; "
             "then set the interface down and up, and connect again.",
         )
 
@@ -204,7 +219,5 @@ def command(data: bytes) -> can.Message:
     return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)
 
 
-def _is_virtual(settings: BusSettings) -> bool:
-    return settings.interface == "virtual" or (
-        settings.interface == "socketcand" and settings.channel == LOOPBACK_CHANNEL
-    )
+def _is_virtual(options: SriOptions) -> bool:
+    return options.interface == "virtual" or (options.interface == "socketcand" and options.channel == LOOPBACK_CHANNEL)

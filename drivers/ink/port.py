@@ -14,8 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Literal, Protocol, TypeVar, cast
+from typing import Protocol, TypeVar, cast
 
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -84,18 +83,6 @@ REPLUG = "Check cable, power and the path of the port, then connect again."
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class SerialSettings:
-    """Settings of a serial port; `path` is the device file or COM port."""
-
-    path: str
-    baud: int
-    parity: Literal["N", "E", "O"] = "N"
-    stopbits: Literal[1, 2] = 1
-    gap_s: float = 0.0
-    """Silence before each request, which separates frames in Modbus RTU."""
-
-
 class _Port(Protocol):
     """The part of pyserial's API that is used; pyserial ships no types."""
 
@@ -109,9 +96,13 @@ class _Port(Protocol):
 class SerialPort:
     """Requests and replies over pyserial, without blocking the event loop."""
 
-    def __init__(self, device: str, settings: SerialSettings) -> None:
+    def __init__(self, device: str, path: str, baud: int, gap_s: float = 0.0) -> None:
+        """`path` is the device file or COM port; `gap_s` a silence before each request, which separates frames in
+        Modbus RTU."""
         self._device = device
-        self._settings = settings
+        self._path = path
+        self._baud = baud
+        self._gap_s = gap_s
         self._worker: ThreadPoolExecutor | None = None
         self._port: _Port | None = None
         self._lost: str | None = None
@@ -121,7 +112,7 @@ class SerialPort:
         """Open the port for this process alone. Raises `ConnectionLost`."""
         await self.close()
         self._lost, self._closing = None, threading.Event()
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"serial {self._settings.path}")
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"serial {self._path}")
         try:
             await asyncio.get_running_loop().run_in_executor(self._worker, self._open)
         except BaseException:
@@ -166,19 +157,10 @@ class SerialPort:
     def _open(self) -> None:
         import serial
 
-        settings = self._settings
         try:
-            port = serial.Serial(
-                settings.path,
-                settings.baud,
-                parity=settings.parity,
-                stopbits=settings.stopbits,
-                timeout=POLL_S,
-                write_timeout=1.0,
-                exclusive=True,
-            )
+            port = serial.Serial(self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True)
         except (OSError, ValueError) as error:  # pyserial's own error is an OSError
-            why = f"cannot open {settings.path}: {error}"
+            why = f"cannot open {self._path}: {error}"
             raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
         self._port = cast("_Port", port)
 
@@ -202,7 +184,7 @@ class SerialPort:
         if port is None or closing.is_set():
             raise NotConnected(self._device, op, "closed while waiting")
         try:
-            time.sleep(self._settings.gap_s)
+            time.sleep(self._gap_s)
             if waiting := port.in_waiting:
                 port.read(waiting)  # late replies and noise from before this request
             port.write(request)
@@ -220,7 +202,7 @@ class SerialPort:
                     break
             return received, None
         except OSError as error:
-            self._lost = f"{self._settings.path}: {error.strerror or error}"
+            self._lost = f"{self._path}: {error.strerror or error}"
             raise ConnectionLost(self._device, op, self._lost) from None
 
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import dataclass
-from typing import Literal
 
 from brushloop.drivers.cancellation import finished
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.ink.modbus import DEVICE, EXCEPTIONS, find_reply, write_register
-from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings
+from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort
 from brushloop.drivers.samples import Identity
 
 SPEED_REGISTER = 1
@@ -37,8 +36,6 @@ class PumpOptions:
     rpm: float = 50.0
     unit: int = 1
     baud: int = 9600
-    parity: Literal["N", "E", "O"] = "N"
-    stopbits: Literal[1, 2] = 1
     max_dose_ml: float = 2.0
     max_per_minute_ml: float = 5.0
     timeout_s: float = 0.5
@@ -64,12 +61,7 @@ class ModbusPump:
     def __init__(self, options: PumpOptions, clock: Clock) -> None:
         self._options = options
         self._clock = clock
-        self._port = SerialPort(
-            DEVICE,
-            SerialSettings(
-                options.path, options.baud, parity=options.parity, stopbits=options.stopbits, gap_s=options.gap_s
-            ),
-        )
+        self._port = SerialPort(DEVICE, options.path, options.baud, options.gap_s)
         # Below a tenth of a second the time that messages take would matter more than the time pumped.
         self._ml_per_s = options.ml_per_revolution * options.rpm / 60.0
         self._budget = DoseBudget(

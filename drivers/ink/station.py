@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
-from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, SerialSettings, crc16
+from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, crc16
 from brushloop.drivers.samples import Identity
 
 DEVICE = "ink"
@@ -129,7 +129,7 @@ class InkStation:
     def __init__(self, options: StationOptions, clock: Clock) -> None:
         self._options = options
         self._clock = clock
-        self._port = SerialPort(DEVICE, SerialSettings(options.path, options.baud))
+        self._port = SerialPort(DEVICE, options.path, options.baud)
         self._budget = DoseBudget(
             DEVICE,
             smallest_ml=SMALLEST_ML,

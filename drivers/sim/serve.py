@@ -6,16 +6,13 @@ import asyncio
 import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.control import live_control
 from brushloop.drivers.sim.described import SimFileError
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.rig_toml import LOOPBACK_HEAD
-
-if TYPE_CHECKING:
-    from brushloop.drivers.sim.lab.traps import Trap
 
 
 def serve(
@@ -31,24 +28,18 @@ def serve(
     Raises `SimFileError` for a control socket that cannot be created, and rather than overwrite a file that no loopback
     rig wrote.
     """
-    asyncio.run(_serve(config, write_rig, idle_exit_s, tell, control))
 
-
-async def _serve(
-    config: SimConfig,
-    write_rig: Path | None,
-    idle_exit_s: float,
-    tell: Callable[[str], None],
-    control: Path | None,
-) -> None:
-    over = _signalled()
-    if write_rig is not None:
-        _refuse_to_overwrite(write_rig)
-    async with LoopbackRig(config) as rig, live_control(rig.faults, control):
+    async def served() -> None:
+        over = _signalled()
         if write_rig is not None:
-            _write_whole(write_rig, rig.toml())
-        tell(f"{rig.where()}; Ctrl-C ends")
-        await _until_over(rig, over, idle_exit_s)
+            _refuse_to_overwrite(write_rig)
+        async with LoopbackRig(config) as rig, live_control(rig.faults, control):
+            if write_rig is not None:
+                _write_whole(write_rig, rig.toml())
+            tell(f"{rig.where()}; Ctrl-C ends")
+            await _until_over(rig, over, idle_exit_s)
+
+    asyncio.run(served())
 
 
 def serve_unknown(
@@ -65,41 +56,34 @@ def serve_unknown(
 
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
     """
+    from brushloop.drivers.sim.lab.lab import UnknownLab
+    from brushloop.drivers.sim.lab.seen import truth_text
     from brushloop.drivers.sim.lab.traps import Trap
 
     if trap is not None and trap not in [*Trap]:
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
     if truth is not None and truth.exists() and b'"seed"' not in truth.read_bytes()[:100]:
         raise LabRefused(f"{truth}: exists and is not the truth of a lab; it is not overwritten")
-    asyncio.run(_serve_unknown(seed, None if trap is None else Trap(trap), rate, idle_exit_s, tell, truth, control))
+    lab = UnknownLab(seed, None if trap is None else Trap(trap), rate=rate)
 
-
-async def _serve_unknown(
-    seed: int,
-    trap: Trap | None,
-    rate: float,
-    idle_exit_s: float,
-    tell: Callable[..., None],
-    truth: Path | None,
-    control: Path | None,
-) -> None:
-    from brushloop.drivers.sim.lab.lab import UnknownLab
-    from brushloop.drivers.sim.lab.seen import truth_text
-
-    over, lab = _signalled(), UnknownLab(seed, trap, rate=rate)
+    def write_truth() -> None:
+        if truth is not None:
+            _write_whole(truth, truth_text(lab.facts, lab.trap))
 
     async def obey(request: Mapping[str, object]) -> dict[str, Any]:
         answer = await lab.obey(request)
-        if truth is not None:
-            _write_whole(truth, truth_text(lab.facts, lab.trap))  # what was mended is no longer as it was
+        write_truth()  # what was mended is no longer as it was
         return answer
 
-    async with lab, live_control(lab.rig.faults, control, obey):
-        if truth is not None:
-            _write_whole(truth, truth_text(lab.facts, lab.trap))
-        how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
-        tell(*lab.seen().lines(), *how, "Ctrl-C ends")
-        await _until_over(lab.rig, over, idle_exit_s)
+    async def served() -> None:
+        over = _signalled()
+        async with lab, live_control(lab.rig.faults, control, obey):
+            write_truth()
+            how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
+            tell(*lab.seen().lines(), *how, "Ctrl-C ends")
+            await _until_over(lab.rig, over, idle_exit_s)
+
+    asyncio.run(served())
 
 
 def _signalled() -> asyncio.Event:

@@ -14,7 +14,7 @@ from brushloop.drivers.force.rounds import Wrench
 from brushloop.drivers.geometry import brush_pose, from_wire, lean
 from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.kinematics import Matrix, matrix_of
-from brushloop.drivers.sim.arm.queue import ArmQueue
+from brushloop.drivers.sim.arm.motion import MotionQueue
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush
 from brushloop.drivers.sim.brush.contact import Contact, ContactWatch, Reaction, bent_toward, leaning_with
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
@@ -138,7 +138,7 @@ class World:
         """While a person guides the arm, the brush is dry and held lightly: contacts leave nothing."""
         self.push_n = (0.0, 0.0, 0.0)
         """Force of a person's finger on the tip, in the base frame."""
-        self.motion = ArmQueue(brush_pose(*config.home_mm), self._travelled, tool_of(config))
+        self.motion = MotionQueue(brush_pose(*config.home_mm), self._travelled, tool_of(config))
         self._felt: tuple[object, Wrench] | None = None
         """The state that the last wrench was computed from, and the wrench: neither changes while the arm rests."""
 

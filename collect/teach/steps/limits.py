@@ -45,10 +45,10 @@ class LimitsStep(Step):
         found = self.derived(day.notebook)
         rig = rig_of(day.notebook.with_values(found), day.rig_path)
         picture = day.rig_path.with_name(f"{day.rig_path.stem}.limits.png")
-        await day.working("drawing reach, box and places")
+        await day.working("drawing box and places")
         await asyncio.to_thread(draw_rig, rig, picture)
         await day.say(
-            f"{picture} shows reach, box, sheet, board, well and park, from above and from the side.",
+            f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
         for axis, field in zip("xyz", _box_fields(), strict=True):

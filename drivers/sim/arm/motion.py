@@ -1,5 +1,7 @@
 """The loopback arm's motion: a queue of moves with trapezoidal timing and rounded corners, evaluated on demand.
 
+Moves are lines in space or in joints, and the path can be held and resumed, as a controller does.
+
 The result does not depend on when it is evaluated. A later move may change how an earlier one ends, but only if that
 agrees with the motion so far; otherwise the arm comes to rest between the two.
 """
@@ -12,18 +14,19 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.samples import Pose
-from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverted
-from brushloop.drivers.sim.arm.paths import Line, Path, fixed
+from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.arm.paths import JointLine, Line, Part, Path, fixed
 from brushloop.drivers.sim.arm.plan import Corners, Move, Ramp, pieces_of, ramps_of
-
-__all__ = ["STEADY_LAG_S", "MotionQueue", "Move", "Ramp", "Segment"]
 
 STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""
 SAME_POSE_MM = 1e-4
 SAME_POSE_DEG = 1e-4
+SAME_JOINT_RAD = 1e-6
 RESTS_KEPT = 64
 AGREES = 1e-6
 """Two timings that differ by less count as equal; in mm, rad, mm/s or rad/s."""
@@ -85,9 +88,18 @@ class Rest:
 
 
 class MotionQueue:
-    """A queue of moves. `on_path(start, end)` is called for every stretch once it has been travelled."""
+    """A queue of moves. `on_path(start, end)` is called for every stretch once it has been travelled.
 
-    def __init__(self, home: Pose, on_path: Callable[[Pose, Pose], None], capacity: int = 64) -> None:
+    `tool` is the true flange to tip.
+    """
+
+    def __init__(
+        self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None, capacity: int = 64
+    ) -> None:
+        self.tool: Matrix = np.eye(4) if tool is None else tool
+        self._held: list[Move] | None = None
+        self._solved: tuple[Pose, Joints] | None = None
+        """The last pose whose joints were found, and the joints."""
         self.fraction = 1.0
         """Speed factor for every move that has not begun."""
         self.near: Joints = HOME
@@ -111,8 +123,13 @@ class MotionQueue:
 
     @property
     def size(self) -> int:
-        """Number of moves queued or running, including one that decelerates to a stop."""
-        return len({segment.ident for segment in self._queue})
+        """Number of moves queued, running or held; one that decelerates into a stop or a hold counts once."""
+        return len({segment.ident for segment in self._queue} if self._held is None else self._held)
+
+    @property
+    def held(self) -> bool:
+        """True between `hold` and `resume`, even if nothing was moving."""
+        return self._held is not None
 
     @property
     def running(self) -> Segment | None:
@@ -149,6 +166,19 @@ class MotionQueue:
         )
         return True
 
+    def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
+        """Append a straight move in joint space, from rest to rest; False if the queue already ends there."""
+        self.advance(now_s)
+        target = pose_of(forward(joints) @ self.tool)
+        travel_mm, turn_deg = distance(self._last(), target)
+        idle = not self._queue and not self._held
+        turned = max(abs(a - b) for a, b in zip(joints, self.near, strict=True))
+        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and (not idle or turned <= SAME_JOINT_RAD):
+            return False
+        path = JointLine(self._last_joints(), joints, self.tool)
+        self._append(Move(self._next_id, path, speed_rad_s, acc_rad_s2, least_s), now_s)
+        return True
+
     def advance(self, now_s: float) -> None:
         """Retire every piece that is over by `now_s`."""
         while self._queue and self._queue[0].end_s <= now_s:
@@ -160,9 +190,48 @@ class MotionQueue:
             self._finish(segment)
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
-        """Decelerate along the path and forget the rest; a second stop changes nothing."""
+        """Decelerate along the path and forget the rest, held or not; a second stop changes nothing."""
         self.advance(now_s)
         self._brake(acc_mm_s2, acc_rad_s2, now_s)
+        self._held = None
+
+    def hold(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
+        """Decelerate on the path and keep it; `exec_id` stays that of the move in which the arm comes to rest."""
+        self.advance(now_s)
+        if self._held is not None:
+            return
+        moves, planned = self._moves, list(self._queue)
+        resting = self._brake(acc_mm_s2, acc_rad_s2, now_s)
+        # a move that was already braking has lost its target; moves queued behind it have not begun
+        self._held = moves if resting is None else []
+        if resting is None:
+            return
+        segment, done = resting
+        rest = next(i for i, m in enumerate(moves) if m.ident == segment.ident)
+        move = moves[rest]
+        if segment.corner:
+            after = next(s.enter for s in planned if s.ident == segment.ident and not s.corner)
+            rest_of_it = Part(segment.path, segment.enter + done)
+            first = replace(move, lead=(rest_of_it, segment.ramp.speed), enter=after)
+        else:
+            first = replace(move, enter=segment.enter + done, lead=None, held=True)
+        self._held = [first, *moves[rest + 1 :]]
+
+    def resume(self, now_s: float) -> None:
+        """Resume the path that was held, from where the arm came to rest."""
+        self.advance(now_s)
+        held, self._held = self._held, None
+        if held:
+            self._moves = [*self._moves, *held]
+            self._replan(0, now_s)
+
+    def set_fraction(self, fraction: float, now_s: float) -> None:
+        """Run every move that has not begun at this share of its speed, 0 to 1."""
+        self.advance(now_s)
+        self.fraction = fraction
+        begun = {s.ident for s in self._queue if s.begin_s <= now_s}
+        first = next((i for i, m in enumerate(self._moves) if m.ident not in begun), len(self._moves))
+        self._replan(first, now_s)
 
     def pose(self, now_s: float) -> Pose:
         """Where the tip is."""
@@ -170,9 +239,25 @@ class MotionQueue:
         return self._queue[0].pose(now_s) if self._queue else self._rest
 
     def exec_id(self, now_s: float) -> int:
-        """Id of the running move, -1 when the queue is empty. A corner belongs to the move that it leads into."""
+        """Id of the running move, or of the one that is held; -1 when there is none. A corner belongs to the move that
+        it leads into."""
         self.advance(now_s)
-        return self._queue[0].ident if self._queue else -1
+        if self._queue:
+            return self._queue[0].ident
+        return self._held[0].ident if self._held else -1
+
+    def joints(self, now_s: float) -> Joints:
+        """Joint positions for the present pose of the tip."""
+        self.advance(now_s)
+        exact = self._queue[0].joints(now_s) if self._queue else None
+        return exact or self.near_joints(self.pose(now_s))
+
+    def near_joints(self, tip: Pose) -> Joints:
+        """The joints for a tip pose, near the last known ones; the last known ones if no solution is found."""
+        if self._solved != (tip, self.near):  # an arm at rest is asked again and again
+            self.near = inverse(matrix_of(tip) @ inverted(self.tool), self.near) or self.near
+            self._solved = (tip, self.near)
+        return self.near
 
     def steady(self, now_s: float) -> bool:
         """True once the queue has been empty for `STEADY_LAG_S`."""
@@ -191,13 +276,24 @@ class MotionQueue:
 
     def _last(self) -> Pose:
         """Where the last accepted move ends."""
-        if self._moves:
-            path = self._moves[-1].path
+        if moves := self._held or self._moves:
+            path = moves[-1].path
             return path.pose(path.length)
         return self._queue[-1].pose(self._queue[-1].end_s) if self._queue else self._rest
 
+    def _last_joints(self) -> Joints:
+        path = (self._held or self._moves)[-1].path if self._held or self._moves else None
+        if path is not None:
+            exact = path.joints(path.length)
+        else:
+            exact = self._queue[-1].joints(self._queue[-1].end_s) if self._queue else None
+        return exact or self.near_joints(self._last())
+
     def _append(self, move: Move, now_s: float) -> None:
         self._next_id += 1
+        if self._held is not None:
+            self._held.append(move)
+            return
         self._moves.append(move)
         first = self._moves[0].ident
         self._corners = {key: corner for key, corner in self._corners.items() if key[0] >= first}

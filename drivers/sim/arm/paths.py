@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import abc
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -20,43 +20,35 @@ STRETCHES = 16
 """Number of straight pieces in which a curved path is reported to the world."""
 
 
-class Path(Protocol):
+class Path(abc.ABC):
     """A path of `length` mm, or rad where `angular`."""
 
     @property
+    @abc.abstractmethod
     def length(self) -> float:
         """Length from end to end."""
-        ...
 
     @property
     def angular(self) -> bool:
         """True where lengths are in rad."""
-        ...
+        return False
 
     @property
     def stretches(self) -> int:
         """Number of straight pieces that approximate it; 1 for a straight line."""
-        ...
+        return STRETCHES
 
+    @abc.abstractmethod
     def pose(self, done: float) -> Pose:
         """Where the true tip is after `done`."""
-        ...
 
     def joints(self, done: float) -> Joints | None:
-        """The joints there, where the path is given in joints."""
-        ...
-
-
-class InSpace:
-    """A path that is given in space only."""
-
-    def joints(self, done: float) -> Joints | None:
-        """None, because the path is not given in joints."""
+        """The joints there; None where the path is not given in joints."""
         return None
 
 
 @dataclass(frozen=True)
-class Line(InSpace):
+class Line(Path):
     """Straight for the tool centre point that was configured; `fix` leads from there to the true tip (None: same)."""
 
     start: Pose
@@ -96,14 +88,12 @@ class Line(InSpace):
 
 
 @dataclass(frozen=True)
-class Corner(InSpace):
+class Corner(Path):
     """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start, turns included."""
 
     a: Line
     b: Line
     cut: float
-    angular: bool = False
-    stretches: int = STRETCHES
 
     @property
     def length(self) -> float:
@@ -125,23 +115,22 @@ class Corner(InSpace):
 
 
 @dataclass(frozen=True)
-class JointLine:
+class JointLine(Path):
     """Straight in joints; its length is the angle of the joint that turns farthest."""
 
     start: Joints
     end: Joints
     tool: Matrix
-    angular: bool = True
-    stretches: int = STRETCHES
 
-    @cached_property
-    def _length(self) -> float:
-        return max(abs(a - b) for a, b in zip(self.start, self.end, strict=True))
+    @property
+    def angular(self) -> bool:
+        """Lengths are in rad."""
+        return True
 
     @property
     def length(self) -> float:
-        """In rad."""
-        return self._length
+        """The largest angle."""
+        return max(abs(a - b) for a, b in zip(self.start, self.end, strict=True))
 
     def joints(self, done: float) -> Joints:
         """The joints after `done`."""
@@ -157,7 +146,7 @@ class JointLine:
 
 
 @dataclass(frozen=True)
-class Part:
+class Part(Path):
     """What is left of a path after `begin`."""
 
     whole: Path

@@ -35,7 +35,7 @@ from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
 from brushloop.drivers.sim.lab.aims import TOUCHED, Aims
 from brushloop.drivers.sim.lab.facts import LIFT_MM, PICTURE_PX, draw
 from brushloop.drivers.sim.lab.hand import Hand
-from brushloop.drivers.sim.lab.seen import Seen, printed
+from brushloop.drivers.sim.lab.seen import PRESS_SHARE, Seen
 from brushloop.drivers.sim.lab.traps import Trap, mended, spring
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.server import LoopbackServer
@@ -114,14 +114,20 @@ class UnknownLab:
 
     def seen(self) -> Seen:
         """What a person can read in the lab now."""
-        ink = self.rig.ink
-        kind = "modbus-pump" if self.facts.config.ink_device == "pump" else "ink-station"
+        ink, facts, brush = self.rig.ink, self.facts, self.facts.config.brush
+        kind = "modbus-pump" if facts.config.ink_device == "pump" else "ink-station"
         return Seen(
             self.host,
             tuple(f"http://{self.host}:{port}/stream.mjpg" for port in CAMERA_PORTS),
             (self.host, CAN_PORT, LOOPBACK_CHANNEL),
             None if ink is None else (kind, ink.path),
-            **printed(self.facts),
+            squares=facts.config.table.board_squares,
+            square_mm=facts.printed_square_mm,
+            marker_mm=facts.printed_marker_mm,
+            dictionary=facts.config.table.board_dictionary,
+            radius_mm=brush.radius_mm,
+            length_mm=brush.length_mm,
+            max_depth_mm=round(PRESS_SHARE * brush.length_mm),
         )
 
     async def obey(self, request: Mapping[str, object]) -> dict[str, Any]:

@@ -55,20 +55,6 @@ class Seen:
         ]
 
 
-def printed(facts: Facts) -> dict[str, Any]:
-    """The fields of `Seen` that stand on the print and on the brush."""
-    table, brush = facts.config.table, facts.config.brush
-    return {
-        "squares": table.board_squares,
-        "square_mm": facts.printed_square_mm,
-        "marker_mm": facts.printed_marker_mm,
-        "dictionary": table.board_dictionary,
-        "radius_mm": brush.radius_mm,
-        "length_mm": brush.length_mm,
-        "max_depth_mm": round(PRESS_SHARE * brush.length_mm),
-    }
-
-
 def truth(facts: Facts, trap: Trap | None) -> dict[str, Any]:
     """Everything that a first day should find, as JSON; lengths in mm, angles in deg, base frame unless named."""
     config, table, view = facts.config, facts.config.table, facts.config.view

@@ -263,7 +263,7 @@ def test_a_pump_that_cannot_run_like_that_is_refused(ml_per_revolution: float, r
 
 async def test_other_line_settings_work_too(firmware: PumpFirmware, line: PtyLine):
     firmware.unit = 17
-    options = PumpOptions(line.path, ML_PER_REV, unit=17, baud=19200, parity="N", stopbits=2)
+    options = PumpOptions(line.path, ML_PER_REV, unit=17, baud=19200)
     pump = ModbusPump(options, HostClock())
     assert (await pump.connect()).model == "Modbus RTU pump, unit 17"
     await pump.close()

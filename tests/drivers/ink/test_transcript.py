@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from brushloop.drivers.errors import DeviceTimeout
-from brushloop.drivers.ink.port import SerialPort, SerialSettings
+from brushloop.drivers.ink.port import SerialPort
 
 
 async def ask(path: str, request: bytes) -> bytes:
-    port = SerialPort("test", SerialSettings(path, 9600))
+    port = SerialPort("test", path, 9600)
     await port.open()
     try:
         return await port.exchange("ask", request, lambda received: received or None, timeout_s=0.1)

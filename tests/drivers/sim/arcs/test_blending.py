@@ -15,7 +15,6 @@ from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.kinematics import HOME
 from brushloop.drivers.sim.arm.motion import MotionQueue
-from brushloop.drivers.sim.arm.queue import ArmQueue
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
 
@@ -36,9 +35,9 @@ class RecordedQueue:
 
     def __init__(self) -> None:
         self.stretches: list[tuple[Pose, Pose]] = []
-        self.queue = ArmQueue(at(0.0), lambda a, b: self.stretches.append((a, b)))
+        self.queue = MotionQueue(at(0.0), lambda a, b: self.stretches.append((a, b)))
 
-    def corner(self, blend_mm: float, second_s: float = 0.0) -> ArmQueue:
+    def corner(self, blend_mm: float, second_s: float = 0.0) -> MotionQueue:
         self.queue.add(CORNER, V, A, 0.0, blend_mm=blend_mm)
         self.queue.add(BEYOND, V, A, second_s)
         return self.queue
@@ -82,7 +81,7 @@ def test_the_next_id_comes_without_a_gap_and_steady_only_at_the_end():
 
 
 def test_a_straight_corner_is_no_corner():
-    queue = ArmQueue(at(0.0), lambda *_: None)
+    queue = MotionQueue(at(0.0), lambda *_: None)
     for x in (50.0, 100.0, 150.0):
         queue.add(at(x), V, A, 0.0, blend_mm=10.0)
     assert queue.exec_id(150.0 / V + V / A - 1e-6) == 2
@@ -101,7 +100,7 @@ ways = st.lists(
 def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
     way: Sequence[tuple[float, float, float, float]],
 ):
-    queue = ArmQueue(at(0.0), lambda *_: None)
+    queue = MotionQueue(at(0.0), lambda *_: None)
     for x, y, blend, v in way:
         queue.add(at(x, y), v, A, 0.0, blend_mm=blend)
     fastest = max(v for *_, v in way)
@@ -213,7 +212,7 @@ def test_a_slower_fraction_applies_after_the_corner_that_is_planned_and_nothing_
 
 @pytest.mark.parametrize("blend_mm", [0.0, 20.0])
 def test_a_duration_is_how_long_a_move_takes_rounded_or_not(blend_mm: float):
-    queue = ArmQueue(at(0.0), lambda *_: None)
+    queue = MotionQueue(at(0.0), lambda *_: None)
     for pose in (at(100.0), at(200.0), at(300.0)):
         queue.add(pose, V, A, 0.0, 3.0, blend_mm=blend_mm)
     seen = [queue.exec_id(t) for t in np.arange(0.0, 12.0, 0.01)]
@@ -224,7 +223,7 @@ def test_a_duration_is_how_long_a_move_takes_rounded_or_not(blend_mm: float):
 
 
 def test_a_move_in_joints_is_not_rounded():
-    queue = ArmQueue(at(0.0), lambda *_: None)
+    queue = MotionQueue(at(0.0), lambda *_: None)
     first, second = (0.4, *HOME[1:]), (0.8, *HOME[1:])
     queue.add_joints(first, 0.5, 2.0, 0.0, 0.0)
     queue.add_joints(second, 0.5, 2.0, 0.0, 0.0)
