@@ -1,18 +1,15 @@
 """Immutable files named after the hash of their contents, and the pointer to the one that a session uses.
 
 `calibration/current` holds the name of one of `calibration/*.json`; every kind of artefact has its own folder.
-In sessions written before pointers existed, the artefact that was written last is in use.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import logging
 import re
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -26,8 +23,6 @@ POINTER = "current"
 NAME = re.compile(rb"([0-9a-f]{%d}\.json)\n?" % HASH_CHARS)
 """File name of an artefact. A pointer that holds anything else, such as a path out of the folder, is refused."""
 MAX_POINTER_BYTES = 256
-
-_log = logging.getLogger(__name__)
 
 
 def made_by() -> str:
@@ -43,9 +38,6 @@ class Frozen(BaseModel):
 
 class Artefact(Frozen):
     """Base class of artefacts, which are saved under the hash of their canonical JSON."""
-
-    versions: ClassVar[tuple[int, ...]] = (1,)
-    """Supported values of `schema_version`."""
 
     @property
     def digest(self) -> str:
@@ -67,7 +59,7 @@ class Artefact(Frozen):
 class SessionFit(Artefact):
     """Base class of what is fitted to the strokes of one session."""
 
-    schema_version: int = 1
+    schema_version: Literal[1, 2] = 1
     session_id: str
     source: str
     recording_sha256: str
@@ -89,12 +81,8 @@ A = TypeVar("A", bound=Artefact)
 
 
 def load_artefact(path: Path, kind: type[A]) -> A:
-    """Read an artefact of this kind. Raises `CalibrationError` for any other file, an edited one or a newer version."""
+    """Read an artefact of this kind. Raises `CalibrationError` for any other file or version, or an edited one."""
     data = read_bounded(path)
-    version = _version(data)
-    if isinstance(version, int) and version not in kind.versions:
-        known = ", ".join(map(str, kind.versions))
-        raise CalibrationError(str(path), f"schema_version: {version} is not known here ({known}): update brushloop")
     try:
         made = kind.model_validate_json(data)
     except ValidationError as error:
@@ -102,14 +90,6 @@ def load_artefact(path: Path, kind: type[A]) -> A:
     if hashlib.sha256(data).hexdigest()[:HASH_CHARS] != path.stem:
         raise CalibrationError(str(path), "was edited: its name is not the hash of its contents")
     return made
-
-
-def _version(data: bytes) -> object:
-    try:
-        parsed: Any = json.loads(data)
-    except (ValueError, RecursionError):
-        return None  # the model gives the better message
-    return cast("dict[str, Any]", parsed).get("schema_version") if isinstance(parsed, dict) else None
 
 
 def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
@@ -128,20 +108,18 @@ def artefacts(session: Path, folder: str = FOLDER) -> list[Path]:
 def current(session: Path, folder: str = FOLDER) -> Path | None:
     """Path of the artefact in use in `folder` of a session; None if it has no artefact.
 
-    Raises `CalibrationError` for a pointer that does not name an existing artefact. If there are several artefacts and
-    no pointer, a warning says which was taken.
+    Raises `CalibrationError` where no pointer says which of the artefacts it is, or names one that is not there.
     """
     pointer, found = session / folder / POINTER, artefacts(session, folder)
-    if pointer.exists() or pointer.is_symlink():
-        name = pointed(read_bounded(pointer, MAX_POINTER_BYTES), str(pointer))
-        path = pointer.with_name(name)
-        if path not in found:
-            raise CalibrationError(str(pointer), f"names {name}, which is not there: {_choose(session, folder)}")
-        return path
-    if len(found) > 1:
-        taken = f"{len(found)} artefacts, and no file `{POINTER}` that says which is in use: {found[-1].name} is used"
-        _log.warning("%s: holds %s, as it was written last; %s", session / folder, taken, _choose(session, folder))
-    return found[-1] if found else None
+    if not pointer.exists() and not pointer.is_symlink():
+        if found:
+            raise CalibrationError(str(pointer), f"is missing: {_choose(session, folder)}")
+        return None
+    name = pointed(read_bounded(pointer, MAX_POINTER_BYTES), str(pointer))
+    path = pointer.with_name(name)
+    if path not in found:
+        raise CalibrationError(str(pointer), f"names {name}, which is not there: {_choose(session, folder)}")
+    return path
 
 
 def pointed(data: bytes, where: str) -> str:

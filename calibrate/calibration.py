@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,6 @@ from brushloop.calibrate.artefact import Artefact, Frozen
 from brushloop.calibrate.board.lens import LensUsed
 from brushloop.calibrate.board.pix2len import apply
 from brushloop.calibrate.board.spec import BoardSpec
-
-SCHEMA_VERSION = 2
-"""Version 2 adds the lens, the board, the still, and whether the calibration was made for another session."""
 
 
 class Foreign(Frozen):
@@ -31,9 +28,7 @@ class Foreign(Frozen):
 class Calibration(Artefact):
     """Scale and paper plane, the recording they come from and the software. Equal inputs give an equal file."""
 
-    versions: ClassVar[tuple[int, ...]] = (1, 2)
-
-    schema_version: int = SCHEMA_VERSION
+    schema_version: Literal[2] = 2
     session_id: str
     source: str
     """`loopback rig` or `real capture`, as the recording says."""
@@ -51,12 +46,12 @@ class Calibration(Artefact):
     corners_dropped: int
     """Outliers: seen, but not on the plane of the others."""
     preprocess: dict[str, float]
-    lens: LensUsed | None = None
-    """Lens by which photographs are undistorted first; None in files of version 1."""
-    middle_px: tuple[float, float] | None = None
+    lens: LensUsed
+    """Lens by which photographs are undistorted first."""
+    middle_px: tuple[float, float]
     """Pixel at which `mm_per_px` holds, in the photograph as it was taken."""
-    board: BoardSpec | None = None
-    still_sha256: str = ""
+    board: BoardSpec
+    still_sha256: str
     """sha256 of the encoded photograph of the board that this was measured on."""
     flags: tuple[str, ...] = ()
     """What was wrong with that photograph: partly hidden, saturated."""
@@ -69,11 +64,11 @@ class Calibration(Artefact):
     def to_image(self, paper_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
         undistorted = apply(np.asarray(np.linalg.inv(self.homography()), np.float64), paper_mm)
-        return undistorted if self.lens is None else self.lens.lens().distorted(undistorted)
+        return self.lens.lens().distorted(undistorted)
 
     def to_paper(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
-        return apply(self.homography(), pixels if self.lens is None else self.lens.lens().undistorted(pixels))
+        return apply(self.homography(), self.lens.lens().undistorted(pixels))
 
     @property
     def named(self) -> str:

@@ -81,11 +81,8 @@ def _meaning(one: Calibration, other: Calibration) -> Iterator[str]:
     apart = other.mm_per_px_low > one.mm_per_px_high or one.mm_per_px_low > other.mm_per_px_high
     verdict = "their intervals lie apart" if apart else "their intervals overlap"
     yield f"pix2len differs by {100.0 * (other.mm_per_px / one.mm_per_px - 1.0):+.4f} %, {verdict}"
-    board = one.board
-    if board is None:
-        return
-    x, y = board.origin_mm
-    width, height = (n * board.square_mm for n in board.squares)
+    x, y = one.board.origin_mm
+    width, height = (n * one.board.square_mm for n in one.board.squares)
     across, along = np.meshgrid(np.linspace(x, x + width, 9), np.linspace(y, y + height, 9))
     paper_mm = np.column_stack([across.ravel(), along.ravel()])
     off_mm = np.linalg.norm(other.to_paper(one.to_image(paper_mm)) - paper_mm, axis=1)

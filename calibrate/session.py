@@ -139,8 +139,7 @@ def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
     spec, where = board_of(recording), str(recording.path)
     off_mm: float | None = None
     for _, image in board_stills(recording):
-        if given.lens is not None:
-            given.lens.lens().check_size(image, where)
+        given.lens.lens().check_size(image, where)
         try:
             view = find_board(image, spec, where)
         except CalibrationError:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.artefact import current
-from brushloop.calibrate.board.lens import Gray, unknown_lens
+from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.session import NO_BOARD, board_of, known_lens
 from brushloop.calibrate.board.view import calibration_plane
@@ -58,9 +58,9 @@ def _plane(recording: Recording, one: Stroke, image: Gray, lens: Path | None, wh
     path = current(recording.path.parent) if lens is None else None
     used = None if path is None else calibration_of(recording, one, recording.sha256, path)
     if used is not None:
-        through = used.lens.lens() if used.lens is not None else unknown_lens((image.shape[1], image.shape[0]))
+        through = used.lens.lens()
         through.check_size(image, where)
-        reach, middle = (used.mm_per_px_low, used.mm_per_px_high), used.middle_px or (0.0, 0.0)
+        reach, middle = (used.mm_per_px_low, used.mm_per_px_high), used.middle_px
         return Plane(through, used.homography(), used.mm_per_px, reach, used.rms_px, 0.0, middle, used.corners, ())
     boards = list(recording.stills_of("board"))
     if not boards:

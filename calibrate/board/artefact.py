@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from brushloop.calibrate.artefact import Artefact, load_artefact
 from brushloop.calibrate.board.intrinsics import Fitted
@@ -14,11 +14,8 @@ from brushloop.calibrate.board.register import Registration
 class LensFile(Artefact):
     """Intrinsics with everything that is needed to judge them."""
 
-    versions: ClassVar[tuple[int, ...]] = (1, 2)
-
     kind: Literal["lens"] = "lens"
-    schema_version: int = 2
-    """In version 1 the standard errors came from the corners alone, as if no two views were alike."""
+    schema_version: Literal[2] = 2
     software: str
     photographs: dict[str, str]
     """Name of every photograph that was given, and the sha256 of its bytes."""
@@ -83,23 +80,18 @@ def read_lens(path: Path) -> LensUsed:
 class RegistrationFile(Artefact):
     """Where the robot's points lie on the paper, with the residual of each."""
 
-    versions: ClassVar[tuple[int, ...]] = (1, 2)
-
     kind: Literal["registration"] = "registration"
-    schema_version: int = 2
-    """Version 1 held `turn_deg`, and took the board's corner for the origin of the paper frame."""
+    schema_version: Literal[2] = 2
     software: str
     source: str
     """The table of points, or the session, and its sha256."""
     model: Literal["rigid", "similarity", "affine"]
     robot_to_paper: tuple[float, float, float, float, float, float]
     """(2, 3) row by row: mm in the robot's base frame to mm in the paper frame."""
-    turn_deg: float | None = None
-    """Rotation of points from the base frame to the paper frame; in files of version 1 only."""
-    board_origin_mm: tuple[float, float] | None = None
+    board_origin_mm: tuple[float, float]
     """Lower left corner of the board in the paper frame, as it was assumed."""
-    origin_mm: tuple[float, float] | None = None
-    yaw_deg: float | None = None
+    origin_mm: tuple[float, float]
+    yaw_deg: float
     """Origin and yaw of the paper frame in the base frame, as in `[paper]` of rig.toml."""
     scale: float
     rms_mm: float

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import binascii
 import zlib
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from brushloop.model.drag import DragModel, distances, trails
 
 Floats = NDArray[np.float64]
 
-SCHEMA_VERSION = 2
 MOST_STROKES = 200
 MOST_PIXELS = 400_000
 """Largest number of pixels of one stroke's image."""
@@ -154,9 +153,7 @@ class Stamps(Frozen):
 class DragArtefact(SessionFit):
     """The fitted drag model on disk. Equal inputs give an equal file."""
 
-    versions: ClassVar[tuple[int, ...]] = (1, SCHEMA_VERSION)
-
-    schema_version: int = SCHEMA_VERSION
+    schema_version: Literal[1, 2] = 2
     images: int
     strokes: int
     mm_per_px: float
@@ -171,7 +168,7 @@ class DragArtefact(SessionFit):
     """A pixel counts as ink above this probability: chosen on the training strokes."""
     stamps: Stamps | None = None
     kept: Kept | None = None
-    """Training strokes, from which the correction of the lag is computed; None for figures, and before version 2."""
+    """Training strokes, from which the correction of the lag is computed; None for figures."""
     fitted_strokes: tuple[str, ...] = ()
     """The strokes that were fitted, which must not be scored as held out."""
     prior: str = ""

@@ -10,14 +10,12 @@ from pydantic import model_validator
 from brushloop.calibrate.artefact import SessionFit
 from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress
 
-SCHEMA_VERSION = 1
 FOLDER = "brushfit"
 
 
 class BrushFit(SessionFit):
     """A fitted brush, with its strokes and software. Equal inputs give an equal file."""
 
-    schema_version: int = SCHEMA_VERSION
     radius_mm: float
     length_mm: float
     strokes: int

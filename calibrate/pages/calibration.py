@@ -50,8 +50,6 @@ def write_calibration_page(recording: Recording, path: Path) -> Path:
     """
     made = load_artefact(path, Calibration)
     where = str(recording.path)
-    if made.board is None:
-        raise CalibrationError(str(path), "names no board, as it was written by an earlier version")
     image = _photograph(recording, made, where)
     seen = find_board(image, made.board, where)
     expected = made.to_image(paper_mm(seen, made.board))
@@ -163,10 +161,10 @@ def _trust(made: Calibration) -> Iterator[Point]:
         )
     else:
         yield Point(True, "No corner was left out.")
-    if made.lens is not None and made.lens.source == FITTED:
+    if made.lens.source == FITTED:
         words = "No lens file: k1 was fitted on this one board and is known only where corners were seen."
         yield Point(None, words)
-    elif made.lens is not None:
+    else:
         yield Point(True, f"Seen through the {made.lens.source}; k1 was refitted for this focus.")
     for flag in made.flags:
         yield Point(False, f"{flag[0].upper()}{flag[1:]}.")
@@ -223,10 +221,9 @@ def _facts(made: Calibration, board: BoardSpec, path: Path) -> Iterator[tuple[st
     yield "session", made.session_id
     yield "source", made.source
     yield "recording", f"sha256 {made.recording_sha256}"
-    yield "photograph of the board", f"sha256 {made.still_sha256}" if made.still_sha256 else "not named"
+    yield "photograph of the board", f"sha256 {made.still_sha256}"
     yield "board", describe(board)
-    if made.lens is not None:
-        yield "lens", f"{made.lens.source}; k1 {made.lens.distortion[0]:+.4f}"
+    yield "lens", f"{made.lens.source}; k1 {made.lens.distortion[0]:+.4f}"
     yield "95 % interval", f"{made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f} mm/px"
     yield "calibrated with", made.software
     yield "artefact", path.name

@@ -55,12 +55,10 @@ def on_raster(point_px: tuple[float, float], px_per_mm: tuple[float, float]) -> 
 
 
 def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, float, float, float], where: str) -> Gray:
-    """Rectify a window of the paper frame to 20 px/mm by a calibration, undistorted if it names a lens.
+    """Rectify a window of the paper frame to 20 px/mm by a calibration.
 
     Raises `CaptureRefused` if the photograph's size differs from the calibration's.
     """
-    if calibration.lens is None:
-        return rectify(image, calibration.homography(), window_mm)
     height, width = image.shape
     if (width, height) != calibration.lens.size_px:
         wanted = "{} x {}".format(*calibration.lens.size_px)

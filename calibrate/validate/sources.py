@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-import os
 import re
 import sys
 import tempfile
@@ -33,7 +32,6 @@ from brushloop.sessions.records import Header, Source, Stroke
 PIECE = 1024 * 1024
 MAX_DOWNLOAD_BYTES = 64 * 1024**3
 MAX_SUM_BYTES = 64 * 1024
-MAX_ARTEFACTS = 64
 MAX_ARTEFACT_BYTES = 4 * 1024 * 1024
 FORBIDDEN = 403
 """HTTP status for a missing file in a bucket that may not be listed."""
@@ -150,7 +148,7 @@ def fetched(url: str, folder: Path) -> Path:
         if not (target.is_file() and file_sha256(target) == expected):
             _copy(system, where, target, expected, address)
         for kind in (FOLDER, FITS):
-            _copy_artefacts(system, f"{where.rsplit('/', 1)[0]}/{kind}", target.parent / kind)
+            _copy_artefact(system, f"{where.rsplit('/', 1)[0]}/{kind}", target.parent / kind)
     except (OSError, ValueError, NotImplementedError, *_backend_errors()) as error:
         raise CalibrationError(address, f"cannot be read: {one_line(error)}") from None
     return target
@@ -210,31 +208,18 @@ def _pieces(system: Any, where: str, most_bytes: int, address: str) -> Iterator[
             yield piece
 
 
-def _copy_artefacts(system: Any, there: str, here: Path) -> None:
-    """Copy artefacts of one kind from beside a remote recording: the one that the pointer names, or else all of them.
-
-    Each is named after its own hash, which is checked when it is read. If folders cannot be listed, as on a plain web
-    server, the artefact in use must be named by a pointer, or by --calibration and --fit.
-    """
+def _copy_artefact(system: Any, there: str, here: Path) -> None:
+    """Copy the artefact that the pointer beside a remote recording names, if there is one."""
     pointer = _read(system, f"{there}/{POINTER}", MAX_POINTER_BYTES)
-    try:
-        names = [f"{there}/{pointed(pointer, POINTER)}"] if pointer else sorted(system.glob(f"{there}/*.json"))
-    except (OSError, NotImplementedError):
+    for old in (here / POINTER, *here.glob("*.json")):
+        old.unlink(missing_ok=True)  # copies from an earlier run
+    if pointer is None:
         return
-    kept = here / POINTER
-    kept.unlink(missing_ok=True)
-    for old in here.glob("*.json"):
-        old.unlink()  # copies from an earlier run
-    for name in names[:MAX_ARTEFACTS]:
-        data = _read(system, name, MAX_ARTEFACT_BYTES)
-        if data is None:
-            continue
-        here.mkdir(exist_ok=True)
-        (here / PurePosixPath(name).name).write_bytes(data)
-        _keep_age(system, name, here / PurePosixPath(name).name)
-    if pointer:
-        here.mkdir(exist_ok=True)
-        kept.write_bytes(pointer)
+    name = pointed(pointer, POINTER)
+    here.mkdir(exist_ok=True)
+    if (data := _read(system, f"{there}/{name}", MAX_ARTEFACT_BYTES)) is not None:
+        (here / name).write_bytes(data)
+    (here / POINTER).write_bytes(pointer)
 
 
 def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
@@ -247,12 +232,3 @@ def _read(system: Any, name: str, most_bytes: int) -> bytes | None:
         if getattr(error, "status", None) == FORBIDDEN:
             return None
         raise
-
-
-def _keep_age(system: Any, name: str, copy: Path) -> None:
-    """Copy the modification time, if there is one: without a pointer the newest artefact is in use."""
-    try:
-        at_s = float(system.modified(name).timestamp())
-    except (AttributeError, NotImplementedError, OSError, ValueError, TypeError, KeyError):
-        return
-    os.utime(copy, (at_s, at_s))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from brushloop.calibrate.board.lens import LensUsed, unknown_lens
+from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.writing.plan_record import PlannedBy
 
@@ -19,6 +21,10 @@ CALIBRATION = Calibration(
     corners=24,
     corners_dropped=0,
     preprocess={},
+    lens=LensUsed.of(unknown_lens((1000, 800)), "test"),
+    middle_px=(0.0, 0.0),
+    board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
+    still_sha256="",
 )
 BY = PlannedBy(
     model="ccd-bsm",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
 import pytest
 
 from brushloop.calibrate.artefact import current, load_artefact, put_to_use
+from brushloop.calibrate.board.lens import LensUsed, unknown_lens
+from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 
@@ -25,6 +26,10 @@ MADE = Calibration(
     corners=159,
     corners_dropped=0,
     preprocess={"contrast_gate": 0.25},
+    lens=LensUsed.of(unknown_lens((640, 480)), "test"),
+    middle_px=(0.0, 0.0),
+    board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
+    still_sha256="",
 )
 
 
@@ -81,19 +86,11 @@ def test_each_kind_of_artefact_has_a_pointer_of_its_own(tmp_path: Path) -> None:
     assert (current(tmp_path), current(tmp_path, "brushfit")) == (calibration, fit)
 
 
-def test_a_session_without_a_pointer_uses_the_artefact_written_last_and_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_artefacts_without_a_pointer_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "calibration"
-    only = made(0.1).save(folder)
-    assert current(tmp_path) == only
-    assert caplog.messages == [], "one candidate is no question"
-    last = made(0.2).save(folder)
-    os.utime(only, (1, 1))
-    assert current(tmp_path) == last
-    [message] = caplog.messages
-    assert f"holds 2 artefacts, and no file `current` that says which is in use: {last.name} is used" in message
-    assert f"choose with `brushloop calibrate apply {folder}/<hash>.json {tmp_path}`" in message
+    MADE.save(folder)
+    with pytest.raises(CalibrationError, match="is missing: choose with `brushloop calibrate apply"):
+        current(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -70,12 +70,6 @@ def test_it_is_fetched_once(session: Path, remote: str, tmp_path: Path) -> None:
     assert open_session(url, tmp_path, None, None).count == 11
 
 
-def test_calibrations_and_fits_beside_come_along(session: Path, remote: str, tmp_path: Path) -> None:
-    fsspec.filesystem("memory").pipe("/lab/presses/calibration/0123.json", b"{}")
-    open_session(f"{remote}#sha256={digest(session)}", tmp_path, None, None)
-    assert [path.name for path in tmp_path.rglob("calibration/*.json")] == ["0123.json"]
-
-
 def test_of_several_calibrations_beside_the_pointed_one_is_used(session: Path, remote: str, tmp_path: Path) -> None:
     """Neither the last by name, nor the one written last."""
     memory, url = fsspec.filesystem("memory"), f"{remote}#sha256={digest(session)}"
@@ -83,7 +77,7 @@ def test_of_several_calibrations_beside_the_pointed_one_is_used(session: Path, r
     for name in (last, *names[:-1]):
         memory.pipe(f"/lab/presses/calibration/{name}", (tmp_path / "made" / name).read_bytes())
     beside = open_session(url, tmp_path, None, None).recording.path.parent
-    assert current(beside) == beside / "calibration" / names[1], "without a pointer, as in a folder: written last"
+    assert current(beside) is None, "without a pointer none comes along"
     memory.pipe("/lab/presses/calibration/current", f"{first}\n".encode())
     assert current(open_session(url, tmp_path, None, None).recording.path.parent) == beside / "calibration" / first
     memory.pipe("/lab/presses/calibration/current", f"{last}\n".encode())
