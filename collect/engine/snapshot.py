@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from brushloop.collect.protocols.steps import Step
 from brushloop.sessions.events import StepKind
@@ -187,35 +187,3 @@ class Snapshot:
     """Folder of the session; empty until there is one."""
     no_pose_s: float | None = None
     """Time since the arm last sent a pose; None below a second. While it is set, no value on the screen is live."""
-
-
-class EngineView(Protocol):
-    """What a screen may do with an engine. Every method may be called from any thread."""
-
-    def snapshot(self) -> Snapshot:
-        """Return the state of the run; never blocks."""
-        ...
-
-    def pause(self) -> None:
-        """Pause before the next step."""
-        ...
-
-    def resume(self) -> None:
-        """Go on after a pause."""
-        ...
-
-    def answer(self, number: int, key: str) -> bool:
-        """Answer question `number`; False if it is closed."""
-        ...
-
-    def request(self, request: OperatorRequest) -> None:
-        """Make or withdraw a request."""
-        ...
-
-    def park(self) -> None:
-        """End the run after this step with the arm lifted and parked; no more questions are asked."""
-        ...
-
-    def stop(self) -> None:
-        """Stop the arm now and end the run, in any state. Not an emergency stop."""
-        ...

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from brushloop.calibrate.board.lens import LensUsed
 from brushloop.collect.rig.config_file import Config, Finite, Positive, Range
+from brushloop.drivers.camera import Locked
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -78,20 +79,6 @@ class RobotConfig(Config):
         return self.host in ("localhost", "::1") or self.host.startswith("127.")
 
 
-class LockedConfig(Config):
-    """Camera settings that must not drift, in the device's own units; a setting that is left out is not changed."""
-
-    width: Annotated[int, Field(ge=16, le=65535)] | None = None
-    height: Annotated[int, Field(ge=16, le=65535)] | None = None
-    exposure: Finite | None = None
-    """Turns automatic exposure off."""
-    gain: Finite | None = None
-    white_balance_k: Finite | None = None
-    """Turns automatic white balance off."""
-    focus: Finite | None = None
-    """Turns autofocus off."""
-
-
 class CameraConfig(Config):
     """The camera that looks at the sheet."""
 
@@ -113,7 +100,7 @@ class CameraConfig(Config):
     """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is removed before anything is measured."""
     optics: LensUsed | None = None
     """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
-    locked: LockedConfig = LockedConfig()
+    locked: Locked = Locked()
 
 
 class InkStationConfig(Config):

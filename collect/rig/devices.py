@@ -12,7 +12,7 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
-from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera
+from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import noting_lateness
 from brushloop.drivers.exclusive import Claimed, claimed
@@ -78,9 +78,7 @@ def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]
 def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> OpenCvCamera:
     """The camera's driver, not yet connected."""
     camera = config.camera
-    options = CameraOptions(
-        camera.source, camera.latency_ms, camera.timeout_s, locked=Locked(**camera.locked.model_dump())
-    )
+    options = CameraOptions(camera.source, camera.latency_ms, camera.timeout_s, locked=camera.locked)
     return OpenCvCamera(options, clock, on_notice)
 
 

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.rig.config_devices import LockedConfig
 from brushloop.collect.rig.optics import gray
 from brushloop.collect.teach.store import Notebook
 from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
@@ -57,8 +56,7 @@ async def still(camera: OpenCvCamera, clock: Clock) -> Gray:
 async def taught_camera(notebook: Notebook, clock: Clock) -> AsyncGenerator[OpenCvCamera]:
     """The camera that was taught, with its settings locked."""
     named = {field.removeprefix(LOCKED): t.value for field, t in notebook.values.items() if field.startswith(LOCKED)}
-    locked = LockedConfig.model_validate(named)
-    async with opened(str(notebook.get("camera.source")), clock, Locked(**locked.model_dump())) as camera:
+    async with opened(str(notebook.get("camera.source")), clock, Locked.model_validate(named)) as camera:
         yield camera
 
 

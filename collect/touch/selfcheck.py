@@ -9,7 +9,6 @@ import asyncio
 import itertools
 import math
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,36 +40,6 @@ MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "mirrored: x and y are swapped": ((0.0, 1.0), (1.0, 0.0)),
     "mirrored: x and y are swapped and negated": ((0.0, -1.0), (-1.0, 0.0)),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class SelfCheck:
-    """What the three marks show about arm, camera and configuration together."""
-
-    commanded_mm: Floats
-    """(3, 2) in the paper frame."""
-    found_mm: Floats
-    """(3, 2), in the same order."""
-    offset_mm: tuple[float, float]
-    """Mean of found minus commanded: the bend of the tip, and errors of the frame's origin."""
-    turn_deg: float
-    scale: tuple[float, float]
-    """Found over commanded length, along paper x and y."""
-    residuals_mm: tuple[float, float, float]
-    """Distance that remains at each mark once offset and turn are taken out."""
-
-    def result(self, sheet: int, patches: tuple[int, ...]) -> SelfCheckResult:
-        """The result of a self-check on these patches."""
-        return SelfCheckResult(
-            sheet=sheet,
-            patches=patches,
-            commanded_mm=self.commanded_mm.tolist(),
-            found_mm=self.found_mm.tolist(),
-            offset_mm=self.offset_mm,
-            turn_deg=self.turn_deg,
-            scale=self.scale,
-            residuals_mm=self.residuals_mm,
-        )
 
 
 def triangle_in(patch: Patch, config: SelfCheckConfig) -> Triangle:
@@ -118,7 +87,7 @@ def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
     return triangle_of(patches) if len(patches) == 3 else triangle_in(patches[0], config)
 
 
-async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheck:
+async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheckResult:
     """Press the marks, photograph them and judge. The arm begins and ends at travel height; the patches are used up.
 
     Raises `StepError` with the figures if the marks are not found, mirrored, turned, stretched or displaced.
@@ -162,7 +131,7 @@ def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Flo
     return np.array([(m.x_mm, m.y_mm) for m in marks], np.float64)
 
 
-def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> SelfCheck:
+def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> SelfCheckResult:
     """Compare three found marks, in any order, with the commanded ones; both are (3, 2).
 
     There is one affine map for each order of three points; the right order is the one whose map keeps angles best.
@@ -192,14 +161,15 @@ def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> Se
         raise _refused(what, found, "Check paper.origin_mm and the board's origin")
     rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     left = (found - found.mean(axis=0)) - (commanded_mm - commanded_mm.mean(axis=0)) @ rotation.T
-    first, second, third = (float(v) for v in np.linalg.norm(left, axis=1))
-    return SelfCheck(
-        commanded_mm,
-        found,
-        (float(offset[0]), float(offset[1])),
-        math.degrees(turn),
-        scale,
-        (first, second, third),
+    return SelfCheckResult(
+        sheet=0,
+        patches=(),
+        commanded_mm=commanded_mm.tolist(),
+        found_mm=found.tolist(),
+        offset_mm=(float(offset[0]), float(offset[1])),
+        turn_deg=math.degrees(turn),
+        scale=scale,
+        residuals_mm=tuple(float(v) for v in np.linalg.norm(left, axis=1)),
     )
 
 

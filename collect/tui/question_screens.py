@@ -15,8 +15,8 @@ from textual.content import Content
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from brushloop.collect.engine.snapshot import EngineView
 from brushloop.collect.errors import NOT_AT_REST
+from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.operator import Prompt
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.text import plain
@@ -54,7 +54,7 @@ class AskScreen(ModalScreen[None]):
         Binding("question_mark", "app.help", "Help"),
     ]
 
-    def __init__(self, prompt: Prompt, engine: EngineView, pictures: Pictures) -> None:
+    def __init__(self, prompt: Prompt, engine: RunnableEngine, pictures: Pictures) -> None:
         super().__init__()
         self.prompt = prompt
         self._engine = engine
@@ -78,7 +78,7 @@ class AskScreen(ModalScreen[None]):
         answer_by_key(self.prompt, self._engine, event)
 
 
-def answer_by_key(prompt: Prompt, engine: EngineView, event: events.Key) -> None:
+def answer_by_key(prompt: Prompt, engine: RunnableEngine, event: events.Key) -> None:
     """Send the answer that this key stands for, if it stands for one."""
     if any(choice.key == event.character for choice in prompt.choices):
         event.stop()

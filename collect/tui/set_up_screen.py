@@ -5,8 +5,8 @@ from __future__ import annotations
 from textual import events
 from textual.content import Content
 
-from brushloop.collect.engine.snapshot import EngineView, Fact, SetUpStep, Snapshot, Standing
-from brushloop.collect.headless import no_pose_text
+from brushloop.collect.engine.snapshot import Fact, SetUpStep, Snapshot, Standing
+from brushloop.collect.headless import RunnableEngine, no_pose_text
 from brushloop.collect.operator import Prompt
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.force_text import LEAST_SCALE_N, force_bar, spark
@@ -35,7 +35,7 @@ class SetUpScreen(StepsScreen):
     SetUpScreen #title.-silent { background: $error; color: $text; }
     """
 
-    def __init__(self, engine: EngineView, pictures: Pictures) -> None:
+    def __init__(self, engine: RunnableEngine, pictures: Pictures) -> None:
         super().__init__(pictures.make("picture") if pictures.camera_shown else None, SET_UP_BAR)
         self._engine = engine
         self._prompt: Prompt | None = None

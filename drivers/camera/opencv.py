@@ -165,7 +165,7 @@ class _Grabber:
             arrival_ns = self._clock.now_ns()
             if image is None:
                 return
-            if self._options.gray and image.ndim == 3:
+            if image.ndim == 3:  # the colour of ink on paper is not worth three times the disk space
                 image = cast("NDArray[np.uint8]", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
             fault = health.judge(image, arrival_ns)
             if fault is not None:

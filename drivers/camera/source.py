@@ -5,10 +5,12 @@ from __future__ import annotations
 import http.client
 import os
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Annotated, Protocol, cast
 from urllib.parse import urlsplit
+
+from pydantic import BaseModel, Field
 
 from brushloop.drivers.errors import ConnectionLost, DeviceError
 
@@ -22,24 +24,29 @@ LOOPBACK_SERVER = "brushloop-loopback"
 """The loopback camera's HTTP server name; no camera maker uses it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Locked:
-    """Settings that must not drift during a session; None leaves one as it is. Values are the driver's own units."""
+Setting = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Side = Annotated[int, Field(ge=16, le=65535)]
 
-    width: int | None = None
-    height: int | None = None
-    exposure: float | None = None
+
+class Locked(BaseModel, frozen=True, extra="forbid"):
+    """Camera settings that must not drift, in the device's own units; a setting that is left out is not changed.
+
+    It is `[camera.locked]` of a `rig.toml`.
+    """
+
+    width: Side | None = None
+    height: Side | None = None
+    exposure: Setting | None = None
     """Turns automatic exposure off."""
-    gain: float | None = None
-    white_balance_k: float | None = None
+    gain: Setting | None = None
+    white_balance_k: Setting | None = None
     """Turns automatic white balance off."""
-    focus: float | None = None
+    focus: Setting | None = None
     """Turns autofocus off."""
 
     def wanted(self) -> dict[str, float]:
         """The settings to lock, by name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: float(value) for name, value in values.items() if value is not None}
+        return {name: float(value) for name, value in self.model_dump(exclude_none=True).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +57,7 @@ class CameraOptions:
     latency_ms: float = 250.0
     """The longest time from exposure to arrival; a frame counts as exposed after (arrival - latency)."""
     timeout_s: float = 10.0
-    gray: bool = True
-    """The colour of ink on paper is not worth three times the disk space."""
-    locked: Locked = Locked()
+    locked: Locked = field(default_factory=Locked)
     folder_fps: float = 10.0
     """Rate at which the images of a folder are shown."""
     frozen_after: int = 5

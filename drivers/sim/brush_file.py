@@ -14,16 +14,18 @@ misplaced_mm = 4.0
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field, ValidationError
 
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.config import SoundHead
-from brushloop.drivers.sim.described import load_described
+from brushloop.drivers.sim.described import SimFileError, complaint
 
+MAX_BYTES = 256 * 1024
 MAX_NOISE_GRAY = 30.0
 LOOPBACK = "loopback"
 """Name of the brush whose constants are the defaults of `BrushSpec`."""
@@ -45,15 +47,11 @@ class NamedBrush:
     """Where its sound marks begin; None for the default of `rig.toml`."""
 
 
-class _Camera(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Camera(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     noise: Annotated[float, Field(ge=0.0, le=MAX_NOISE_GRAY)]
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _File(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
     brush: BrushSpec
     camera: _Camera | None = None
@@ -67,5 +65,22 @@ def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
     """
     if str(path) == LOOPBACK:
         return NamedBrush(BrushSpec(seed=seed), "")
-    found = load_described(PAPER_FILE if str(path) == PAPER else path, _File)
+    found = _read(PAPER_FILE if str(path) == PAPER else path)
     return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise, found.quality)
+
+
+def _read(path: Path) -> _File:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
+        return _File.model_validate(tomllib.loads(data.decode("utf-8")))
+    except FileNotFoundError:
+        raise SimFileError(path, "", "no such file") from None
+    except OSError as error:
+        raise SimFileError(path, "", error.strerror or str(error)) from None
+    except ValidationError as error:
+        raise SimFileError(path, *complaint(error)) from None
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
+        raise SimFileError(path, "", f"is not TOML: {error}") from None

@@ -1,15 +1,11 @@
-"""TOML files that describe a brush to the simulator: read completely, or refused with one line."""
+"""What is wrong with a file or a request for the simulator, in one line."""
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
-from pydantic import BaseModel, ValidationError
-
-MAX_BYTES = 256 * 1024
-Described = TypeVar("Described", bound=BaseModel)
+from pydantic import ValidationError
 
 
 class SimFileError(Exception):
@@ -22,26 +18,6 @@ class SimFileError(Exception):
         self.field = field
         self.what = what
         super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
-
-
-def load_described(path: Path, model: type[Described]) -> Described:
-    """Read and check the file. Raises `SimFileError`, naming file, field and range."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
-        values = tomllib.loads(data.decode("utf-8"))
-    except FileNotFoundError:
-        raise SimFileError(path, "", "no such file") from None
-    except OSError as error:
-        raise SimFileError(path, "", error.strerror or str(error)) from None
-    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
-        raise SimFileError(path, "", f"is not TOML: {error}") from None
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        raise SimFileError(path, *complaint(error)) from None
 
 
 def complaint(error: ValidationError) -> tuple[str, str]:

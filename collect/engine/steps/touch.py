@@ -104,7 +104,8 @@ async def check_rig(context: StepContext) -> SelfCheckResult:
     patches = (patch, *context.more_patches)
     places_mm = triangle_on(patches, run.rig.config.self_check)
     checked = await context.guard.guarded(self_check(run.rig, _Effector(context), places_mm, run.procedures.plane))
-    return checked.result(run.store.state.sheet, tuple(one.index for one in patches))
+    on = {"sheet": run.store.state.sheet, "patches": tuple(one.index for one in patches)}
+    return checked.model_copy(update=on)
 
 
 class _Effector:

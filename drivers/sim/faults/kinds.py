@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from brushloop.drivers.sim.described import complaint
 from brushloop.drivers.sim.faults.phases import Phase
@@ -90,13 +90,11 @@ KINDS: dict[Device, frozenset[str]] = {
 }
 
 
-class Fault(BaseModel):
+class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """One fault. All conditions of its trigger must hold at once; without any it begins at once.
 
     Once begun it strikes every matching request, push or frame until its `count` or `for_s` is over.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     device: Device
     kind: str

@@ -19,7 +19,6 @@ from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.config_touch import SelfCheckConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
 from brushloop.collect.touch.selfcheck import (
-    SelfCheck,
     Triangle,
     judge,
     partners,
@@ -29,6 +28,7 @@ from brushloop.collect.touch.selfcheck import (
     triangle_on,
 )
 from brushloop.drivers.samples import Pose
+from brushloop.sessions.events import SelfCheckResult
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench
@@ -54,7 +54,7 @@ def test_a_good_rig_passes_in_whatever_order_the_marks_are_found(order: list[int
     rng = np.random.default_rng(noise)
     found = linear(*turn(turn_deg)) + np.array([-1.2, 0.05]) + np.clip(rng.normal(0.0, 0.09, (3, 2)), -0.2, 0.2)
     check = judge(COMMANDED, found[order], CONFIG)
-    assert np.array_equal(check.found_mm, found)
+    assert np.array_equal(np.array(check.found_mm), found)
     assert check.turn_deg == pytest.approx(turn_deg, abs=0.4)
     assert max(check.residuals_mm) < 0.5
 
@@ -92,7 +92,7 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
             judge(COMMANDED, found, CONFIG)
 
 
-async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheck:
+async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
     return await self_check(bench.rig, bench.effector, places, PaperPlane(120.0))
 
 
@@ -102,7 +102,6 @@ async def test_marks_on_the_loopback_sheet_are_found_and_pass(make_bench: MakeBe
     assert max(check.residuals_mm) < 0.4
     assert check.scale == pytest.approx((1.0, 1.0), abs=0.006)
     assert math.hypot(*check.offset_mm) < 2.0
-    assert check.result(0, (0,)).residuals_mm == check.residuals_mm
     assert bench.lifted
 
 
