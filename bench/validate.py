@@ -81,7 +81,7 @@ def scoring(seed: int, repeats: int = 12, rounds: int = 3) -> list[Result]:
     """Presses scored against every model and against each other: compiled, and by a plain loop."""
     presses = [one for one in pressed((15.0, 5.0), repeats, seed) if not one.refused]
     models = stroke_models(Bundle())
-    cell = presses[0].depth_mm, presses[0].tilt_deg
+    cell = presses[0].condition.depth_mm, presses[0].condition.tilt_deg
     predicted = tuple(pack(simulated_pixels(model, *cell, Field())) for model in models.values())
     pixels = tuple(press.pixels for press in presses)
     others = tuple(tuple(k for k in range(len(presses)) if k != m)[:9] for m in range(len(presses)))

@@ -20,6 +20,7 @@ from brushloop.model.brush import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.loops import BEZIER_PIECES, Loop, bezier_side, closed
 from brushloop.model.plane import Plane, fit_plane
+from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
@@ -33,6 +34,7 @@ PER_CELL = 3
 """Presses of each other cell that a fit uses; more did not change it."""
 MAX_STROKES = 60
 One = TypeVar("One")
+C = TypeVar("C", Cell, Condition)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +54,14 @@ def predictor(press: FittedPress, grid: Grid) -> Predict:
     return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
 
 
-def folds(cells: Sequence[Cell], most: int = MAX_FOLDS) -> list[list[Cell]]:
+def folds(cells: Sequence[C], most: int = MAX_FOLDS) -> list[list[C]]:
     """Groups of cells that are left out together; none if there is only one cell."""
     ordered = sorted(set(cells))
     count = min(len(ordered), most)
     return [ordered[k::count] for k in range(count)] if len(ordered) > 1 else []
 
 
-def without(cells: Mapping[Cell, Sequence[One]], fold: Sequence[Cell]) -> list[One]:
+def without(cells: Mapping[C, Sequence[One]], fold: Sequence[C]) -> list[One]:
     """The strokes of all other cells that a fit uses."""
     others = [one for cell, group in cells.items() if cell not in fold for one in group[:PER_CELL]]
     return others[:: max(1, -(-len(others) // MAX_STROKES))]

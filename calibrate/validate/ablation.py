@@ -10,12 +10,12 @@ import numpy as np
 
 from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
 from brushloop.calibrate.compare.images import brush_of, loop_pixels, pack
-from brushloop.calibrate.validate.heldout import RefitJob, bezier_pixels, fitted_press, refit_job
+from brushloop.calibrate.validate.heldout import RefitJob, bezier_pixels, fitted_press, refit_job, stroke_of
 from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, score_job
 from brushloop.calibrate.validate.pool import Scheduler
 from brushloop.calibrate.validate.report.data import Step
-from brushloop.calibrate.validate.rows import CHUNK
-from brushloop.calibrate.validate.run import Outcome
+from brushloop.calibrate.validate.run import CHUNK, Outcome
+from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
@@ -41,7 +41,7 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
     jobs: dict[str, tuple[Trial, RefitJob]] = {}
     for trial in _trials(outcome):
         brush = brush_of(outcome.sessions[trial.session].header)
-        strokes = tuple((*outcome.rows.cell(k), outcome.rows.pixels(k)) for k in trial.chosen)
+        strokes = tuple(stroke_of(outcome.rows, k) for k in trial.chosen)
         job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), outcome.options.view)
         jobs[f"{job.key}:{len(jobs)}"] = (trial, job)
     waiting = ((name, job) for name, (_, job) in jobs.items() if name.partition(":")[0] not in outcome.store)
@@ -65,8 +65,8 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
 
 def _trials(outcome: Outcome) -> Iterator[Trial]:
     for session in range(len(outcome.sessions)):
-        cut = outcome.rows.index["cut"]
-        cells = [group[~cut[group]] for number, _, group in outcome.rows.groups() if number == session]
+        cut = outcome.rows.cut
+        cells = [group[~cut[group]] for number, _, group in outcome.rows.groups if number == session]
         for draw in range(DRAWS):
             rng = np.random.default_rng([draw, session])
             # Every cell once before any cell twice, as a person would choose.
@@ -87,14 +87,14 @@ def _scored(
     """Yield (model, (n, 2) CSIM and SSIM) in millimetres, binary."""
     brush, view = brush_of(outcome.sessions[trial.session].header), outcome.options.view
     press = fitted_press(fit["fitted"], float(brush.radius_mm), float(brush.length_mm))
-    cells: dict[tuple[float, float], list[int]] = {}
+    cells: dict[Condition, list[int]] = {}
     for k in trial.scored:
-        cells.setdefault(outcome.rows.cell(k), []).append(k)
+        cells.setdefault(outcome.rows[k].press.condition, []).append(k)
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell, group in cells.items():
-            bezier = ABSENT if fit["bezier"] is None else pack(bezier_pixels(fit["bezier"], *cell, view))
-            predictions = (pack(loop_pixels(press.outline(*cell), view)), bezier)
+            bezier = ABSENT if fit["bezier"] is None else pack(bezier_pixels(fit["bezier"], cell, view))
+            predictions = (pack(loop_pixels(press.outline(cell.depth_mm, cell.tilt_deg), view)), bezier)
             for start in range(0, len(group), CHUNK):
                 chunk = group[start : start + CHUNK]
                 presses = tuple(outcome.rows.pixels(k) for k in chunk)

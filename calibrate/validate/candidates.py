@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
 from brushloop.calibrate.validate.heldout import bezier_pixels, fitted_press
-from brushloop.calibrate.validate.rows import Cell
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.model.brush import Brush, DomainError
 from brushloop.model.fitted import NAME
+from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
     from brushloop.model.protocol import StrokeModel
@@ -42,8 +42,8 @@ class Candidate:
     definition: str
     basis: str
     """What the model knows of these strokes: `as published`, `fitted, in sample`, `fitted, held-out cells`, ..."""
-    predict: Callable[[float, float], Pixels]
-    """(H, alpha) -> (len(KEYS), 128, 128); raises `DomainError` for a press that the model does not predict."""
+    predict: Callable[[Condition], Pixels]
+    """(len(KEYS), 128, 128) of a condition; raises `DomainError` for a press that the model does not predict."""
     file: Path | None = None
     """File of a trained generator."""
 
@@ -96,16 +96,16 @@ def generators(session: LoadedSession, files: Sequence[Generator], view: Field) 
     return found
 
 
-def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
+def held_out(fits: dict[Condition, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
     """Models fitted without the cell they predict; `fits` holds the result of a `refit_job` for each cell."""
 
-    def predict_fitted(depth_mm: float, tilt_deg: float) -> Pixels:
-        found = _of_cell(fits, depth_mm, tilt_deg, "fitted")
+    def predict_fitted(condition: Condition) -> Pixels:
+        found = _without(fits, condition, "fitted")
         press = fitted_press(found, float(brush.radius_mm), float(brush.length_mm))
-        return loop_pixels(press.outline(depth_mm, tilt_deg), view)
+        return loop_pixels(press.outline(condition.depth_mm, condition.tilt_deg), view)
 
-    def predict_bezier(depth_mm: float, tilt_deg: float) -> Pixels:
-        return bezier_pixels(_of_cell(fits, depth_mm, tilt_deg, "bezier"), depth_mm, tilt_deg, view)
+    def predict_bezier(condition: Condition) -> Pixels:
+        return bezier_pixels(_without(fits, condition, "bezier"), condition, view)
 
     bezier = Candidate(
         BEZIER_REFITTED,
@@ -124,17 +124,17 @@ def held_out(fits: dict[Cell, dict[str, Any]], brush: Brush, view: Field, *, fit
     return [ours, bezier] if fitted else [bezier]
 
 
-def tuned(files: dict[Cell, Path], brush: Brush, view: Field, number: int) -> Candidate:
+def tuned(files: dict[Condition, Path], brush: Brush, view: Field, number: int) -> Candidate:
     """A generator tuned on all cells except the one it predicts."""
     from brushloop.model.train.checkpoint import load_generator
 
     loaded: dict[Path, StrokeModel] = {}
 
-    def predict(depth_mm: float, tilt_deg: float) -> Pixels:
-        file = files[(depth_mm, tilt_deg)]
+    def predict(condition: Condition) -> Pixels:
+        file = files[condition]
         if file not in loaded:
             loaded[file] = load_generator(file, brush)
-        return simulated_pixels(loaded[file], depth_mm, tilt_deg, view)
+        return simulated_pixels(loaded[file], condition.depth_mm, condition.tilt_deg, view)
 
     return Candidate(
         GENERATOR_HELD_OUT if number == 0 else f"{GENERATOR_HELD_OUT}-{number + 1}",
@@ -152,12 +152,13 @@ def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label
         label or model.label,
         model.definition,
         basis,
-        lambda depth_mm, tilt_deg: simulated_pixels(model, depth_mm, tilt_deg, view),
+        lambda condition: simulated_pixels(model, condition.depth_mm, condition.tilt_deg, view),
     )
 
 
-def _of_cell(fits: dict[Cell, dict[str, Any]], depth_mm: float, tilt_deg: float, what: str) -> Any:
-    found = fits.get((depth_mm, tilt_deg), {}).get(what)
+def _without(fits: dict[Condition, dict[str, Any]], condition: Condition, what: str) -> Any:
+    found = fits.get(condition, {}).get(what)
     if found is None:
-        raise DomainError("depth_mm", depth_mm, "other cells", "the other cells do not determine this press")
+        why = "the other cells do not determine this press"
+        raise DomainError("depth_mm", condition.depth_mm, "other cells", why)
     return found

@@ -129,14 +129,15 @@ def captures(
     from brushloop.calibrate.validate.sources import open_session
     from brushloop.calibrate.validate.tuning import align_captures, write_captures
     from brushloop.sessions.disk import number
+    from brushloop.sessions.records import Condition
 
-    cells: list[tuple[float, float]] = []
+    cells: list[Condition] = []
     for text in leave_out or ():
         try:
-            height, tilt = (number(part) for part in text.split("/"))
+            depth_mm, tilt_deg = (number(part) for part in text.split("/"))
         except ValueError:
             raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
-        cells.append((height, tilt))
+        cells.append(Condition(depth_mm, tilt_deg))
     check_target(out, ".safetensors", generator)
     opened = [open_session(place, out.parent / "work", calibration, None) for place in session]
     aligned = align_captures(opened, generator)

@@ -26,11 +26,12 @@ from brushloop.calibrate.fit.heldout import (
     without,
 )
 from brushloop.calibrate.validate.pool import Scheduler
-from brushloop.calibrate.validate.rows import Cell, Numbers, Rows
+from brushloop.calibrate.validate.rows import Numbers, Rows
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import VERSION, Store
 from brushloop.model.fitted import MODES, TERMS, FittedPress
 from brushloop.model.plane import Plane
+from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
 
 
@@ -83,10 +84,10 @@ def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> Fi
     return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges, np.array(body["ends"]).reshape(2, TERMS))
 
 
-def bezier_pixels(coefficients: Sequence[float], depth_mm: float, tilt_deg: float, view: Field) -> Pixels:
+def bezier_pixels(coefficients: Sequence[float], condition: Condition, view: Field) -> Pixels:
     """Images of a refitted Bezier, (len(KEYS), 128, 128)."""
     plane = Plane(BEZIER_SIZES, np.reshape(coefficients, (len(BEZIER_SIZES), 3)))
-    return loop_pixels(RefittedBezier(plane).outline(depth_mm, tilt_deg), view)
+    return loop_pixels(RefittedBezier(plane).outline(condition.depth_mm, condition.tilt_deg), view)
 
 
 def refits_by_cell(
@@ -98,18 +99,18 @@ def refits_by_cell(
     store: Store,
     progress: Progress,
     most_folds: int = MAX_FOLDS,
-) -> dict[Cell, dict[str, Any]]:
+) -> dict[Condition, dict[str, Any]]:
     """Refit for each cell of session `number` to uncut presses of its other cells; return the results by cell."""
-    cells = {cell: _first_uncut(rows, group) for session_of, cell, group in rows.groups() if session_of == number}
+    cells = {one: _first_uncut(rows, group) for session_of, one, group in rows.groups if session_of == number}
     brush, fitted = brush_of(session.header), session.fit is not None
-    fits: dict[Cell, dict[str, Any]] = {}
+    fits: dict[Condition, dict[str, Any]] = {}
     jobs: list[tuple[str, RefitJob]] = []
-    of_key: dict[str, list[Cell]] = {}
+    of_key: dict[str, list[Condition]] = {}
     for fold in folds(list(cells), most_folds):
         others = without(cells, fold)
         if not others:
             continue
-        strokes = tuple((*rows.cell(row), rows.pixels(row)) for row in others)
+        strokes = tuple(stroke_of(rows, row) for row in others)
         job = RefitJob(strokes, float(brush.radius_mm), float(brush.length_mm), view, fitted)
         of_key[job.key] = fold
         if job.key not in store:
@@ -124,6 +125,12 @@ def refits_by_cell(
     return fits
 
 
+def stroke_of(rows: Rows, row: int) -> tuple[float, float, bytes]:
+    """A stroke of a `RefitJob`."""
+    condition = rows[row].press.condition
+    return condition.depth_mm, condition.tilt_deg, rows.pixels(row)
+
+
 def _first_uncut(rows: Rows, group: Numbers) -> list[int]:
     """The rows of one cell that a fit uses."""
-    return [int(row) for row in group[~rows.index["cut"][group]][:PER_CELL]]
+    return [int(row) for row in group[~rows.cut[group]][:PER_CELL]]

@@ -17,10 +17,12 @@ from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field, covered
 from brushloop.calibrate.compare.images import captured_images, pack, prepare_press, to_pixels, unpack
 from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.scores import Values
 from brushloop.calibrate.stroke.measure import Measured, measure
 from brushloop.calibrate.validate.store import VERSION, Store
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
     from brushloop.calibrate.validate.pool import Scheduler
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 
 ABSENT = b""
 """Placeholder for the images of a model that does not predict this press."""
-Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,8 @@ class Press:
     """A captured press after preparation; `pixels` is empty if it was refused."""
 
     stroke_id: str
-    depth_mm: float
-    tilt_deg: float
+    condition: Condition
+    """As commanded."""
     again_of: str
     pixels: bytes
     """`pack` of (len(KEYS) + 1, 128, 128): an image for each key, then the coverage on the millimetre field."""
@@ -63,21 +64,23 @@ class Press:
 
 def press_of(body: dict[str, Any]) -> Press:
     """A press from plain data."""
-    measured = body["measured"]
-    rest: dict[str, Any] = {"measured": Measured(**measured) if measured else None, "flags": tuple(body["flags"])}
+    rest: dict[str, Any] = {
+        "condition": Condition(**body["condition"]),
+        "measured": Measured(**body["measured"]) if body["measured"] else None,
+        "flags": tuple(body["flags"]),
+    }
     return Press(**(body | rest))
 
 
 def prepare_job(job: PrepareJob) -> Press:
     """Prepare a capture; one that cannot be used comes back with the reason."""
     stroke = job.capture.stroke
-    height, tilt = stroke.depth_mm, stroke.tilt_deg
+    condition, again = Condition(stroke.depth_mm or 0.0, stroke.tilt_deg or 0.0), stroke.again_of or ""
 
     def refused(why: str) -> Press:
-        depth, lean = (0.0 if value is None else value for value in (height, tilt))
-        return Press(stroke.stroke_id, depth, lean, stroke.again_of or "", b"", None, False, (), why)
+        return Press(stroke.stroke_id, condition, again, b"", None, False, (), why)
 
-    if height is None or tilt is None:
+    if stroke.depth_mm is None or stroke.tilt_deg is None:
         return refused("has no depth or tilt")
     try:
         prepared = prepare_press(job.capture, job.calibration, job.view)
@@ -85,11 +88,11 @@ def prepare_job(job: PrepareJob) -> Press:
     except (CaptureRefused, SessionDamaged) as error:
         return refused(error.what)
     pixels = pack(np.stack([to_pixels(image) for image in (*images.values(), covered(prepared))]))
-    measured, again = measure(prepared.mask), stroke.again_of or ""
-    return Press(stroke.stroke_id, height, tilt, again, pixels, measured, prepared.cut, prepared.flags, "")
+    measured = measure(prepared.mask)
+    return Press(stroke.stroke_id, condition, again, pixels, measured, prepared.cut, prepared.flags, "")
 
 
-def key_of(session: LoadedSession, view: Field) -> str:
+def _key_of(session: LoadedSession, view: Field) -> str:
     """The beginning of the keys of a session's prepared strokes; `:` and the number of the stroke follow."""
     calibration = session.calibration.digest if session.calibration is not None else ""
     bad = sorted(session.recording.marked_bad().items())
@@ -98,9 +101,9 @@ def key_of(session: LoadedSession, view: Field) -> str:
 
 def prepared(
     session: LoadedSession, view: Field, scheduler: Scheduler, store: Store, progress: Progress
-) -> Iterator[Press]:
-    """Every stroke of a session without its pixels, in order of capture; those not in the store are prepared first."""
-    base = key_of(session, view)
+) -> Iterator[tuple[str, Press]]:
+    """Every stroke of a session by its key, without pixels, in order of capture; what the store lacks is prepared."""
+    base = _key_of(session, view)
     what = f"{session.header.session_id}: found"
     every = range(session.count)
     waiting = np.fromiter((f"{base}:{k}" not in store for k in every), np.bool_, session.count)
@@ -123,7 +126,7 @@ def prepared(
         for number, press in scheduler.run(prepare_job, jobs()):
             put(number, press)
     for k in every:
-        yield press_of(store.get(f"{base}:{k}") | {"pixels": b""})
+        yield f"{base}:{k}", press_of(store.get(f"{base}:{k}") | {"pixels": b""})
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,32 +1,38 @@
 """The run: prepare every capture, fit to other cells, score everything. Finished work is never repeated.
 
-Captures stream from the recording through the workers into the store, and so do their scores; memory holds only where
-they are. Each result depends only on its inputs, so neither the order nor the place of work changes it.
+Captures stream from the recording through the workers into the store, and so do their scores, which are then held in
+memory. Each result depends only on its inputs, so neither the order nor the place of work changes it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from brushloop.calibrate.compare.ceiling import others_of
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.field import KEYS, Field
 from brushloop.calibrate.compare.images import brush_of, pack
 from brushloop.calibrate.compare.paper import ROBOT_WRITING
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.scores import Score, Scores
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.candidates import Candidate, Generator
 from brushloop.calibrate.validate.heldout import refits_by_cell
-from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, key_of, prepared, score_job
+from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, prepared, score_job
 from brushloop.calibrate.validate.pool import Scheduler
-from brushloop.calibrate.validate.rows import CHUNK, Entry, Numbers, Rows, Scores
+from brushloop.calibrate.validate.rows import Numbers, Row, Rows
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import Store
 from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
 from brushloop.model.brush import DomainError
 from brushloop.sessions.terminal import Progress
 
+CHUNK = 16
+"""Most strokes in one job of scores; all are of one condition in one session."""
 ANOTHER = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
 REPEATED = ROBOT_WRITING
@@ -54,14 +60,24 @@ class Outcome:
     options: Options
     candidates: list[list[Candidate]]
     """Candidates of each session."""
-    names: list[str]
-    """Columns: every candidate of any session, then the comparisons with presses."""
     rows: Rows
     """Compared strokes, by session and order of capture."""
     scores: Scores
+    """Of every candidate of any session, then of the comparisons with presses."""
     refused: list[tuple[str, str, str]]
     """(session, stroke, reason) of strokes that could not be used, or that one of the models does not predict."""
     store: Store
+
+    def every_score(self) -> Iterator[Score]:
+        """The scores by session, order of capture and model; those that are missing are left out."""
+        for k, row in enumerate(self.rows):
+            session, press = self.sessions[row.session], row.press
+            reached_mm = session.reached_mm.get(press.stroke_id)
+            about = (session.header.session_id, press.stroke_id, press.condition, reached_mm)
+            for model, values in zip(self.scores.models, self.scores.of_stroke(k), strict=True):
+                for key, (csim, ssim) in zip(KEYS, values.tolist(), strict=True):
+                    if math.isfinite(csim):
+                        yield Score(*about, model, *key, csim, ssim)
 
 
 def validate_presses(
@@ -90,15 +106,15 @@ def _validate(
     known = _known(sessions, options) if options.models or options.generators else []
     refused: list[tuple[str, str, str]] = []
 
-    def used() -> Iterator[Entry]:
+    def used() -> Iterator[Row]:
         for number, session in enumerate(sessions):
-            for k, press in enumerate(prepared(session, options.view, scheduler, store, progress)):
+            for key, press in prepared(session, options.view, scheduler, store, progress):
                 if press.refused:
                     refused.append((session.header.session_id, press.stroke_id, press.refused))
                 else:
-                    yield number, k, press.depth_mm, press.tilt_deg, press.cut
+                    yield Row(number, key, press)
 
-    rows = Rows(store, [key_of(session, options.view) for session in sessions], used())
+    rows = Rows(store, used())
     known = known or _known(sessions, options)
     candidates: list[list[Candidate]] = []
     for number, session in enumerate(sessions):
@@ -112,28 +128,35 @@ def _validate(
                 "--model", f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
             )
     names = [*_ordered_names(candidates), ANOTHER, REPEATED]
-    columns = [[*(names.index(one.name) for one in group), len(names) - 2, len(names) - 1] for group in candidates]
-    scores = Scores(store, rows, names, columns)
+    columns = [
+        np.array([names.index(name) for name in (*(one.name for one in group), ANOTHER, REPEATED)], np.int64)
+        for group in candidates
+    ]
+    scores, places = Scores(len(rows), names), dict[str, list[Numbers]]()
     done = 0
 
-    def compared(strokes: int) -> None:
+    def put(key: str) -> None:
         nonlocal done
-        done += strokes
+        body = store.get(key)
+        values = np.frombuffer(body["values"]).reshape(body["shape"])
+        for chunk in places.pop(key):
+            scores.put(chunk, columns[rows[int(chunk[0])].session], values)
+            done += len(chunk)
         progress("compared", done, len(rows))
 
     def waiting() -> Iterator[tuple[str, ScoreJob]]:
         for chunk, job in _score_jobs(sessions, candidates, rows, refused):
             key = job.key
-            scores.add(chunk, key)
+            places.setdefault(key, []).append(chunk)
             if key in store:
-                compared(len(chunk))
-            else:
+                put(key)
+            elif len(places[key]) == 1:
                 yield key, job
 
     for key, found in scheduler.run(score_job, waiting()):
         store.put(key, {"shape": list(found.shape), "values": found.tobytes()})
-        compared(len(found))
-    return Outcome(sessions, options, candidates, names, rows, scores, refused, store)
+        put(key)
+    return Outcome(sessions, options, candidates, rows, scores, refused, store)
 
 
 def _known(sessions: list[LoadedSession], options: Options) -> list[list[Candidate]]:
@@ -181,13 +204,13 @@ def _score_jobs(
     rows: Rows,
     refused: list[tuple[str, str, str]],
 ) -> Iterator[tuple[Numbers, ScoreJob]]:
-    """Yield (rows, job), cell by cell, in the order of `Rows.groups`."""
+    """Yield (rows, job), in the order of `Rows.groups`."""
     originals = _originals(rows) if len(sessions) > 1 else {}
-    for session, cell, group in rows.groups():
+    for session, condition, group in rows.groups:
         predictions: list[bytes] = []
         for one in candidates[session]:
             try:
-                predictions.append(pack(one.predict(*cell)))
+                predictions.append(pack(one.predict(condition)))
             except DomainError as error:
                 predictions.append(ABSENT)
                 why = f"{one.name} does not predict it: {error}"
@@ -214,7 +237,7 @@ def _originals(rows: Rows) -> dict[int, int]:
     for k, row in enumerate(rows if named else ()):
         if row.press.stroke_id in named:
             by_name.setdefault(row.press.stroke_id, []).append(k)
-    session = rows.index["session"]
+    session = rows.session
     found: dict[int, int] = {}
     for k, name in again.items():
         of = [n for n in by_name.get(name, []) if session[n] != session[k]]

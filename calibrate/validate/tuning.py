@@ -27,22 +27,22 @@ from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.calibrate.validate.candidates import Generator
 from brushloop.calibrate.validate.heldout import fitted_press
-from brushloop.calibrate.validate.rows import Cell
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
 from brushloop.calibrate.validate.store import VERSION
 from brushloop.model.brush import DomainError
 from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.records import Condition
+from brushloop.sessions.terminal import Progress
 
 if TYPE_CHECKING:
     from brushloop.model.generator.stroke import GeneratorModel
     from brushloop.model.train.loop import Validation
-    from brushloop.sessions.terminal import Progress
 
 MAX_STROKES = 100_000
 FOLDS = 5
 """Number of folds: cells are left out by fifths, since a tuning takes a minute."""
 LEARNING_RATE = 2e-3
-NO_CELL: Cell = (-1.0, -1.0)
+NO_CELL = Condition(-1.0, -1.0)
 """Cell of an image that is not a capture, so that it is never left out."""
 IMAGES = 400
 """Number of images of the fitted CCD-BSM added to the captures; drawn evenly from the generator's ranges."""
@@ -60,7 +60,7 @@ class AlignedStrokes:
     images: list[Image]
     """(N, N) each."""
     inputs: list[dict[str, float]]
-    cells: list[Cell]
+    cells: list[Condition]
     left_out: list[tuple[str, str]]
     """(stroke, why) of presses that the generator does not draw or that cannot be used."""
 
@@ -92,13 +92,13 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
                 aligned.left_out.append((stroke.stroke_id, f"the generator does not draw it: {error}"))
                 continue
             aligned.inputs.append(values)
-            aligned.cells.append((stroke.depth_mm, stroke.tilt_deg))
+            aligned.cells.append(Condition(stroke.depth_mm, stroke.tilt_deg))
             if len(aligned.cells) > MAX_STROKES:
                 raise CalibrationError(str(session.recording.path), f"more than {MAX_STROKES} strokes to tune on")
     return aligned
 
 
-def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Cell] = ()) -> int:
+def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condition] = ()) -> int:
     """Write the file for `brushloop train tune`, without some cells; return the number of presses.
 
     Raises `CalibrationError` if fewer than two conditions are left.
@@ -120,12 +120,12 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Cell]
 
 def tuned_by_cell(
     session: LoadedSession,
-    fits: dict[Cell, dict[str, Any]],
+    fits: dict[Condition, dict[str, Any]],
     generator: Generator,
     steps: int,
     work: Path,
     progress: Progress,
-) -> dict[Cell, Path]:
+) -> dict[Condition, Path]:
     """File of the generator tuned without each cell, by cell; empty for fewer than two cells.
 
     `fits` has for each cell the result of a `refit_job` with the same `FOLDS`. Raises what `load_generator` and
@@ -133,7 +133,7 @@ def tuned_by_cell(
     """
     left_out = folds(list(fits), FOLDS)
     calibration = session.calibration.digest if session.calibration is not None else ""
-    files: dict[Cell, Path] = {}
+    files: dict[Condition, Path] = {}
     aligned: AlignedStrokes | None = None
     for number, fold in enumerate(left_out):
         fit = fits[fold[0]]["fitted"]

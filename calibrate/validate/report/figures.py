@@ -27,14 +27,14 @@ MAX_POINTS = 200
 LABEL_CHARS = 120
 """As many fit on a line over two plots; a label that names a simulated brush is longer."""
 MAX_SAMPLES, MAX_CELLS = 15, 5
-GRAY_MM, MM_BINARY = KEYS.index((Alignment.MM, Tone.GRAY)), KEYS.index((Alignment.MM, Tone.BINARY))
+GRAY_MM, MM_BINARY = KEYS.index((Alignment.MM, Tone.GRAY)), (Alignment.MM, Tone.BINARY)
 MAX_CURVE_BYTES = 64 * 1024 * 1024
 
 
 def distributions(outcome: Outcome, report: Report) -> str:
     """CSIM of every stroke by model in both alignments, with the average and its interval."""
     labels = {rival.name: rival.label for rival in report.rivals}
-    names = [name for name in outcome.names if name in labels]
+    names = [name for name in outcome.scores.models if name in labels]
     figure, axes = plot(1, 2, (11.0, 0.9 + 0.36 * len(names)))
     for axis, alignment in zip(axes, (Alignment.MM, Alignment.SIZE_NORMALISED), strict=True):
         key = KEYS.index((alignment, Tone.BINARY))
@@ -132,7 +132,7 @@ def samples(outcome: Outcome, shown: str) -> list[dict[str, Any]]:
         size = "" if measured is None else f"{measured.length_mm:.1f} × {measured.breadth_mm:.1f} mm"
         csim, ssim = np.nan, np.nan
         if shown:
-            csim, ssim = 100.0 * outcome.scores.of_row(k)[outcome.names.index(shown), MM_BINARY]
+            csim, ssim = (100.0 * v for v in outcome.scores.one(k, shown, MM_BINARY))
         scores = f"CSIM {csim:.1f}, SSIM {ssim:.1f}" if np.isfinite(csim) else ""
         figures.append({"row": row, "size": size, "scores": scores, "images": triple(outcome, k, shown)})
     return figures
@@ -167,7 +167,7 @@ def of_one_cell(outcome: Outcome, names: Sequence[str]) -> list[tuple[str, str]]
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
     """The first capture of each cell; with more than `most` cells, of evenly spaced ones."""
-    first = list(outcome.rows.first_of_cells().values())
+    first = list(outcome.rows.first_of_each().values())
     count = min(len(first), most)
     return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
 
@@ -188,7 +188,7 @@ def predicted(outcome: Outcome, k: int, name: str) -> Pixels | None:
     if found is None:
         return None
     try:
-        return found.predict(*row.cell)[GRAY_MM]
+        return found.predict(row.press.condition)[GRAY_MM]
     except DomainError:
         return None
 

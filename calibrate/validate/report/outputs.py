@@ -9,10 +9,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.table import Column, Table
 
-from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import replacing, write_whole
 from brushloop.calibrate.loop.scores import AGAIN
@@ -29,8 +28,6 @@ COLUMNS = (
 )
 """`depth_mm` was commanded; `reached_mm` is empty where the recording does not say what the arm reached."""
 NUMBERS = ("depth_mm", "reached_mm", "tilt_deg", "csim", "ssim")
-GROUP = 500
-"""Strokes per row group of the Parquet file."""
 MAX_REFUSED = 20
 """Refused strokes listed on the terminal."""
 SHORT = {"fitted, held-out cells": ", held out", "fitted, in sample": ", in sample"}
@@ -39,29 +36,12 @@ Cells = tuple[str, str, float, float | None, float, str, str, str, float, float,
 
 
 def score_rows(outcome: Outcome) -> Iterator[Cells]:
-    """Yield one row per score, by session and order of capture; missing scores are left out."""
-    for k, row in enumerate(outcome.rows):
-        session = outcome.sessions[row.session]
-        header = session.header
-        press, scores = row.press, outcome.scores.of_row(k)
-        label = source_label(header.source, [header.brush])
-        for m, model in enumerate(outcome.names):
-            for j, (alignment, tone) in enumerate(KEYS):
-                csim, ssim = (float(v) for v in scores[m, j])
-                if np.isfinite(csim):
-                    yield (
-                        header.session_id,
-                        press.stroke_id,
-                        press.depth_mm,
-                        session.reached_mm.get(press.stroke_id),
-                        press.tilt_deg,
-                        model,
-                        str(alignment),
-                        str(tone),
-                        csim,
-                        ssim,
-                        label,
-                    )
+    """Yield one row per score, by session and order of capture."""
+    labels = {one.header.session_id: source_label(one.header.source, [one.header.brush]) for one in outcome.sessions}
+    for s in outcome.every_score():
+        pressed = s.condition.depth_mm, s.reached_mm, s.condition.tilt_deg
+        compared = s.model, str(s.alignment), str(s.tone), s.csim, s.ssim
+        yield s.session, s.stroke_id, *pressed, *compared, labels[s.session]
 
 
 def write_csv(outcome: Outcome, path: Path) -> str:
@@ -85,10 +65,9 @@ def write_parquet(outcome: Outcome, path: Path) -> None:
     kinds = [pa.float64() if name in NUMBERS else pa.string() for name in COLUMNS]
     label = source_label(outcome.sessions[0].header.source, (one.header.brush for one in outcome.sessions))
     schema: Any = pa.schema(list(zip(COLUMNS, kinds, strict=True)), metadata={"source": label})
-    with replacing(path) as part, pq.ParquetWriter(part, schema) as writer:
-        for group in _groups(outcome):
-            columns = [list(column) for column in zip(*group, strict=True)]
-            writer.write_table(pa.table(columns, schema=schema))
+    columns = [list(column) for column in zip(*score_rows(outcome), strict=True)] or [[] for _ in COLUMNS]
+    with replacing(path) as part:
+        pq.write_table(pa.table(columns, schema=schema), part)
 
 
 def summary_csv(report: Report) -> str:
@@ -134,18 +113,6 @@ def table_3_csv(report: Report) -> str:
         for row in record.table_3
     ]
     return csv_text((*head, "source"), rows)
-
-
-def _groups(outcome: Outcome) -> Iterator[list[Cells]]:
-    group: list[Cells] = []
-    most = GROUP * len(outcome.names)
-    for row in score_rows(outcome):
-        group.append(row)
-        if len(group) == most:
-            yield group
-            group = []
-    if group:
-        yield group
 
 
 def summary(report: Report) -> Iterator[Table | str]:

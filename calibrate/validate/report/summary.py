@@ -30,12 +30,13 @@ from brushloop.calibrate.validate.report.data import (
     Step,
     software,
 )
-from brushloop.calibrate.validate.rows import Cell, Rows
+from brushloop.calibrate.validate.rows import Rows
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Outcome
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
 from brushloop.model.brush import DomainError
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.records import Condition
 from brushloop.sessions.show import details
 
 MEASURES = ("csim", "ssim")
@@ -70,11 +71,11 @@ def report_of(
     outcome: Outcome, command: str, scores_sha256: str, by_strokes: tuple[Step, ...], extras: Extras
 ) -> tuple[Report, Extremes]:
     """Build one frozen report of a whole run; return with it the rows of its best and worst strokes."""
-    cells = list(outcome.rows.first_of_cells())
+    cells = list(outcome.rows.first_of_each())
     each_cell = len(cells) <= MAX_CELLS
     stats = _stats(outcome, cells if each_cell else [])
     scored = {stat.model for stat in stats}
-    present = [name for name in (*outcome.names, CEILING) if name in scored]
+    present = [name for name in (*outcome.scores.models, CEILING) if name in scored]
     shown = _shown(present)
     best, worst = _extremes(outcome, shown)
     report = Report(
@@ -99,14 +100,14 @@ def report_of(
     return report.sealed(), (best, worst)
 
 
-def _stats(outcome: Outcome, cells: list[Cell]) -> list[Stat]:
+def _stats(outcome: Outcome, cells: list[Condition]) -> list[Stat]:
     """Of all cells together, then of each of these; the scores of one model at a time are in memory."""
     stratum = outcome.rows.stratum
-    groups: list[tuple[Cell | None, NDArray[np.int64]]] = [(None, np.arange(len(outcome.rows)))]
-    groups += [(cell, outcome.rows.of_cell(cell)) for cell in cells]
+    groups: list[tuple[Condition | None, NDArray[np.int64]]] = [(None, np.arange(len(outcome.rows)))]
+    groups += [(cell, outcome.rows.of_condition(cell)) for cell in cells]
     stats: list[list[Stat]] = [[] for _ in groups]
     top = np.apply_along_axis(ceiling_values, 0, 100.0 * outcome.scores.of(ANOTHER), stratum)
-    for model in (*outcome.names, CEILING):
+    for model in (*outcome.scores.models, CEILING):
         scores = top if model == CEILING else 100.0 * outcome.scores.of(model)
         for mine, (cell, at) in zip(stats, groups, strict=True):
             for (k, (alignment, tone)), (j, measure) in itertools.product(enumerate(KEYS), enumerate(MEASURES)):
@@ -127,7 +128,7 @@ def _stats(outcome: Outcome, cells: list[Cell]) -> list[Stat]:
                         alignment=alignment,
                         tone=tone,
                         measure=measure,
-                        cell=cell,
+                        cell=None if cell is None else (cell.depth_mm, cell.tilt_deg),
                         n=found.n,
                         avg=_round(found.avg),
                         avg_interval=_interval(span),
@@ -167,15 +168,15 @@ def _extremes(outcome: Outcome, model: str) -> Extremes:
 
 def _extreme(outcome: Outcome, k: int, model: str) -> Extreme:
     row = outcome.rows[k]
-    csim, ssim = outcome.scores.of_row(k)[outcome.names.index(model), KEYS.index(JUDGED)]
+    csim, ssim = outcome.scores.one(k, model, JUDGED)
     return Extreme(
         session_id=outcome.sessions[row.session].header.session_id,
         stroke_id=row.press.stroke_id,
-        depth_mm=row.press.depth_mm,
-        tilt_deg=row.press.tilt_deg,
+        depth_mm=row.press.condition.depth_mm,
+        tilt_deg=row.press.condition.tilt_deg,
         model=model,
-        csim=_round(100.0 * float(csim)),
-        ssim=_round(100.0 * float(ssim)),
+        csim=_round(100.0 * csim),
+        ssim=_round(100.0 * ssim),
     )
 
 
@@ -196,7 +197,7 @@ def _candidates(outcome: Outcome, present: list[str]) -> tuple[CandidateInfo, ..
             basis="; ".join(bases[name]),
             sha256=files[file] if (file := by_name[name].file) is not None else "",
         )
-        for name in outcome.names
+        for name in outcome.scores.models
         if name in by_name
     ]
     for name, (label, definition) in PRESSES.items():
@@ -208,7 +209,7 @@ def _candidates(outcome: Outcome, present: list[str]) -> tuple[CandidateInfo, ..
 
 def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
     header, calibration = one.header, one.calibration
-    mine = np.flatnonzero(outcome.rows.index["session"] == number)
+    mine = np.flatnonzero(outcome.rows.session == number)
     length, width = _ratios(one, outcome.rows, mine)
     scale = None
     if calibration is not None:
@@ -232,7 +233,7 @@ def _session(outcome: Outcome, number: int, one: LoadedSession) -> Session:
         licence=header.licence,
         strokes=one.count,
         compared=len(mine),
-        cut=tuple(outcome.rows[int(k)].press.stroke_id for k in mine[outcome.rows.index["cut"][mine]]),
+        cut=tuple(outcome.rows[int(k)].press.stroke_id for k in mine[outcome.rows.cut[mine]]),
         calibration=calibration.named if calibration is not None else "",
         mm_per_px=calibration.mm_per_px if calibration is not None else None,
         mm_per_px_interval=scale,
@@ -249,8 +250,8 @@ def _deepest_miss(one: LoadedSession, presses: list[Press]) -> DepthMiss | None:
     known = [(press, reached) for press in presses if (reached := one.reached_mm.get(press.stroke_id)) is not None]
     if not known:
         return None
-    press, reached = max(known, key=lambda pair: abs(pair[1] - pair[0].depth_mm))
-    return DepthMiss(stroke_id=press.stroke_id, depth_mm=press.depth_mm, reached_mm=round(reached, 3))
+    press, reached = max(known, key=lambda pair: abs(pair[1] - pair[0].condition.depth_mm))
+    return DepthMiss(stroke_id=press.stroke_id, depth_mm=press.condition.depth_mm, reached_mm=round(reached, 3))
 
 
 def collected_in(folder: Path) -> Collected | None:
@@ -278,19 +279,19 @@ def _ratios(one: LoadedSession, rows: Rows, mine: NDArray[np.int64]) -> tuple[fl
     from brushloop.model.ccdbsm import ccdbsm
 
     brush = brush_of(one.header)
-    drawn: dict[Cell, tuple[float, float]] = {}
+    drawn: dict[Condition, tuple[float, float]] = {}
     total, strokes = np.zeros(2), 0
     for row in map(rows.__getitem__, map(int, mine)):
-        measured = row.press.measured
+        measured, condition = row.press.measured, row.press.condition
         if measured is None or row.press.cut:
             continue
-        if row.cell not in drawn:
+        if condition not in drawn:
             try:
-                mark = ccdbsm(brush, *row.cell)
+                mark = ccdbsm(brush, condition.depth_mm, condition.tilt_deg)
             except DomainError:
                 continue
-            drawn[row.cell] = float(mark.length_mm[0]), float(mark.width_mm[0])
-        length, width = drawn[row.cell]
+            drawn[condition] = float(mark.length_mm[0]), float(mark.width_mm[0])
+        length, width = drawn[condition]
         total += measured.length_mm / length, measured.breadth_mm / width
         strokes += 1
     if not strokes:

@@ -65,7 +65,7 @@ def validate(captures: list[Capture]) -> tuple[list[Press], list[Score]]:
     refused = [press for press in presses if press.refused]
     if not used:
         return refused, []
-    cell = used[0].depth_mm, used[0].tilt_deg
+    cell = used[0].condition.depth_mm, used[0].condition.tilt_deg
     pixels = tuple(press.pixels for press in used)
     predicted_by = tuple(tuple(k for k in range(len(used)) if k != n) for n in range(len(used)))
     predictions = tuple(pack(simulated_pixels(model, *cell, Field())) for model in MODELS.values())

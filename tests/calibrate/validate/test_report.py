@@ -10,14 +10,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
-import numpy as np
 import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
+from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.scores import Score
 from brushloop.calibrate.validate.gates import GateMissed, parse_gate
 from brushloop.calibrate.validate.report.data import Collected, Report, load_report
 from brushloop.calibrate.validate.report.findings import trust
@@ -26,7 +26,7 @@ from brushloop.calibrate.validate.report.page import _of_session
 from brushloop.calibrate.validate.run import Outcome
 from brushloop.sessions.events import Remark
 from brushloop.sessions.recording import Recording, add_remark
-from brushloop.sessions.records import Source
+from brushloop.sessions.records import Condition, Source
 from tests.browser import BROWSER, content_widths_px
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
@@ -130,11 +130,8 @@ def test_every_score_of_a_twin_is_labelled_as_one() -> None:
     header = SimpleNamespace(
         session_id="s", source=Source.LOOPBACK, brush="simulated bristle bundle (twin of monday, simulated), R = 5 mm"
     )
-    row = SimpleNamespace(session=0, press=SimpleNamespace(stroke_id="a", depth_mm=11.0, tilt_deg=0.0))
-    scores = SimpleNamespace(of_row=lambda _: np.full((1, len(KEYS), 2), 0.9))
-    outcome = SimpleNamespace(
-        sessions=[SimpleNamespace(header=header, reached_mm={})], rows=[row], scores=scores, names=["ccd-bsm"]
-    )
+    score = Score("s", "a", Condition(11.0, 0.0), None, "ccd-bsm", Alignment.MM, Tone.BINARY, 0.9, 0.9)
+    outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], every_score=lambda: iter([score]))
     labels = {one[COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
     assert labels == {"loopback rig, brush twin of monday, simulated"}
 
