@@ -30,7 +30,6 @@ from brushloop.collect.tui.end_screen import EndScreen
 from brushloop.collect.tui.finish_screen import FinishScreen
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.drivers.sim.brush.flaws import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
@@ -103,7 +102,7 @@ class _Tour:
     async def _answer(self) -> None:
         """Answer every question that no picture shows: a pale stroke is kept, a late frame taken again."""
         asked = None if self.app.engine is None else self.app.engine.snapshot().prompt
-        if asked is None or not isinstance(self.app.screen, AskScreen | SetUpScreen):
+        if asked is None or not isinstance(self.app.screen, AskScreen):
             return
         if Flaw.SPLIT in asked.question and not self.asked_split:
             return

@@ -23,8 +23,8 @@ from brushloop.collect.engine.perform import Performer
 from brushloop.collect.engine.policy import resume_question
 from brushloop.collect.engine.progress import Progress
 from brushloop.collect.engine.run import Run
-from brushloop.collect.engine.set_up import board_first, listed
-from brushloop.collect.engine.snapshot import SetUpStep, Snapshot
+from brushloop.collect.engine.set_up import board_first
+from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.engine.steps.context import RunContext, uninterrupted
 from brushloop.collect.engine.telemetry import Telemetry, noting_targets, previewing
 from brushloop.collect.errors import (
@@ -96,7 +96,6 @@ class Engine:
         self._armed = armed
         self._live = live
         self._guided = guided
-        self._self_checked = bool(rig.self_check.enabled and protocol.planned())
         self._preview = preview
         self._telemetry = Telemetry()
         self._requests = OperatorRequests()
@@ -148,7 +147,6 @@ class Engine:
             force_ceiling_n=None if self._rig_config.force is None else self._rig_config.force.max_n,
             picture=self._telemetry.picture,
             requests=self._requests.open,
-            set_up=self._set_up(),
             no_pose_s=no_pose_s if no_pose_s >= SILENT_S and state not in FINAL else None,
         )
 
@@ -159,11 +157,6 @@ class Engine:
     def _parked(self) -> bool:
         tip_mm, motion = self._telemetry.tip_mm, self._rig_config.motion
         return not self._rest_unknown and tip_mm is not None and math.dist(tip_mm, motion.park_mm) < PARKED_MM
-
-    def _set_up(self) -> tuple[SetUpStep, ...]:
-        if not self._guided or self._progress.set_up_over:
-            return ()
-        return listed(self._rig_config, self._progress.found, self._progress.set_up, checked=self._self_checked)
 
     def request(self, request: OperatorRequest) -> None:
         """Make or withdraw a request; requests are carried out between steps. From any thread."""

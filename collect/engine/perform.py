@@ -107,14 +107,14 @@ class Performer:
             run.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
-            progress.finished(step, None)
+            progress.finished()
             raise
         if isinstance(result, DipResult) and run.requests.take(OperatorRequest.SKIP):
             left_out = progress.planned(step.index).press()
             result = result.model_copy(update={"skipped": left_out})
             progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)
-        progress.finished(step, result)
+        progress.finished()
         return result
 
     async def _do(self, step: Step, context: StepContext) -> StepResult:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.last_capture import LastCapture
-from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot, in_set_up
+from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
 from brushloop.collect.operator import Prompt
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.plan import Planned, with_review
-from brushloop.collect.protocols.steps import MARKING, Step
+from brushloop.collect.protocols.steps import CaptureStep, DipStep, DrawStep, PressStep, Step
 from brushloop.collect.rig.paper import Layout
 from brushloop.drivers.clock import Clock
 from brushloop.sessions.events import (
@@ -26,8 +26,6 @@ from brushloop.sessions.events import (
     PressResult,
     ReviewResult,
     SelfCheckResult,
-    StepKind,
-    StepResult,
 )
 from brushloop.sessions.journal import RunState
 from brushloop.sessions.store import SessionStore
@@ -57,12 +55,6 @@ class Progress:
         self._logged = 0
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
         self._last: LastCapture | None = None
-        self.found: dict[StepKind, StepResult] = {}
-        """Results of the set-up steps of this process."""
-        self.set_up: StepKind | None = None
-        """Set-up step in progress."""
-        self.set_up_over = False
-        """Whether this process has begun a step after the set-up."""
 
     def opened(self, store: SessionStore) -> None:
         """Begin with what a new or resumed session holds."""
@@ -89,19 +81,13 @@ class Progress:
         """Note that a step begins."""
         with self._lock:
             self._count()
-            self.set_up_over = self.set_up_over or not in_set_up(step)
-            if in_set_up(step):
-                self.set_up = step.kind
-            elif step.kind in (StepKind.DIP, StepKind.CAPTURE) or step.kind in MARKING:
+            if isinstance(step, DipStep | PressStep | DrawStep | CaptureStep):
                 self._index = step.index
 
-    def finished(self, step: Step, result: StepResult | None) -> None:
-        """Note that a step is done, or was cut short (None)."""
+    def finished(self) -> None:
+        """Note that a step is done, or was cut short."""
         with self._lock:
             self._count()
-            self.set_up = None
-            if in_set_up(step) and result is not None:
-                self.found[step.kind] = result
 
     @property
     def first_free_index(self) -> int:

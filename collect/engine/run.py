@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from brushloop.collect.engine.control import RunControl, State
 from brushloop.collect.engine.perform import Performer
 from brushloop.collect.engine.policy import GO_ON, STOP, Action, decide, question
-from brushloop.collect.engine.set_up import by_method
+from brushloop.collect.engine.set_up import by_method, in_set_up
 from brushloop.collect.engine.set_up import question as set_up_question
-from brushloop.collect.engine.snapshot import in_set_up
 from brushloop.collect.engine.steps.context import RunContext
 from brushloop.collect.engine.steps.retake import marked_bad
 from brushloop.collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe

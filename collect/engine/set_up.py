@@ -1,13 +1,12 @@
-"""Compares what a set-up step measured with its limits, and asks the questions of a guided set-up."""
+"""A guided set-up: what each of its steps measured, compared with its limits, and the question about it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from brushloop.calibrate.board.pix2len import WORST_RMS_PX
 from brushloop.collect.engine.policy import GO_ON, KEEP, STOP
-from brushloop.collect.engine.snapshot import SET_UP, TITLES, Fact, SetUpStep, Standing
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.protocols.steps import BoardStep, Protocol, Step, ZeroTouchStep
 from brushloop.collect.rig.config import RigConfig
@@ -16,6 +15,35 @@ from brushloop.sessions.events import BoardResult, SelfCheckResult, StepKind, St
 AGAIN = Choice("a", "measure again")
 BY_JOG, BY_FORCE = Choice("b", "measure by jog"), Choice("f", "measure by force")
 METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force", KEEP: "kept"}
+TITLES = {
+    StepKind.BOARD: "Camera, board, scale",
+    StepKind.ZERO_TOUCH: "Zero touch and plane",
+    StepKind.SELF_CHECK: "Self-check",
+}
+"""Steps of the set-up, in their order."""
+NAME = 20
+"""Columns of a fact's name."""
+
+
+def in_set_up(step: Step) -> bool:
+    """Whether this is a step of the set-up: the board is also looked at between strokes, and the paper found again."""
+    return step.kind in TITLES and step.index == 0
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One measured value of a set-up step."""
+
+    name: str
+    value: str
+    limit: str = ""
+    good: bool | None = None
+    """Whether the value is within its limit; None without one."""
+
+    def __str__(self) -> str:
+        """A line such as `✓ residual of corners  0.11 px  (at most 1)`."""
+        sign = {True: "✓", False: "!", None: " "}[self.good]
+        return f"{sign} {self.name:<{NAME}} {self.value}" + (f"  ({self.limit})" if self.limit else "")
 
 
 def facts_of(result: StepResult, config: RigConfig) -> tuple[Fact, ...]:
@@ -31,20 +59,12 @@ def facts_of(result: StepResult, config: RigConfig) -> tuple[Fact, ...]:
             return ()
 
 
-def listed(
-    config: RigConfig, found: dict[StepKind, StepResult], now: StepKind | None, *, checked: bool
-) -> tuple[SetUpStep, ...]:
-    """Every set-up step of this run, with what was measured so far; `now` is in progress. `checked`: it has a
-    self-check."""
-    kinds = SET_UP if checked else SET_UP[:-1]
-    return tuple(_listed(kind, found.get(kind), config, now is kind) for kind in kinds)
-
-
 def question(result: StepResult, config: RigConfig) -> Prompt:
     """Ask whether the result is good enough. The default is to stop: nothing goes on without an answer."""
     facts = facts_of(result, config)
     good = all(fact.good is not False for fact in facts)
-    text = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not all is within limits.")
+    verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not all is within limits.")
+    text = "\n".join([verdict, *map(str, facts)])
     choices = [Choice(GO_ON, "good, go on" if good else "go on anyway"), AGAIN]
     if isinstance(result, ZeroTouchResult):
         choices += [BY_JOG, *([BY_FORCE] if config.force is not None else [])]
@@ -61,16 +81,6 @@ def board_first(protocol: Protocol) -> Protocol:
     have the same key, so the later one is then done already."""
     yield BoardStep(0)
     yield from protocol
-
-
-def _listed(kind: StepKind, result: StepResult | None, config: RigConfig, now: bool) -> SetUpStep:
-    facts = () if result is None else facts_of(result, config)
-    if now:
-        return SetUpStep(kind, Standing.NOW, facts)
-    if result is None:
-        return SetUpStep(kind, Standing.TO_COME)
-    good = all(fact.good is not False for fact in facts)
-    return SetUpStep(kind, Standing.GOOD if good else Standing.DOUBTFUL, facts)
 
 
 def _board(result: BoardResult, config: RigConfig) -> tuple[Fact, ...]:

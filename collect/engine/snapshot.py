@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from brushloop.collect.protocols.steps import Step
-from brushloop.sessions.events import StepKind
 from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
@@ -78,57 +76,6 @@ class Picture:
     """Standard deviation of the blur at the steepest edges, in pixels of the full frame; None without an edge."""
 
 
-SET_UP = (StepKind.BOARD, StepKind.ZERO_TOUCH, StepKind.SELF_CHECK)
-"""Steps of the set-up, in their order."""
-
-
-def in_set_up(step: Step) -> bool:
-    """Whether this is a step of the set-up: the board is also looked at between strokes, and the paper found again."""
-    return step.kind in SET_UP and step.index == 0
-
-
-TITLES = {
-    StepKind.BOARD: "Camera, board, scale",
-    StepKind.ZERO_TOUCH: "Zero touch and plane",
-    StepKind.SELF_CHECK: "Self-check",
-}
-
-
-class Standing(StrEnum):
-    """Progress of a set-up step."""
-
-    TO_COME = "to come"
-    NOW = "now"
-    GOOD = "good"
-    DOUBTFUL = "look"
-    """Measured, and outside its limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fact:
-    """One measured value of a set-up step, as text."""
-
-    name: str
-    value: str
-    limit: str = ""
-    good: bool | None = None
-    """Whether the value is within its limit; None without one."""
-
-
-@dataclass(frozen=True, slots=True)
-class SetUpStep:
-    """One step of the set-up, as a screen lists it."""
-
-    kind: StepKind
-    standing: Standing
-    facts: tuple[Fact, ...] = ()
-
-    @property
-    def title(self) -> str:
-        """What the step measures."""
-        return TITLES[self.kind]
-
-
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """State of a run at one moment."""
@@ -181,8 +128,6 @@ class Snapshot:
     """Name of the stroke in progress."""
     requests: tuple[OperatorRequest, ...] = ()
     """Key requests that are still pending."""
-    set_up: tuple[SetUpStep, ...] = ()
-    """Steps of a guided set-up; empty once it is over, and in a run without one."""
     folder: str = ""
     """Folder of the session; empty until there is one."""
     no_pose_s: float | None = None

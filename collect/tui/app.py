@@ -18,11 +18,11 @@ from brushloop.collect.errors import NOT_AT_REST, ConfigError
 from brushloop.collect.headless import REFRESH_S, RunnableEngine
 from brushloop.collect.operator import OperatorRequest
 from brushloop.collect.tui.browser import SessionBrowser
+from brushloop.collect.tui.panes import live_content
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.question_screens import AT_WORK, NOT_PARKED, UNSEEN, AskScreen, Confirm
 from brushloop.collect.tui.run_app import RunApp
 from brushloop.collect.tui.run_screen import RunScreen
-from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.collect.tui.text import plain
 from brushloop.sessions.errors import SessionError
@@ -163,23 +163,10 @@ class OperatorApp(RunApp):
         self._review(self._browser.paths.root / session_id)
 
     def _show_run(self) -> None:
-        """Show the wizard while the set-up lasts, then the run screen."""
-        assert self.engine is not None
-        assert self._now is not None
-        wizard = bool(self._now.set_up) and self._now.state not in FINAL
-        if self._main is not None and isinstance(self._main, SetUpScreen) == wizard:
-            return
-        screen = SetUpScreen(self.engine, self._pictures) if wizard else self._run_screen()
+        """Show the run screen."""
         if self._main is None:
-            self.push_screen(screen)
-        elif self.screen is self._main:
-            self.switch_screen(screen)  # pyright: ignore[reportUnknownMemberType]
-        else:
-            return  # another screen covers it: try again at the next poll
-        self._main = screen
-
-    def _run_screen(self) -> RunScreen:
-        return RunScreen(self._pictures, resumable=self._again is not None, now_s=self._now_s)
+            self._main = RunScreen(self._pictures, resumable=self._again is not None, now_s=self._now_s)
+            self.push_screen(self._main)
 
     def _poll(self) -> None:
         if not self.is_running:
@@ -189,7 +176,6 @@ class OperatorApp(RunApp):
         if self.engine is None or self._now is None:
             return
         before, self._now = self._now, self.engine.snapshot()
-        self._show_run()
         if self._main is not None and self._main.is_mounted:
             self._main.show(self._now)
         self._ask(self._now)
@@ -221,9 +207,10 @@ class OperatorApp(RunApp):
             self.push_screen(FinishScreen(Path(self._now.folder), is_open=False))
 
     def _ask(self, now: Snapshot) -> None:
-        prompt = None if isinstance(self._main, SetUpScreen) else now.prompt
+        prompt = now.prompt
         shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
         if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
+            shown.show(live_content(now))
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()

@@ -53,13 +53,3 @@ def plot_title(ceiling_n: float | None) -> str:
     """What the plot shows, and where the arm is stopped."""
     ceiling = "" if ceiling_n is None else f", the arm stops above {ceiling_n:g} N"
     return f"Force: peak of each 0.1 s{ceiling}"
-
-
-def force_bar(force_n: float | None, full_n: float, width: int) -> str:
-    """`███▌    0.123 N`; the bar is full at `full_n`."""
-    if force_n is None:
-        return "no force sensor"
-    filled = min(max(force_n / full_n, 0.0), 1.0) * width if full_n > 0 else 0.0
-    whole, part = divmod(round(8 * filled), 8)
-    bar = FULL * whole + ("▏▎▍▌▋▊▉"[part - 1] if part else "")
-    return f"{bar.ljust(width, EMPTY)} {force_n:7.3f} N"

@@ -66,7 +66,6 @@ LABELS = {k.key: k.label for k in RUN_KEYS}
 RUN_BAR: tuple[Key, ...] = tuple(LABELS.items())
 OVER_BAR: tuple[Key, ...] = tuple((key, LABELS[key]) for key in ("q", "v", "?", "tab", "ctrl-p"))
 GO_ON_BAR: tuple[Key, ...] = (("enter", "resume"), *OVER_BAR)
-SET_UP_BAR: tuple[Key, ...] = (*((key, LABELS[key]) for key in ("s", "space", "q", "?", "ctrl-p")), ("tab", "camera"))
 
 
 def keys_in(state: State, bar: tuple[Key, ...], *, resumable: bool = False) -> tuple[Key, ...]:

@@ -37,6 +37,10 @@ GRID_STYLES = {
     COMPLETE: "bold $text-success",
     NEXT: "bold",
 }
+SHARP_PX = 2.0
+"""Blur in the full frame below which the lens is in focus: a hint for turning it; the step's own check decides."""
+LIVE_COLUMNS = 55
+"""Columns of the force beside a question."""
 GAP = 2
 SHEET_SIGNS: dict[Mark | None, tuple[str, str]] = {
     None: ("·", "dim"),
@@ -85,6 +89,22 @@ def _counts(now: Snapshot) -> tuple[str, str]:
         parts.append(f"left out {now.given_up}")
     parts.append("ink level unknown" if now.ink_level is None else f"ink {now.ink_level:.0%} of the well")
     return "   ".join(parts), "bold $text-warning" if now.voids or now.given_up else ""
+
+
+def live_content(now: Snapshot) -> Content:
+    """Tip, target, force, and focus at this moment, for a person who answers a question."""
+    rows = [("Tip", no_pose_text(now) or tip_text(now.tip_mm)), ("Target", target_text(now))]
+    if now.force_n is not None:
+        rows.append(("Force", _force(now, LIVE_COLUMNS)))
+    if now.picture is not None:
+        rows.append(("Focus", _focus_text(now.picture.blur_px)))
+    return Content("\n").join(Content.assemble((name.ljust(LABEL), "dim"), text) for name, text in rows)
+
+
+def _focus_text(blur_px: float | None) -> str:
+    if blur_px is None:
+        return "no edge in view to measure"
+    return f"blur {blur_px:.1f} px  {'✓ sharp' if blur_px < SHARP_PX else '! turn the lens'}"
 
 
 def target_text(now: Snapshot) -> str:

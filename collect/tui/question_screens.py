@@ -20,6 +20,7 @@ from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.operator import Prompt
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.text import plain
+from brushloop.collect.tui.widgets import Line
 
 LEAVE_LINE = "q  leave: park the arm, answer nothing"
 STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
@@ -47,6 +48,7 @@ class AskScreen(ModalScreen[None]):
     }
     AskScreen #question { text-style: bold; margin-bottom: 1; }
     AskScreen #cause { height: 9; margin-bottom: 1; }
+    AskScreen #live { height: auto; margin: 1 0; background: $boost; text-wrap: nowrap; }
     AskScreen #left { color: $text-muted; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -59,6 +61,7 @@ class AskScreen(ModalScreen[None]):
         self.prompt = prompt
         self._engine = engine
         self._pictures = pictures
+        self._live = Line("live")
 
     def compose(self) -> ComposeResult:
         """Lay out the question, its picture, and a line for each answer."""
@@ -68,24 +71,24 @@ class AskScreen(ModalScreen[None]):
                 picture = self._pictures.make("cause")
                 picture.show(self.prompt.image)
                 yield picture
-            yield Static(choices_content(self.prompt), markup=False)
+            yield Static(_choices_content(self.prompt), markup=False)
+            yield self._live
             yield Static(LEAVE_LINE, markup=False)
             yield Static(STOP_LINE, markup=False)
             yield Static("Waits until it is answered; the arm does not move meanwhile.", id="left", markup=False)
 
     def on_key(self, event: events.Key) -> None:
         """Answer, if it is the key of an answer."""
-        answer_by_key(self.prompt, self._engine, event)
+        if any(choice.key == event.character for choice in self.prompt.choices):
+            event.stop()
+            self._engine.answer(self.prompt.number, str(event.character))
+
+    def show(self, live: Content) -> None:
+        """Show where the arm is and what it feels: a person who jogs, or turns the lens, watches that."""
+        self._live.show(live)
 
 
-def answer_by_key(prompt: Prompt, engine: RunnableEngine, event: events.Key) -> None:
-    """Send the answer that this key stands for, if it stands for one."""
-    if any(choice.key == event.character for choice in prompt.choices):
-        event.stop()
-        engine.answer(prompt.number, str(event.character))
-
-
-def choices_content(prompt: Prompt) -> Content:
+def _choices_content(prompt: Prompt) -> Content:
     """A line for each answer."""
     return Content("\n").join(
         Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}") for choice in prompt.choices

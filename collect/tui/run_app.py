@@ -19,7 +19,6 @@ from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.tui.keys import CAN_GO_ON, CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.run_screen import RunScreen
-from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.text import plain
 from brushloop.collect.tui.widgets import HelpScreen
@@ -47,7 +46,7 @@ class RunApp(PlainApp):
         self._again: Callable[[str], RunnableEngine] | None = again
         self._pictures = pictures
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
-        self._main: RunScreen | SetUpScreen | None = None
+        self._main: RunScreen | None = None
 
     @property
     def at_work(self) -> bool:

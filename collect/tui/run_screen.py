@@ -20,9 +20,8 @@ from brushloop.collect.tui.force_text import plot, plot_title
 from brushloop.collect.tui.keys import RUN_BAR, keys_in
 from brushloop.collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
 from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.steps_screen import NARROW_COLUMNS
 from brushloop.collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
-from brushloop.collect.tui.widgets import KeyBar, Line, entitle
+from brushloop.collect.tui.widgets import NARROW_COLUMNS, KeyBar, Line, entitle
 
 OVER = "Over: q leaves"
 GOES_ON = "Press enter to resume, or run the same command later."

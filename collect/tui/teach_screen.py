@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from typing import ClassVar
 
 from textual import events
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
-from textual.widget import Widget
+from textual.screen import Screen
 from textual.widgets import Input
 
 from brushloop.collect.rig.optics import gray
 from brushloop.collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState, number_in
 from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.steps_screen import StepsScreen
 from brushloop.collect.tui.teach_guide import Question, ScreenGuide, TeachView
 from brushloop.collect.tui.text import SHORT_STOP, one_line, plain, tip_text
-from brushloop.collect.tui.widgets import Key
+from brushloop.collect.tui.widgets import NARROW_COLUMNS, Key, KeyBar, Line
 
 SIGNS = {"open": ("·", "dim"), "current": ("▶", "bold reverse"), "taught": ("✓", "bold $text-success")}
 TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}
@@ -53,16 +55,40 @@ LEAVE: tuple[Key, ...] = (("q", "leave"),)
 GO_ON: tuple[Key, ...] = (("g", "go on"), *LEAVE)
 
 
-class TeachScreen(StepsScreen):
+class TeachScreen(Screen[None]):
     """Shows a `TeachView`; its keys answer the question."""
 
     DEFAULT_CSS = """
+    TeachScreen #title {
+        height: 1; padding: 0 1; background: $panel; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis;
+    }
+    TeachScreen #body { height: 1fr; }
+    TeachScreen #steps {
+        width: 27; height: 100%; padding: 0 1; border-right: solid $foreground 40%;
+        text-wrap: nowrap; text-overflow: ellipsis;
+    }
+    TeachScreen #found { width: 1fr; height: 1fr; padding: 0 1; }
+    TeachScreen #picture { width: 36%; height: 100%; padding: 0 1; }
+    TeachScreen.-narrow #picture { display: none; }
+    TeachScreen.-narrow.-picture #picture { display: block; width: 1fr; }
+    TeachScreen.-narrow.-picture #found-pane { display: none; }
+    TeachScreen #live { height: auto; padding: 0 1; background: $boost; text-wrap: nowrap; }
+    TeachScreen #question-box { height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none; }
+    TeachScreen.-asking #question-box { display: block; }
+    TeachScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; }
     TeachScreen #answer { display: none; height: 1; border: none; padding: 0; background: $boost; }
     TeachScreen.-typing #answer { display: block; }
     """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("tab", "picture", "Picture", priority=True)]
 
     def __init__(self, guide: ScreenGuide, name: str, pictures: Pictures) -> None:
-        super().__init__(pictures.make("picture"), KEYS["busy"])
+        super().__init__()
+        self._title, self._steps, self._found = Line("title"), Line("steps"), Line("found-text")
+        self._live, self._asked, self._note = Line("live"), Line("question-text"), Line("note")
+        self._picture = pictures.make("picture")
+        self._keys = KeyBar(KEYS["busy"])
+        self._found_pane = VerticalScroll(id="found")
+        self._found_pane.can_focus = False
         self._guide = guide
         self._name = name
         self._question: Question | None = None
@@ -73,9 +99,30 @@ class TeachScreen(StepsScreen):
         self._over = ""
         self._stop_sent = False
 
-    def below_the_question(self) -> Iterable[Widget]:
-        """The line that is typed."""
-        yield self._input
+    def compose(self) -> ComposeResult:
+        """Lay out the parts from top to bottom."""
+        yield self._title
+        with Horizontal(id="body"):
+            yield self._steps
+            with Vertical(id="found-pane"), self._found_pane:
+                yield self._found
+            yield self._picture
+        yield self._live
+        with VerticalScroll(id="question-box") as box:
+            box.can_focus = False
+            yield self._asked
+            yield self._input
+        yield self._note
+        yield self._keys
+
+    def on_resize(self, event: events.Resize) -> None:
+        """Show the picture beside the findings where there is room."""
+        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
+
+    def action_picture(self) -> None:
+        """Show the picture instead of the findings, on a narrow screen."""
+        self.toggle_class("-picture")
+        self.call_after_refresh(self._found_pane.scroll_end, animate=False)  # what was hidden could not be scrolled
 
     @property
     def typing(self) -> bool:
@@ -93,7 +140,7 @@ class TeachScreen(StepsScreen):
 
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed."""
-        super().stop_sent()
+        self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
         self._stop_sent = True
 
     def show(self, now: TeachView, over: str = "", keys: tuple[Key, ...] = ()) -> None:
@@ -102,7 +149,6 @@ class TeachScreen(StepsScreen):
         self._title.show(f"First day   {one_line(self._name)}{_where(now.steps)}")
         self._steps.show(_steps_content(now.steps, summaries=self.size.height >= HIGH_ROWS))
         self._live.show(_live_text(now))
-        assert self._picture is not None
         self._picture.show(_gray(now.live if self._guide.looking and now.live is not None else now.picture))
         if before is None or before.findings is not now.findings:
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
@@ -137,11 +183,14 @@ class TeachScreen(StepsScreen):
             self.set_focus(None)
 
     def on_key(self, event: events.Key) -> None:
-        """Answer, if the key is an answer to the question."""
+        """Answer, if the key is an answer to the question; else page through the findings."""
         question = self._question
-        if question is None:
+        if event.key in ("pageup", "pagedown") and (question is None or question.kind != "jog"):
+            event.stop()
+            (self._found_pane.scroll_page_up if event.key == "pageup" else self._found_pane.scroll_page_down)()
+        elif question is None:
             return
-        if event.key == "escape":
+        elif event.key == "escape":
             event.stop()
             self._guide.back(question.number)
         elif question.kind == "choose":

@@ -21,6 +21,8 @@ Key = tuple[str, str]
 """The key and what it does."""
 KEY_NAMES = {"?": "question_mark", "→": "right", "ctrl-p": "ctrl+p", "esc": "escape"}
 """Textual's names of keys that are shown by another."""
+NARROW_COLUMNS = 110
+"""Width from which a picture has room beside the text."""
 GAP = 2
 CURSOR, ELSEWHERE = "›", " "
 

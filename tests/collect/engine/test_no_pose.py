@@ -20,7 +20,7 @@ from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.samples import Identity
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
-from tests.collect.tui.fake import SET_UP, FakeEngine, picture
+from tests.collect.tui.fake import TOUCHED, FakeEngine, picture
 from tests.collect.tui.screen_text import look
 
 WHO = Identity("robot", "aubo_i5", "", True)
@@ -78,12 +78,11 @@ async def test_the_run_screen_is_not_green_without_a_pose() -> None:
         assert (str(state.render()), state.styles.background) == ("RUNNING", green)
 
 
-async def test_the_set_up_says_it_in_its_title_and_beside_the_tip() -> None:
-    app = OperatorApp(FakeEngine(picture(set_up=SET_UP, tip_mm=None, no_pose_s=1.44)))
+async def test_a_question_says_it_beside_the_tip() -> None:
+    app = OperatorApp(FakeEngine(picture(state=State.ASKING, prompt=TOUCHED, tip_mm=None, no_pose_s=1.44)))
     async with app.run_test(size=(110, 30)) as pilot:
         await look(app, pilot)
-        assert str(app.screen.query_one("#title").render()).endswith("press H15-a5-r02, no pose for 1.4 s")
-        assert "Tip     no pose for 1.4 s" in str(app.screen.query_one("#live").render())
+        assert "Tip      no pose for 1.4 s" in str(app.screen.query_one("#live").render())
 
 
 def test_without_a_screen_it_is_one_line_when_it_begins_and_one_when_it_ends(

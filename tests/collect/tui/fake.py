@@ -11,10 +11,9 @@ import numpy as np
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.last_capture import LastCapture, mark_of
-from brushloop.collect.engine.snapshot import CellCount, Fact, Mark, Picture, SetUpStep, SheetMap, Snapshot, Standing
+from brushloop.collect.engine.snapshot import CellCount, Mark, Picture, SheetMap, Snapshot
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.quality.verdict import Check, Failure, Verdict
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.events import Press
@@ -132,29 +131,6 @@ SPLIT = Prompt(
     image=capture(kept=False).photo,
     number=3,
 )
-SET_UP = (
-    SetUpStep(
-        StepKind.BOARD,
-        Standing.GOOD,
-        (
-            Fact("corners seen", "184"),
-            Fact("scale (pix2len)", "0.1600 mm/px"),
-            Fact("residual of corners", "0.11 px", "at most 1", True),
-            Fact("focus: blur", "0.13 mm", "at most 0.25", True),
-        ),
-    ),
-    SetUpStep(
-        StepKind.ZERO_TOUCH,
-        Standing.DOUBTFUL,
-        (
-            Fact("method", "force"),
-            Fact("point 1 (4, 4)", "120.012 mm"),
-            Fact("  its touches span", "0.180 mm", "at most 0.15", False),
-            Fact("plane", "level: fewer than three points"),
-        ),
-    ),
-    SetUpStep(StepKind.SELF_CHECK, Standing.TO_COME),
-)
 JOGGED = Prompt(
     "Touch 1 of 3. Jog until the tip just touches the paper. It is +1.00 mm from the expected height.",
     (
@@ -171,7 +147,11 @@ JOGGED = Prompt(
     number=4,
 )
 TOUCHED = Prompt(
-    "Zero touch and plane: not all is within limits.",
+    "Zero touch and plane: not all is within limits.\n"
+    "  method               force\n"
+    "  point 1 (4, 4)       120.012 mm\n"
+    "!   its touches span   0.180 mm  (at most 0.15)\n"
+    "  plane                level: fewer than three points",
     (
         Choice("g", "go on anyway"),
         Choice("a", "measure again"),

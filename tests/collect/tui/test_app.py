@@ -22,9 +22,7 @@ from tests.collect.tui.fake import (
     ERROR,
     FAILED,
     PAUSED,
-    SET_UP,
     SPLIT,
-    TOUCHED,
     FakeEngine,
     picture,
 )
@@ -83,16 +81,16 @@ async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
             assert engine.calls == ["stop", "stop"], state
 
 
-@pytest.mark.parametrize("over", ["q", "question_mark", "ctrl+p", "prompt", "wizard"])
+@pytest.mark.parametrize("over", ["q", "question_mark", "ctrl+p", "prompt"])
 async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) -> None:
-    engine = FakeEngine(picture(set_up=SET_UP, prompt=TOUCHED) if over == "wizard" else picture())
+    engine = FakeEngine(picture())
     app = OperatorApp(engine)
     async with app.run_test() as pilot:
         await look(app, pilot)
         if over == "prompt":
             engine.now = picture(state=State.ASKING, prompt=SPLIT)
             await look(app, pilot)
-        elif over != "wizard":
+        else:
             await pilot.press(over)
             await look(app, pilot)
         await pilot.press("s")
@@ -342,13 +340,3 @@ async def test_a_session_that_cannot_be_resumed_says_why() -> None:
             await look(app, pilot)
         assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
         assert app.engine is stopped
-
-
-async def test_the_keys_of_the_set_up_are_those_that_work_now() -> None:
-    engine = FakeEngine(picture(set_up=SET_UP, state=State.PAUSED))
-    app = OperatorApp(engine)
-    async with app.run_test(size=(109, 40)) as pilot:
-        assert "space resume" in await look(app, pilot)
-        engine.now = picture(set_up=SET_UP, state=State.STOPPING)
-        text = await look(app, pilot)
-        assert not [word for word in ("space resume", "space pause") if word in text]

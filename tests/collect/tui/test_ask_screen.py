@@ -10,8 +10,7 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.question_screens import AskScreen, Confirm
-from brushloop.collect.tui.set_up_screen import SetUpScreen
-from tests.collect.tui.fake import SET_UP, SPLIT, TOUCHED, FakeEngine, picture
+from tests.collect.tui.fake import SPLIT, TOUCHED, FakeEngine, full_picture, picture
 from tests.collect.tui.screen_text import has_picture, look
 
 PROMPT = Prompt(
@@ -71,13 +70,13 @@ async def test_a_bad_stroke_is_shown_with_its_picture() -> None:
         assert engine.calls == ["answer 3 r"]
 
 
-async def test_the_wizard_shows_what_was_measured_and_asks_within_itself() -> None:
-    engine = FakeEngine(picture(state=State.ASKING, set_up=SET_UP, prompt=TOUCHED))
+async def test_a_question_of_the_set_up_shows_what_was_measured_and_the_live_figures() -> None:
+    engine = FakeEngine(full_picture(state=State.ASKING, prompt=TOUCHED))
     app = OperatorApp(engine)
     async with app.run_test(size=(120, 40)) as pilot:
         text = await look(app, pilot)
-        assert isinstance(app.screen, SetUpScreen)
-        for part in ("✓ Camera, board, scale", "0.11 px  (at most 1)", "!   its touches span", "b  measure by jog"):
+        assert isinstance(app.screen, AskScreen)
+        for part in ("0.180 mm  (at most 0.15)", "!   its touches span", "b  measure by jog", "blur 0.9 px  ✓ sharp"):
             assert part in text
         await pilot.press("b")
         assert engine.calls == ["answer 2 b"]

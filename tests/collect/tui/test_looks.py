@@ -19,7 +19,6 @@ from tests.collect.tui.fake import (
     FAILED,
     JOGGED,
     PAUSED,
-    SET_UP,
     SPLIT,
     TOUCHED,
     FakeEngine,
@@ -36,8 +35,8 @@ NOW = {
     "failed": FAILED,
     "done": DONE,
     "asking": full_picture(state=State.ASKING, prompt=SPLIT),
-    "jog": full_picture(state=State.RUNNING, step="zero touch", set_up=SET_UP, prompt=JOGGED),
-    "set-up": full_picture(state=State.ASKING, step="zero touch", set_up=SET_UP, prompt=TOUCHED),
+    "jog": full_picture(state=State.RUNNING, step="zero touch", prompt=JOGGED),
+    "set-up": full_picture(state=State.ASKING, step="zero touch", prompt=TOUCHED),
 }
 Press = Callable[[Pilot[None]], Awaitable[None]]
 

@@ -1,4 +1,4 @@
-"""A whole session on the loopback rig through the app: wizard, strokes, trouble, pause, stop, resume, review, close."""
+"""A whole session on the loopback rig through the app: set-up, strokes, trouble, pause, stop, resume, review, close."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from brushloop.collect.tui.finish_screen import FinishScreen
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
-from brushloop.collect.tui.set_up_screen import SetUpScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
@@ -144,11 +143,11 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.press("d")
         await operator.reads("✓ well    camera", "✓ well    robot")
 
-        # a new session: the wizard shows what each step measured and asks
+        # a new session: the set-up asks about what each step measured
         await operator.press("n")
         await operator.reads(f"{STROKES} strokes on 1 sheet")
         await operator.press("y")
-        await operator.on(SetUpScreen)
+        await operator.on(AskScreen)
         await operator.accept("Camera, board, scale")
         await operator.accept("Zero touch and plane")
         await operator.reads("Self-check: all within limits")
@@ -196,8 +195,8 @@ async def test_a_day_at_the_rig(day: Day) -> None:
 
         # resume: asked first; board seen and paper touched again, not checked again; then to the end
         await operator.press("enter")
-        await operator.on(SetUpScreen)
-        await operator.reads("Resume ", "stopped; the same command", "g  resume")
+        await operator.on(AskScreen)
+        await operator.reads("Resume ", "stopped; the", "g  resume")
         await operator.press("g")
         await operator.accept("Camera, board, scale")
         await operator.accept("Zero touch and plane")

@@ -18,7 +18,7 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.dots import Cells
 from brushloop.collect.tui.finish_screen import FinishScreen, run_command, verdict_content
-from brushloop.collect.tui.force_text import force_bar, plot, plot_title, scale_n, spark
+from brushloop.collect.tui.force_text import plot, plot_title, scale_n, spark
 from brushloop.collect.tui.levels import Coloured
 from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
@@ -314,6 +314,3 @@ def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
     assert plot([0.0, 1.0], 10, 2).plain == "    1 N┤ █\n    0 N┤ █"
     assert plot([0.0, 1.0], 10, 2, ceiling_n=0.6).plain == "    1 N┤╌█\n    0 N┤ █"
     assert "5 N" in plot_title(5.0)
-    assert force_bar(0.05, 0.1, 10) == "█████░░░░░   0.050 N"
-    assert force_bar(9.0, 0.1, 4) == "████   9.000 N"
-    assert force_bar(None, 0.1, 4) == "no force sensor"
