@@ -5,21 +5,17 @@ Only two values change in the text. Comments, order and everything else stay, an
 
 from __future__ import annotations
 
-import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+import tomlkit
 from pydantic import ValidationError
 
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
-
-TABLE = re.compile(r"\s*\[{1,2}\s*[A-Za-z0-9_\"'-]")
-PAPER = re.compile(r"\s*\[\s*paper\s*\]\s*(#.*)?$")
-VALUE = r"^(?P<name>\s*{}\s*=\s*)(?P<value>\[[^\[\]#]*\]|[^\s\[#]+)(?P<rest>\s*(#.*)?)$"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +28,10 @@ class PaperLines:
     """From base x to paper x, counter-clockwise."""
 
     @property
-    def values(self) -> dict[str, str]:
-        """Each field and its value as TOML, rounded to 0.001 mm and 0.0001 deg."""
-        x, y = (round(v, 3) + 0.0 for v in self.origin_mm)  # no -0.0
-        return {"origin_mm": f"[{x}, {y}]", "yaw_deg": f"{round(self.yaw_deg, 4) + 0.0}"}
+    def values(self) -> dict[str, list[float] | float]:
+        """Each field and its value, rounded to 0.001 mm and 0.0001 deg."""
+        # Adding 0 turns -0.0 into 0.0.
+        return {"origin_mm": [round(v, 3) + 0.0 for v in self.origin_mm], "yaw_deg": round(self.yaw_deg, 4) + 0.0}
 
     @property
     def toml(self) -> str:
@@ -53,26 +49,14 @@ class RigFile:
     lens_file: Path | None
 
     def with_paper(self, lines: PaperLines) -> str:
-        """The text with these two values. Raises `CalibrationError` unless each of them is found on its own line."""
-        rows, found = self.text.splitlines(keepends=True), dict[str, int]()
-        start = next((k for k, row in enumerate(rows) if PAPER.match(row.rstrip("\r\n"))), None)
-        if start is None:
-            raise self._refused("paper", "is not a table of its own ([paper])", lines)
-        for k, row in enumerate(rows[start + 1 :], start + 1):
-            if TABLE.match(row):
-                break
-            bare = row.rstrip("\r\n")
-            for name, value in lines.values.items():
-                if (at := re.match(VALUE.format(name), bare)) is not None:
-                    rows[k] = f"{at['name']}{value}{at['rest']}{row[len(bare) :]}"
-                    found[name] = k
-        for name in lines.values:
-            if name not in found:
-                raise self._refused(f"paper.{name}", "is not found on a line of its own under [paper]", lines)
-        made = "".join(rows)
-        if _tables(made, self.path) != _changed(_tables(self.text, self.path), lines):
-            raise self._refused("paper", "cannot be changed without changing other values", lines)
-        return made
+        """The text with these two values. Raises `CalibrationError` where there is no table `paper` to hold them."""
+        document: Any = tomlkit.parse(self.text)
+        if not isinstance(document.get("paper"), dict):
+            what = "paper: is not a table; nothing is written. Enter by hand: " + ", ".join(lines.toml.splitlines())
+            raise CalibrationError(str(self.path), what)
+        for name, value in lines.values.items():
+            document["paper"][name] = value
+        return tomlkit.dumps(document)
 
     def write(self, lines: PaperLines) -> Path:
         """Write these two values; returns the path of the old file. Raises `CalibrationError` and OSError."""
@@ -83,10 +67,6 @@ class RigFile:
         write_whole(self.path.resolve(), made)
         return kept
 
-    def _refused(self, field: str, what: str, lines: PaperLines) -> CalibrationError:
-        put = ", ".join(lines.toml.splitlines())
-        return CalibrationError(str(self.path), f"{field}: {what}; nothing is written. Enter by hand: {put}")
-
 
 def read_rig(path: Path) -> RigFile:
     """Read a rig's configuration. Raises `CalibrationError` that names file and field."""
@@ -94,7 +74,10 @@ def read_rig(path: Path) -> RigFile:
         text = read_bounded(path).decode("utf-8")
     except UnicodeDecodeError as error:
         raise CalibrationError(str(path), f"is not UTF-8 at byte {error.start}") from None
-    tables = _tables(text, path)
+    try:
+        tables = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
+        raise CalibrationError(str(path), f"is not TOML: {error}") from None
     try:
         board = BoardSpec.model_validate(tables.get("board"))
     except ValidationError as error:
@@ -105,17 +88,6 @@ def read_rig(path: Path) -> RigFile:
     camera = tables.get("camera")
     lens = cast("dict[str, Any]", camera).get("lens_file") if isinstance(camera, dict) else None
     return RigFile(path, text, board, path.parent / lens if isinstance(lens, str) else None)
-
-
-def _tables(text: str, path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
-        raise CalibrationError(str(path), f"is not TOML: {error}") from None
-
-
-def _changed(tables: dict[str, Any], lines: PaperLines) -> dict[str, Any]:
-    return tables | {"paper": cast("dict[str, Any]", tables["paper"]) | tomllib.loads(lines.toml)}
 
 
 def free_name(path: Path) -> Path:
