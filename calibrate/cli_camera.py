@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,14 +11,6 @@ from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
     from brushloop.calibrate.board.spec import Board
-
-
-class Kind(StrEnum):
-    """Transformation that a registration fits."""
-
-    RIGID = "rigid"
-    SIMILARITY = "similarity"
-    AFFINE = "affine"
 
 
 app = typer.Typer(
@@ -191,9 +182,6 @@ def register(
         typer.Option(help="Without a rig.toml: lower left corner of the board, seen from that of the sheet."),
     ] = None,
     lens: LensOption = None,
-    model: Annotated[
-        Kind, typer.Option(help="rigid; similarity: also the scale; affine: x and y independently.")
-    ] = Kind.RIGID,
     out: Annotated[Path, typer.Option(help="Folder for the registration file.")] = Path("camera"),
 ) -> None:
     """Locate the paper in the robot's base frame from touched or pressed marks; prints the lines for rig.toml."""
@@ -209,8 +197,6 @@ def register(
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
 
-    if write is not None and model is not Kind.RIGID:
-        raise CalibrationError("--write", "needs --model rigid: rig.toml holds a place and a rotation but no scale")
     rig_path = config or write
     rig = read_rig(rig_path) if rig_path else None
     target = read_rig(write) if write else None
@@ -227,7 +213,7 @@ def register(
     lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None
     plane = calibration_plane(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
-    fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), model.value)
+    fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px))
     for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
         out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
         say(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
@@ -238,13 +224,9 @@ def register(
     for flag in plane.flags:
         say(f"warning: {flag}")
     say(
-        f"scale {file.scale:.5f}, residual {file.rms_mm:.3f} mm, "
-        f"{file.left_out_rms_mm:.3f} mm for a point that was left out",
+        f"residual {file.rms_mm:.3f} mm, {file.left_out_rms_mm:.3f} mm for a point that was left out",
         str(file.save(out)),
     )
-    if model is not Kind.RIGID:
-        say("no lines for rig.toml, which holds a place and a rotation but no scale: use --model rigid")
-        return
     lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
     if target is not None:
         say(f"{target.path}: written; the old file is kept as {target.write(lines)}")

@@ -81,11 +81,10 @@ class RegistrationFile(Artefact):
     """Where the robot's points lie on the paper, with the residual of each."""
 
     kind: Literal["registration"] = "registration"
-    schema_version: Literal[2] = 2
+    schema_version: Literal[3] = 3
     software: str
     source: str
     """The table of points, or the session, and its sha256."""
-    model: Literal["rigid", "similarity", "affine"]
     robot_to_paper: tuple[float, float, float, float, float, float]
     """(2, 3) row by row: mm in the robot's base frame to mm in the paper frame."""
     board_origin_mm: tuple[float, float]
@@ -93,7 +92,6 @@ class RegistrationFile(Artefact):
     origin_mm: tuple[float, float]
     yaw_deg: float
     """Origin and yaw of the paper frame in the base frame, as in `[paper]` of rig.toml."""
-    scale: float
     rms_mm: float
     left_out_rms_mm: float
     """Root mean square error of points that are each predicted by the others."""
@@ -110,12 +108,10 @@ def registration_file(
     return RegistrationFile(
         software=software,
         source=source,
-        model=fitted.model,
         robot_to_paper=(a, b, x, c, d, y),
         board_origin_mm=board_origin_mm,
         origin_mm=fitted.origin_mm,
         yaw_deg=fitted.yaw_deg,
-        scale=fitted.scale,
         rms_mm=fitted.rms_mm,
         left_out_rms_mm=fitted.left_out_rms_mm,
         residuals_mm={n: r for n, r in residuals.items() if n not in fitted.dropped},

@@ -9,7 +9,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,8 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.sessions.disk import number
 
-Model = Literal["rigid", "similarity", "affine"]
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")
-LEAST_POINTS = {"rigid": 3, "similarity": 3, "affine": 4}
+LEAST_POINTS = 3
 WORST_RMS_MM = 5.0
 TRIALS = 500
 OUTLIER_MEDIANS = 5.0
@@ -33,9 +31,8 @@ MIXED_UP_MM, EXPLAINED = 3.0, 0.2
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """The plane transformation from the robot's base frame to the paper frame, both in mm."""
+    """The place and turn of the paper frame in the robot's base frame, both in mm."""
 
-    model: Model
     matrix: Floats
     """(2, 3)."""
     names: tuple[str, ...]
@@ -66,11 +63,6 @@ class Registration:
         x, y = self.to_robot(np.zeros((1, 2)))[0]
         return float(x), float(y)
 
-    @property
-    def scale(self) -> float:
-        """Paper mm per robot mm, the square root of the ratio of areas; 1 for a rigid transformation."""
-        return float(np.sqrt(abs(np.linalg.det(self.matrix[:, :2]))))
-
     def to_paper(self, robot_mm: Floats) -> Floats:
         """(n, 2) points in the base frame -> in the paper frame."""
         return robot_mm @ self.matrix[:, :2].T + self.matrix[:, 2]
@@ -80,28 +72,25 @@ class Registration:
         return (paper_mm - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
 
 
-def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Model = "rigid") -> Registration:
+def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> Registration:
     """Fit by least squares to (n, 2) points of both frames, with outliers dropped and named (Umeyama 1991, eq. 40-43).
 
-    Outliers are found by the few points (two, or three for an affine fit) that explain the others best. A similarity
-    also fits the scale, for a board that was not printed at true scale; an affine fit treats x and y independently, for
-    a page that was rectified to wrong proportions. Raises `CalibrationError` for fewer than three points, for points
-    that are all in one place, and if most do not fit together.
+    Outliers are found by the two points that explain the others best. Raises `CalibrationError` for fewer than three
+    points, for points that are all in one place, and if most do not fit together.
     """
     where = f"{len(names)} points"
     if not len(names) == len(robot_mm) == len(seen_mm):
         raise ValueError(f"{len(names)} names, {len(robot_mm)} and {len(seen_mm)} points")
-    least = LEAST_POINTS[model]
-    if len(names) < least:
-        raise CalibrationError(where, f"at least {least} are needed")
+    if len(names) < LEAST_POINTS:
+        raise CalibrationError(where, f"at least {LEAST_POINTS} are needed")
     if np.ptp(robot_mm, axis=0).max() < 1.0:
         raise CalibrationError(where, "lie within 1 mm: touch the paper at places far apart")
-    if model == "rigid" and (problem := mixed_up(names, robot_mm, seen_mm)):
+    if problem := mixed_up(names, robot_mm, seen_mm):
         raise CalibrationError(where, problem)
-    kept = _agreeing(robot_mm, seen_mm, model)
-    if kept.sum() < max(least, (len(names) + 1) // 2):
+    kept = _agreeing(robot_mm, seen_mm)
+    if kept.sum() < max(LEAST_POINTS, (len(names) + 1) // 2):
         raise CalibrationError(where, f"only {kept.sum()} agree: are their names mixed up?")
-    matrix = _fit(robot_mm[kept], seen_mm[kept], model)
+    matrix = _fit(robot_mm[kept], seen_mm[kept])
     residuals = seen_mm - _apply(matrix, robot_mm)
     if rms(residuals[kept]) > WORST_RMS_MM:
         problem = f"{rms(residuals[kept]):.1f} mm off on average, allowed {WORST_RMS_MM:g}: are their names mixed up?"
@@ -110,9 +99,8 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats, model: Mod
     for index in np.flatnonzero(kept):
         others = kept.copy()
         others[index] = False
-        left_out[index] = seen_mm[index] - _apply(_fit(robot_mm[others], seen_mm[others], model), robot_mm[[index]])[0]
+        left_out[index] = seen_mm[index] - _apply(_fit(robot_mm[others], seen_mm[others]), robot_mm[[index]])[0]
     return Registration(
-        model,
         matrix,
         tuple(names),
         residuals,
@@ -150,41 +138,34 @@ def mixed_up(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> str:
 
 def _worst(robot_mm: Floats, seen_mm: Floats) -> float:
     """Largest distance that a rigid fit leaves."""
-    off = seen_mm - _apply(_fit(robot_mm, seen_mm, "rigid"), robot_mm)
+    off = seen_mm - _apply(_fit(robot_mm, seen_mm), robot_mm)
     return float(np.linalg.norm(off, axis=1).max())
 
 
-def _agreeing(robot_mm: Floats, seen_mm: Floats, model: Model) -> NDArray[np.bool_]:
+def _agreeing(robot_mm: Floats, seen_mm: Floats) -> NDArray[np.bool_]:
     best = np.full(len(robot_mm), np.inf)
-    few = list(itertools.combinations(range(len(robot_mm)), 3 if model == "affine" else 2))
+    few = list(itertools.combinations(range(len(robot_mm)), 2))
     for chosen in few[:: max(1, len(few) // TRIALS)]:
         points = robot_mm[list(chosen)]
-        # Points on a line do not determine an affine map, points in one place determine nothing.
-        if np.linalg.svd(points - points.mean(axis=0))[1][1 if model == "affine" else 0] < 1.0:
+        if np.linalg.norm(points[1] - points[0]) < 2.0**0.5:  # points in one place determine nothing
             continue
-        away = np.linalg.norm(seen_mm - _apply(_fit(points, seen_mm[list(chosen)], model), robot_mm), axis=1)
+        away = np.linalg.norm(seen_mm - _apply(_fit(points, seen_mm[list(chosen)]), robot_mm), axis=1)
         if np.median(away) < np.median(best):
             best = away
     if not np.isfinite(best).all():
         return np.zeros(len(robot_mm), np.bool_)
     rough = best <= max(LEAST_OUTLIER_MM, OUTLIER_MEDIANS * float(np.median(best)))
-    # Judge again by the fit to all that agree: a fit to two or three points is inaccurate.
-    away = np.linalg.norm(seen_mm - _apply(_fit(robot_mm[rough], seen_mm[rough], model), robot_mm), axis=1)
+    # Judge again by the fit to all that agree: a fit to two points is inaccurate.
+    away = np.linalg.norm(seen_mm - _apply(_fit(robot_mm[rough], seen_mm[rough]), robot_mm), axis=1)
     return away <= max(LEAST_OUTLIER_MM, OUTLIER_MEDIANS * float(np.median(away)))
 
 
-def _fit(robot_mm: Floats, seen_mm: Floats, model: Model) -> Floats:
+def _fit(robot_mm: Floats, seen_mm: Floats) -> Floats:
     from_middle, to_middle = robot_mm.mean(axis=0), seen_mm.mean(axis=0)
     a, b = robot_mm - from_middle, seen_mm - to_middle
-    if model == "affine":
-        linear = np.asarray(np.linalg.pinv(a) @ b, np.float64).T
-    else:
-        u, s, vt = np.linalg.svd(b.T @ a)
-        # Both frames are right-handed: a mirrored fit is never wanted.
-        sign = np.array([1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
-        linear = u @ np.diag(sign) @ vt
-        if model == "similarity":
-            linear = linear * float((s * sign).sum()) / max(float((a**2).sum()), 1e-12)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    # Both frames are right-handed: a mirrored fit is never wanted.
+    linear = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt)) or 1.0]) @ vt
     return np.column_stack([linear, to_middle - linear @ from_middle])
 
 

@@ -221,15 +221,6 @@ def test_register_must_know_where_the_sheet_lies_on_the_board(tmp_path: Path) ->
     assert not out.exists()
 
 
-def test_register_gives_no_lines_for_what_a_rig_cannot_hold(tmp_path: Path) -> None:
-    photograph = saved(tmp_path / "p.png", board())
-    given = ("register", points(tmp_path), "--photograph", photograph, *FLAT, "--model", "similarity")
-    ran = run(*given, "--out", tmp_path)
-    assert ran.output.splitlines()[-1].startswith("no lines for rig.toml")
-    assert "yaw_deg" not in ran.output
-    refused(run(*given, "--write", tmp_path / "rig.toml"), "--write: needs --model rigid")
-
-
 def test_register_finds_the_turn_and_names_all_that_it_was_made_of(tmp_path: Path) -> None:
     photograph, lens = saved(tmp_path / "p.png", board()), a_lens(tmp_path)
     ran = run("register", points(tmp_path), "--photograph", photograph, *FLAT, "--lens", lens, "--out", tmp_path / "o")
