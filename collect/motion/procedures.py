@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from brushloop.collect.errors import StepVoid
 from brushloop.collect.motion.moves import (
@@ -18,12 +18,11 @@ from brushloop.collect.motion.moves import (
     zero_touch_moves,
 )
 from brushloop.collect.photograph.photographer import ArmTrips, Photographer
-from brushloop.collect.protocols.steps import Drawn, TrajectoryPoint
+from brushloop.collect.protocols.steps import Drawn
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_paper
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.protocols import Robot
 from brushloop.drivers.samples import Frame, QueuedLine
 from brushloop.sessions.records import Condition
 
@@ -107,6 +106,22 @@ class Procedures:
             raise StepVoid(f"the depth was {reached_mm:.3f} mm, {condition.depth_mm:g} mm was commanded")
         return reached_mm
 
+    async def stroke(self, patch: Patch, drawn: Drawn, number: int) -> float:
+        """Draw stroke `number`, from 0, of a figure that `check_drawn` passed; begins and ends at safe height.
+
+        Returns the depth at which the brush landed, in mm.
+        """
+        robot, motion = self._rig.robot, self._config.motion
+        moves = stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s)
+        for move in moves.down:
+            await self.go(move)
+        depth_mm = -self.plane.above_mm(self._config.paper, await robot.where())
+        way, pace_mm_s = moves.way.poses, moves.way.speed_mm_s
+        await robot.follow(way, speed_mm_s=pace_mm_s, acc_mm_s2=motion.acc_mm_s2, blend_mm=drawn.blend_mm)
+        for move in moves.up:
+            await self.go(move)
+        return depth_mm
+
     async def capture(self) -> Frame:
         """Park, and return the first frame exposed after the camera has shown the arm gone."""
         return await self.photographer.photograph()
@@ -134,30 +149,3 @@ def check_drawn(config: RigConfig, plane: PaperPlane, limits: Limits, patches: I
         for points in drawn.strokes:
             for pose, speed_mm_s in commanded(stroke_moves(config, plane, patch, points, drawn.speed_mm_s).parts):
                 limits.check("robot", pose, speed_mm_s=speed_mm_s, acc_mm_s2=config.motion.acc_mm_s2)
-
-
-async def draw_stroke(
-    robot: Robot,
-    config: RigConfig,
-    plane: PaperPlane,
-    patch: Patch,
-    points: Sequence[TrajectoryPoint],
-    *,
-    speed_mm_s: float,
-    blend_mm: float,
-) -> float:
-    """Draw one stroke; begins and ends at safe height. Returns the depth at which the brush landed, in mm.
-
-    All poses are checked before the arm moves. Raises `LimitExceeded` and what `Robot.move` and `Robot.follow` raise.
-    """
-    acc_mm_s2 = config.motion.acc_mm_s2
-    moves = stroke_moves(config, plane, patch, points, speed_mm_s)
-    for pose, pace_mm_s in commanded(moves.parts):
-        robot.check(pose, speed_mm_s=pace_mm_s, acc_mm_s2=acc_mm_s2)
-    for move in moves.down:
-        await robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
-    depth_mm = -plane.above_mm(config.paper, await robot.where())
-    await robot.follow(moves.way.poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
-    for move in moves.up:
-        await robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
-    return depth_mm

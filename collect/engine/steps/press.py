@@ -8,7 +8,7 @@ from brushloop.collect.engine.steps.capture import look_at_sheet
 from brushloop.collect.engine.steps.context import StepContext
 from brushloop.collect.engine.steps.dip import DipToTouch, fill_brush, must_dip
 from brushloop.collect.motion.moves import press_moves, stroke_moves
-from brushloop.collect.motion.procedures import check_drawn, draw_stroke
+from brushloop.collect.motion.procedures import check_drawn
 from brushloop.collect.protocols.steps import DrawStep, PressStep
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Patch
@@ -42,16 +42,7 @@ async def draw(context: StepContext, step: DrawStep) -> PressResult:
                 await fill_brush(context)
             if run.left_ink_ns is not None:
                 await timing.begin(stroke_moves(config, plane, patch, points, drawn.speed_mm_s).down[0])
-            stroke = draw_stroke(
-                run.rig.robot,
-                run.rig.config,
-                plane,
-                patch,
-                points,
-                speed_mm_s=drawn.speed_mm_s,
-                blend_mm=drawn.blend_mm,
-            )
-            depths_mm.append(await context.guard.guarded(stroke))
+            depths_mm.append(await context.guard.guarded(run.procedures.stroke(patch, drawn, number)))
             peaks_n.append(context.guard.peak_n)
     made = _made(context, step.press, max(depths_mm), timing)
     return PressResult(

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from brushloop.collect.motion.moves import stroke_moves
-from brushloop.collect.motion.procedures import check_drawn, draw_stroke
+from brushloop.collect.motion.procedures import Procedures, check_drawn
 from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.steps import Drawn, DrawStep
 from brushloop.collect.rig.config import RigConfig, load_rig
-from brushloop.collect.rig.devices import limits_of, make_robot
+from brushloop.collect.rig.devices import Rig, limits_of, make_robot
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.sim.arcs.server import ArcsServer
@@ -30,7 +30,7 @@ PLANE = PaperPlane(120.0)
 
 @dataclass
 class Desk:
-    arm: AuboArcs
+    procedures: Procedures
     world: World
     config: RigConfig
 
@@ -50,7 +50,9 @@ async def desk(config: RigConfig) -> AsyncIterator[Desk]:
     arm = make_robot(config.model_copy(update={"robot": here}), HostClock(), lambda _: None)
     await arm.connect()
     await arm.enable()
-    yield Desk(arm, world, config)
+    nothing = cast("Any", None)
+    procedures = Procedures(Rig(config, HostClock(), arm, nothing, nothing, nothing))
+    yield Desk(procedures, world, config)
     await arm.close()
     await server.stop()
 
@@ -62,7 +64,7 @@ def first_drawn(config: RigConfig) -> Drawn:
 async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None:
     drawn = first_drawn(desk.config)
     patch = sheet_of(desk.config, load_protocol(WRITE)).patch(0)
-    depth_mm = await draw_stroke(desk.arm, desk.config, PLANE, patch, drawn.strokes[0], speed_mm_s=15.0, blend_mm=1.0)
+    depth_mm = await desk.procedures.stroke(patch, drawn, 0)
     assert depth_mm == pytest.approx(drawn.strokes[0][0][2], abs=0.05)
     [drag] = desk.world.drags
     assert not desk.world.presses
@@ -74,14 +76,6 @@ async def test_a_drawn_stroke_is_one_drag_through_its_points(desk: Desk) -> None
         assert near < 0.8
     assert drag.heading_deg % 360.0 == pytest.approx(180.0, abs=0.1)
     assert desk.world.tool().z_mm == pytest.approx(desk.config.motion.safe_z_mm, abs=0.05)
-
-
-async def test_a_stroke_that_leaves_the_limits_somewhere_moves_nothing(desk: Desk) -> None:
-    patch = sheet_of(desk.config, load_protocol(WRITE)).patch(0)
-    points = [*first_drawn(desk.config).strokes[0], (30.0, 30.0, 40.0, 0.0, 0.0)]
-    with pytest.raises(LimitExceeded):
-        await draw_stroke(desk.arm, desk.config, PLANE, patch, points, speed_mm_s=15.0, blend_mm=1.0)
-    assert desk.world.motion._next_id == 0
 
 
 def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
