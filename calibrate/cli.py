@@ -86,7 +86,6 @@ def preprocess(
     stroke: Annotated[str, typer.Option(help="Name of a stroke; default: the first.")] = "",
     px_per_mm: Annotated[float | None, typer.Option(help="Scale of a photograph.")] = None,
     before: Annotated[Path | None, typer.Option(help="Photograph of the page before the stroke.")] = None,
-    lens: Annotated[Path | None, typer.Option(help="Lens file; the session's own by default.")] = None,
     out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
 ) -> None:
     """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
@@ -99,7 +98,7 @@ def preprocess(
         trace = show_photograph(capture, px_per_mm, before, out)
     else:
         with shown() as progress:
-            trace = show_stroke(capture, stroke, out, lens=lens, progress=progress)
+            trace = show_stroke(capture, stroke, out, progress)
     for name, value in trace.log.items():
         say(f"{name} {value:.6g}")
     for flag in trace.flags:

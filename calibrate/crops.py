@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from brushloop.calibrate.stroke.preprocess import Steps, preprocess
 from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.export import Crop, Cropper
+from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture, Recording
 
 
@@ -43,7 +43,11 @@ def crop_capture(capture: Capture, calibration: Calibration | None) -> Crop:
     mask = ink_of(capture, steps)
     prepared = steps.prepared
     return Crop(
-        _png(raster), _png(255 * mask.astype(np.uint8)), PX_PER_MM, prepared.anchor_px, "; ".join(prepared.flags)
+        encode_png(raster),
+        encode_png(255 * mask.astype(np.uint8)),
+        PX_PER_MM,
+        prepared.anchor_px,
+        "; ".join(prepared.flags),
     )
 
 
@@ -75,7 +79,3 @@ def rectified(capture: Capture, calibration: Calibration | None) -> tuple[Gray, 
     else:
         raise CaptureRefused(stroke.stroke_id, "has neither a zero-touch point on the sheet nor a scale of its own")
     return raster, preprocess(raster, anchor, capture.where, params, cell_px)
-
-
-def _png(image: Gray | NDArray[np.uint8]) -> bytes:
-    return cv2.imencode(".png", image)[1].tobytes()

@@ -7,15 +7,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
+from brushloop.calibrate.crops import rectified
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
-from brushloop.calibrate.stroke.preprocess import preprocess, to_levels
-from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_distorted, rescale
+from brushloop.calibrate.stroke.preprocess import Steps, preprocess, to_levels
+from brushloop.calibrate.stroke.rectify import on_raster, rescale
+from brushloop.sessions.recording import Capture
 
 TILE_PX = 300
 CAPTION_PX = 74
 COLUMNS = 4
+SCALE = {"px_per_mm": PX_PER_MM}
 LINES = 3
 FONT, HEIGHT, STEP_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 16
 
@@ -42,6 +45,7 @@ class Trace:
     anchor_px: tuple[float, float] | None
     """The zero-touch point on the small image: pixel j covers [j, j + 1). It may lie outside."""
     flags: tuple[str, ...]
+    params: Params
 
     @property
     def log(self) -> dict[str, float]:
@@ -49,46 +53,36 @@ class Trace:
         return {f"{stage.name}.{name}": value for stage in self.stages for name, value in stage.values.items()}
 
 
-def trace_seen(
-    image: Gray,
-    plane: Plane,
-    window_mm: tuple[float, float, float, float],
-    anchor_mm: tuple[float, float],
-    where: str,
-    params: Params,
-    cell_mm: tuple[float, float, float, float] | None = None,
-) -> Trace:
-    """Trace a photograph of a sheet whose plane is known; `window_mm` (x, y, width, height) holds the stroke.
-
-    Everything outside the paper cell is hidden. Raises `CaptureRefused` as `prepare` does.
-    """
-    k1, k2, p1, p2, k3 = (float(v) for v in plane.lens.distortion)
-    lens = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
-    raster = rectify_distorted(image, plane, window_mm)
-    stages = (
-        Stage("captured", image, {"width_px": float(image.shape[1]), "height_px": float(image.shape[0])}),
-        Stage("undistort", plane.lens.undistort(image), lens),
+def trace_capture(capture: Capture, calibration: Calibration | None, where: str) -> Trace:
+    """Trace a capture of a session, as `rectified` crops it, or as an import brings it. Raises `CaptureRefused`."""
+    image = capture.image()
+    raster, steps = rectified(capture, calibration)
+    if calibration is None:
+        return _traced(raster, steps, where, Params(), (_captured(image), Stage("rectify", raster, SCALE)))
+    k1, k2, p1, p2, k3 = calibration.lens.distortion
+    found = {"pix2len_mm_per_px": calibration.mm_per_px, "rms_px": calibration.rms_px}
+    before = (
+        _captured(image),
         Stage(
-            "rectify", raster, {"px_per_mm": PX_PER_MM, "pix2len_mm_per_px": plane.mm_per_px, "rms_px": plane.rms_px}
+            "undistort", calibration.lens.lens().undistort(image), {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
         ),
+        Stage("rectify", raster, SCALE | found),
     )
-    left, top = anchor_mm[0] - window_mm[0], window_mm[1] + window_mm[3] - anchor_mm[1]
-    cell_px = None if cell_mm is None else on_window(cell_mm, window_mm)
-    return _from_raster(raster, (left * PX_PER_MM, top * PX_PER_MM), where, params, stages, cell_px)
+    return _traced(raster, steps, where, Params.of(calibration), before)
 
 
 def trace_scaled(
     image: Gray, px_per_mm: tuple[float, float], anchor_px: tuple[float, float] | None, where: str, params: Params
 ) -> Trace:
-    """Trace a flat photograph of known scale, as imported. Raises `CaptureRefused`."""
+    """Trace a flat photograph of known scale. Raises `CaptureRefused`."""
     raster = rescale(image, px_per_mm, where)
-    scale = {"from_px_per_mm_x": px_per_mm[0], "from_px_per_mm_y": px_per_mm[1], "px_per_mm": PX_PER_MM}
-    stages = (
-        Stage("captured", image, {"width_px": float(image.shape[1]), "height_px": float(image.shape[0])}),
-        Stage("rectify", raster, scale),
-    )
     anchor = None if anchor_px is None else on_raster(anchor_px, px_per_mm)
-    return _from_raster(raster, anchor, where, params, stages)
+    before = (_captured(image), Stage("rectify", raster, SCALE))
+    return _traced(raster, preprocess(raster, anchor, where, params), where, params, before)
+
+
+def _captured(image: Gray) -> Stage:
+    return Stage("captured", image, {"width_px": float(image.shape[1]), "height_px": float(image.shape[0])})
 
 
 def contact_sheet(trace: Trace) -> Gray:
@@ -108,15 +102,8 @@ def contact_sheet(trace: Trace) -> Gray:
     return sheet
 
 
-def _from_raster(
-    raster: Gray,
-    anchor_px: tuple[float, float] | None,
-    where: str,
-    params: Params,
-    before: tuple[Stage, ...],
-    cell_px: tuple[int, int, int, int] | None = None,
-) -> Trace:
-    steps, view = preprocess(raster, anchor_px, where, params, cell_px), Field()
+def _traced(raster: Gray, steps: Steps, where: str, params: Params, before: tuple[Stage, ...]) -> Trace:
+    view, anchor_px = Field(), steps.prepared.anchor_px
     whole, chosen = steps.prepared, steps.chosen
     if anchor_px is None:
         corner = view.corner_around_px(whole.mask)
@@ -165,7 +152,7 @@ def _from_raster(
             {"mm_per_px": view.mm_per_px, "area_mm2": float(binary.sum()) * view.mm_per_px**2},
         ),
     )
-    return Trace(where, (*before, *after), binary, captured_mm(cropped, Tone.GRAY), small_anchor, tuple(flags))
+    return Trace(where, (*before, *after), binary, captured_mm(cropped, Tone.GRAY), small_anchor, tuple(flags), params)
 
 
 def _range(values: Soft, name: str) -> dict[str, float]:
