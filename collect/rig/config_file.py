@@ -80,13 +80,13 @@ def refusal(
     """
     errors = error.errors()
     first = min(errors, key=lambda e: e["type"] != "extra_forbidden")
-    what, covered = _what(first, errors, of)
+    what = _what(first, of)
     key = first["loc"][-1:] if first["type"] == "extra_forbidden" else ()
     within = first["loc"][1 if tagged else 0 : len(first["loc"]) - len(key)]
     loc = [*(part for part in within if not _is_tag(part)), *key]
     if first["type"].startswith("union_tag"):
         loc.append("kind")
-    more = f"; and {len(errors) - covered} more" if len(errors) > covered else ""
+    more = f"; and {len(errors) - 1} more" if len(errors) > 1 else ""
     where: Path | str = path
     for set_at, variable in (environment or {}).items():
         if tuple(loc[: len(set_at)]) == set_at and all(isinstance(part, int) for part in loc[len(set_at) :]):
@@ -96,30 +96,25 @@ def refusal(
     return ConfigError(where, ".".join(str(part) for part in loc), what + more)
 
 
-def _what(first: ErrorDetails, errors: list[ErrorDetails], of: object) -> tuple[str, int]:
-    """Return (what is wrong, number of errors that this covers)."""
+def _what(first: ErrorDetails, of: object) -> str:
+    """What is wrong."""
     loc = first["loc"]
     match first["type"]:
         case "extra_forbidden":
-            kind = "table" if isinstance(first["input"], dict) else "field"
-            missing = [str(e["loc"][-1]) for e in errors if e["type"] == "missing" and e["loc"][:-1] == loc[:-1]]
             known = fields(models_at(of, loc[:-1]))
-            meant = nearest(str(loc[-1]), missing) or nearest(str(loc[-1]), known)
-            if meant is None:
-                return f"unknown {kind}; known are {', '.join(known)}", 1
-            if meant in missing:
-                return f"unknown {kind}; did you mean {meant}, which is missing?", 2
-            return f"unknown {kind}; did you mean {meant}?", 1
+            meant = nearest(str(loc[-1]), known)
+            hint = f"known are {', '.join(known)}" if meant is None else f"did you mean {meant}?"
+            return f"unknown field; {hint}"
         case "union_tag_not_found":
-            return f"is missing: one of {', '.join(map(repr, kinds(models_at(of, loc))))}", 1
+            return f"is missing: one of {', '.join(map(repr, kinds(models_at(of, loc))))}"
         case "union_tag_invalid":
             context = first.get("ctx", {})
-            return f"{context['tag']!r} is not one of {context['expected_tags']}", 1
+            return f"{context['tag']!r} is not one of {context['expected_tags']}"
         case "missing" | "value_error":
-            return first["msg"].removeprefix("Value error, "), 1
+            return first["msg"].removeprefix("Value error, ")
         case _:
             shown = repr(first["input"])
-            return f"{first['msg']} (given: {shown if len(shown) <= 80 else shown[:77] + '...'})", 1
+            return f"{first['msg']} (given: {shown if len(shown) <= 80 else shown[:77] + '...'})"
 
 
 def _is_tag(part: str | int) -> bool:
