@@ -11,6 +11,8 @@ from brushloop.calibrate.board.lens import LensUsed
 from brushloop.collect.rig.config_file import Config, Finite, Positive, Range
 from brushloop.drivers.camera import Locked
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.ink.pump import ModbusPumpConfig
+from brushloop.drivers.ink.station import InkStationConfig
 
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
 MOST_STALE_MS = 100.0
@@ -101,39 +103,6 @@ class CameraConfig(Config):
     optics: LensUsed | None = None
     """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
     locked: Locked = Locked()
-
-
-class InkStationConfig(Config):
-    """A station that doses ink, lights the sheet and measures the level (docs/ink-station.md)."""
-
-    kind: Literal["ink-station"]
-    port: str = Field(min_length=1)
-    """Device file or COM port."""
-    baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
-    keep_level: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Before a dip the well is filled up to this share of its capacity."""
-    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.5
-    """Size of one dose, repeated until the level is reached."""
-    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
-    light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
-    """Set at the start of a run; if left out, the light stays as it is."""
-
-
-class ModbusPumpConfig(Config):
-    """A peristaltic pump without a gauge: replaces the ink that dips take without measuring it."""
-
-    kind: Literal["modbus-pump"]
-    port: str = Field(min_length=1)
-    """Device file or COM port."""
-    ml_per_revolution: Annotated[float, Field(gt=0.0, lt=100.0)]
-    """Calibrated by weighing."""
-    rpm: Annotated[float, Field(gt=0.0, le=600.0)] = 50.0
-    unit: Annotated[int, Field(ge=1, le=247)] = 1
-    baud: Annotated[int, Field(ge=1200, le=115200)] = 9600
-    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.3
-    """Dose before every `every_dips`-th dip."""
-    every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
-    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
 
 InkDeviceConfig = Annotated[InkStationConfig | ModbusPumpConfig, Field(discriminator="kind")]

@@ -17,8 +17,8 @@ from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import noting_lateness
 from brushloop.drivers.exclusive import Claimed, claimed
 from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
-from brushloop.drivers.ink.pump import ModbusPump, PumpOptions
-from brushloop.drivers.ink.station import InkStation, StationOptions
+from brushloop.drivers.ink.pump import ModbusPump
+from brushloop.drivers.ink.station import InkStation
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.protocols import Camera, ForceSensor, Ink, Robot
 from brushloop.drivers.samples import Identity
@@ -98,25 +98,7 @@ def make_force(config: ForceConfig, clock: Clock) -> SriM8123:
 
 def make_ink(config: InkDeviceConfig, clock: Clock) -> InkStation | ModbusPump:
     """The ink device's driver, not yet connected."""
-    if isinstance(config, InkStationConfig):
-        return InkStation(
-            StationOptions(
-                config.port, config.baud, max_dose_ml=config.dose_ml, max_per_minute_ml=config.max_per_minute_ml
-            ),
-            clock,
-        )
-    return ModbusPump(
-        PumpOptions(
-            config.port,
-            config.ml_per_revolution,
-            rpm=config.rpm,
-            unit=config.unit,
-            baud=config.baud,
-            max_dose_ml=config.dose_ml,
-            max_per_minute_ml=config.max_per_minute_ml,
-        ),
-        clock,
-    )
+    return InkStation(config, clock) if isinstance(config, InkStationConfig) else ModbusPump(config, clock)
 
 
 def _resolved(host: str) -> str:

@@ -26,8 +26,6 @@ from brushloop.drivers.force.rounds import Wrench
 from brushloop.drivers.force.stream import ForceHealth, RoundStream, SriOptions
 from brushloop.drivers.samples import ForceSample, Identity, Stamp
 
-__all__ = ["SriM8123", "SriOptions"]
-
 DEVICE = "force"
 AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 MIN_BIAS_ROUNDS = 10

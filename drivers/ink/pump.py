@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
 
 from brushloop.drivers.cancellation import finished
 from brushloop.drivers.clock import Clock
@@ -26,50 +28,48 @@ MAX_RPM = 600.0
 """The speed register could hold up to 655.35."""
 
 
-@dataclass(frozen=True, slots=True)
-class PumpOptions:
-    """Where the pump is and what its tube delivers."""
+class ModbusPumpConfig(BaseModel, frozen=True, extra="forbid"):
+    """A peristaltic pump without a gauge: replaces the ink that dips take without measuring it."""
 
-    path: str
-    ml_per_revolution: float
+    kind: Literal["modbus-pump"]
+    port: str = Field(min_length=1)
+    """Device file or COM port."""
+    ml_per_revolution: Annotated[float, Field(gt=0.0, lt=100.0)]
     """Calibrated: weigh what 100 revolutions deliver. A tube wears, so it is worth repeating."""
-    rpm: float = 50.0
-    unit: int = 1
-    baud: int = 9600
-    max_dose_ml: float = 2.0
-    max_per_minute_ml: float = 5.0
-    timeout_s: float = 0.5
-    echo_s: float = 0.15
-    """How long `connect` waits for an echo: longer than eight characters and the adapter's own delay."""
-    max_overrun_s: float = 0.5
-    """A stop that is later than this is reported: the well got more than was asked for."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError if the pump cannot run with these options."""
-        if not (0.0 < self.rpm <= MAX_RPM and 0.0 < self.ml_per_revolution < 100.0):
-            raise ValueError(f"cannot pump {self.ml_per_revolution} ml per revolution at {self.rpm} rpm")
-
-    @property
-    def gap_s(self) -> float:
-        """3.5 characters of 11 bits, at least 1.75 ms: the silence that ends a frame."""
-        return max(0.00175, 3.5 * 11 / self.baud)
+    rpm: Annotated[float, Field(gt=0.0, le=MAX_RPM)] = 50.0
+    unit: Annotated[int, Field(ge=1, le=247)] = 1
+    baud: Annotated[int, Field(ge=1200, le=115200)] = 9600
+    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.3
+    """Dose before every `every_dips`-th dip."""
+    every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
+    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
 
 class ModbusPump:
     """`Ink` that doses by time at a fixed speed; a running pump is always stopped."""
 
-    def __init__(self, options: PumpOptions, clock: Clock) -> None:
-        self._options = options
+    def __init__(
+        self,
+        config: ModbusPumpConfig,
+        clock: Clock,
+        *,
+        timeout_s: float = 0.5,
+        echo_s: float = 0.15,
+        max_overrun_s: float = 0.5,
+    ) -> None:
+        """`echo_s`: how long `connect` waits for an echo, longer than eight characters and the adapter's own delay.
+
+        A stop that is more than `max_overrun_s` late is reported: the well got more than was asked for.
+        """
+        self._unit, self._rpm = config.unit, config.rpm
         self._clock = clock
-        self._port = SerialPort(DEVICE, options.path, options.baud, options.gap_s)
+        self._timeout_s, self._echo_s, self._max_overrun_s = timeout_s, echo_s, max_overrun_s
+        # 3.5 characters of 11 bits, at least 1.75 ms: the silence that ends a frame.
+        self._port = SerialPort(DEVICE, config.port, config.baud, max(0.00175, 3.5 * 11 / config.baud))
         # Below a tenth of a second the time that messages take would matter more than the time pumped.
-        self._ml_per_s = options.ml_per_revolution * options.rpm / 60.0
-        self._budget = DoseBudget(
-            DEVICE,
-            smallest_ml=0.1 * self._ml_per_s,
-            max_dose_ml=options.max_dose_ml,
-            max_per_minute_ml=options.max_per_minute_ml,
-        )
+        self._ml_per_s = config.ml_per_revolution * config.rpm / 60.0
+        least_ml, most_ml, a_minute_ml = 0.1 * self._ml_per_s, config.dose_ml, config.max_per_minute_ml
+        self._budget = DoseBudget(DEVICE, smallest_ml=least_ml, max_dose_ml=most_ml, max_per_minute_ml=a_minute_ml)
         self._running = asyncio.Lock()
         self._connected = False
         self._may_run = False
@@ -86,7 +86,7 @@ class ModbusPump:
             raise
         self._connected = True
         # A pump cannot say whether it is the loopback rig's.
-        return Identity(DEVICE, f"Modbus RTU pump, unit {self._options.unit}", "", False)
+        return Identity(DEVICE, f"Modbus RTU pump, unit {self._unit}", "", False)
 
     async def dose(self, volume_ml: float) -> None:
         """Pump for as long as `volume_ml` takes, then stop. Raises `LimitExceeded`, `InkRefused`, `DeviceError`.
@@ -97,7 +97,7 @@ class ModbusPump:
             raise NotConnected(DEVICE, "dose", "not connected")
         async with self._running:
             self._budget.take(volume_ml, self._clock.now_ns())
-            speed = round(self._options.rpm * 100)
+            speed = round(self._rpm * 100)
             await self._write(SPEED_REGISTER, speed, "set speed", "The pump was not started.")
             planned_s = volume_ml / self._ml_per_s
             if not self._connected:  # closed meanwhile: the stop has been sent, and no start may follow
@@ -112,7 +112,7 @@ class ModbusPump:
                 raise
             ran_s = time.monotonic() - began_s
             await finished(self._halt())
-            if ran_s > planned_s + self._options.max_overrun_s:
+            if ran_s > planned_s + self._max_overrun_s:
                 excess_ml = (ran_s - planned_s) * self._ml_per_s
                 raise DeviceError(
                     DEVICE,
@@ -168,12 +168,12 @@ class ModbusPump:
             error.add_note(str(failure))
 
     async def _write(self, register: int, value: int, op: str, condition: str) -> None:
-        request = write_register(self._options.unit, register, value)
+        request = write_register(self._unit, register, value)
         code = await self._port.exchange(
             op,
             request,
             lambda received: find_reply(received, request),
-            timeout_s=self._options.timeout_s,
+            timeout_s=self._timeout_s,
             condition=condition,
         )
         if code:
@@ -185,14 +185,14 @@ class ModbusPump:
 
         The reply to a write is the request itself, so an echo would look like a pump that obeys.
         """
-        intact = write_register(self._options.unit, RUN_REGISTER, STOP)
+        intact = write_register(self._unit, RUN_REGISTER, STOP)
         damaged = intact[:-2] + bytes(byte ^ 0xFF for byte in intact[-2:])
         try:
             await self._port.exchange(
                 "connect",
                 damaged,
                 lambda received: True if damaged in received else None,
-                timeout_s=self._options.echo_s,
+                timeout_s=self._echo_s,
             )
         except (DeviceTimeout, ProtocolViolation):
             return

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
 
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
@@ -107,34 +110,44 @@ REMEDIES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class StationOptions:
-    """Where the station is and how much ink it may give."""
+class InkStationConfig(BaseModel, frozen=True, extra="forbid"):
+    """A station that doses ink, lights the sheet and measures the level (docs/ink-station.md)."""
 
-    path: str
-    baud: int = 115200
-    max_dose_ml: float = 2.0
-    max_per_minute_ml: float = 5.0
-    timeout_s: float = 0.5
-    s_per_ml: float = 4.0
-    """Longest time that the station takes for 1 ml; its reply comes when the ink is in the well."""
-    attempts: int = 2
-    connect_attempts: int = 6
-    """Many boards restart when their port is opened, and are deaf for two seconds."""
+    kind: Literal["ink-station"]
+    port: str = Field(min_length=1)
+    """Device file or COM port."""
+    baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
+    keep_level: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Before a dip the well is filled up to this share of its capacity."""
+    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.5
+    """Size of one dose, repeated until the level is reached."""
+    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
+    light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    """Set at the start of a run; if left out, the light stays as it is."""
 
 
 class InkStation:
     """`Ink` over the station's line protocol."""
 
-    def __init__(self, options: StationOptions, clock: Clock) -> None:
-        self._options = options
+    def __init__(
+        self,
+        config: InkStationConfig,
+        clock: Clock,
+        *,
+        timeout_s: float = 0.5,
+        s_per_ml: float = 4.0,
+        attempts: int = 2,
+        connect_attempts: int = 6,
+    ) -> None:
+        """`s_per_ml`: longest time for 1 ml; the reply comes when the ink is in the well. `connect_attempts`: many
+        boards restart when their port is opened, and are deaf for two seconds."""
         self._clock = clock
-        self._port = SerialPort(DEVICE, options.path, options.baud)
+        self._timeout_s = timeout_s
+        self._s_per_ml = s_per_ml
+        self._attempts, self._connect_attempts = attempts, connect_attempts
+        self._port = SerialPort(DEVICE, config.port, config.baud)
         self._budget = DoseBudget(
-            DEVICE,
-            smallest_ml=SMALLEST_ML,
-            max_dose_ml=options.max_dose_ml,
-            max_per_minute_ml=options.max_per_minute_ml,
+            DEVICE, smallest_ml=SMALLEST_ML, max_dose_ml=config.dose_ml, max_per_minute_ml=config.max_per_minute_ml
         )
         self._number = 0
 
@@ -155,7 +168,7 @@ class InkStation:
         """
         self._budget.take(volume_ml, self._clock.now_ns())
         unknown = f"Between 0 and {volume_ml:.3f} ml may be in the well."
-        timeout_s = self._options.timeout_s + volume_ml * self._options.s_per_ml
+        timeout_s = self._timeout_s + volume_ml * self._s_per_ml
         reply = await self._ask("dose", f"{volume_ml:.3f}", timeout_s=timeout_s, condition=unknown)
         given_ml = self._number_in(reply, "dose")
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
@@ -183,7 +196,7 @@ class InkStation:
         await self._port.close()
 
     async def _identify(self) -> Identity:
-        reply = await self._ask("identify", attempts=self._options.connect_attempts)
+        reply = await self._ask("identify", attempts=self._connect_attempts)
         match reply.values:
             case (model, protocol, firmware, ("real" | "loopback") as kind) if (model, protocol) == (MODEL, PROTOCOL):
                 return Identity(DEVICE, MODEL, firmware, kind == "loopback")
@@ -200,14 +213,14 @@ class InkStation:
     ) -> Reply:
         number, self._number = self._number, (self._number + 1) % NUMBERS
         request = seal(number, " ".join(words))
-        left = attempts or self._options.attempts
+        left = attempts or self._attempts
         while True:
             try:
                 reply = await self._port.exchange(
                     words[0],
                     request,
                     lambda received: find_reply(received, number),
-                    timeout_s=timeout_s or self._options.timeout_s,
+                    timeout_s=timeout_s or self._timeout_s,
                     condition=condition,
                 )
             except (DeviceTimeout, ProtocolViolation):

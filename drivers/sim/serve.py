@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -57,7 +58,7 @@ def serve_unknown(
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
     """
     from brushloop.drivers.sim.lab.lab import UnknownLab
-    from brushloop.drivers.sim.lab.seen import truth_text
+    from brushloop.drivers.sim.lab.seen import truth as truth_of
     from brushloop.drivers.sim.lab.traps import Trap
 
     if trap is not None and trap not in [*Trap]:
@@ -68,7 +69,7 @@ def serve_unknown(
 
     def write_truth() -> None:
         if truth is not None:
-            _write_whole(truth, truth_text(lab.facts, lab.trap))
+            _write_whole(truth, json.dumps(truth_of(lab.facts, lab.trap), indent=1) + "\n")
 
     async def obey(request: Mapping[str, object]) -> dict[str, Any]:
         answer = await lab.obey(request)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -103,8 +102,3 @@ def truth(facts: Facts, trap: Trap | None) -> dict[str, Any]:
         "brush": asdict(config.brush),
         "cabinet": {"tcp_offset": list(facts.cabinet_tcp), "payload_kg": facts.payload_kg},
     }
-
-
-def truth_text(facts: Facts, trap: Trap | None) -> str:
-    """The truth as a file."""
-    return json.dumps(truth(facts, trap), indent=1) + "\n"

@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import AsyncIterator, Iterator
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from brushloop.drivers.errors import (
     ProtocolViolation,
 )
 from brushloop.drivers.ink.port import InkRefused
-from brushloop.drivers.ink.pump import ModbusPump, PumpOptions
+from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
 from brushloop.drivers.protocols import Ink
 from brushloop.drivers.sim.faults.kinds import InkFault
 from brushloop.drivers.sim.instruments.ink_station import PtyLine
@@ -38,7 +39,12 @@ BYE = [(STOP, STOP)]
 
 
 def pump_at(path: str, **options: float) -> ModbusPump:
-    return ModbusPump(PumpOptions(path, ML_PER_REV, **{"timeout_s": TIMEOUT_S, "echo_s": 0.02, **options}), HostClock())
+    return ModbusPump(table(path), HostClock(), **{"timeout_s": TIMEOUT_S, "echo_s": 0.02, **options})
+
+
+def table(path: str, ml_per_revolution: float = ML_PER_REV, **fields: Any) -> ModbusPumpConfig:
+    fields = {"port": path, "ml_per_revolution": ml_per_revolution, "dose_ml": 2.0, **fields}
+    return ModbusPumpConfig(kind="modbus-pump", **fields)
 
 
 @pytest.fixture
@@ -257,13 +263,12 @@ async def test_a_dose_beyond_the_limits_is_never_sent(expected_protocol):
 
 @pytest.mark.parametrize(("ml_per_revolution", "rpm"), [(0.0, 50.0), (0.1, 0.0), (0.1, 601.0), (math.nan, 50.0)])
 def test_a_pump_that_cannot_run_like_that_is_refused(ml_per_revolution: float, rpm: float):
-    with pytest.raises(ValueError, match="cannot pump"):
-        PumpOptions("port", ml_per_revolution, rpm=rpm)
+    with pytest.raises(ValueError, match="Input should be"):
+        table("port", ml_per_revolution, rpm=rpm)
 
 
 async def test_other_line_settings_work_too(firmware: PumpFirmware, line: PtyLine):
     firmware.unit = 17
-    options = PumpOptions(line.path, ML_PER_REV, unit=17, baud=19200)
-    pump = ModbusPump(options, HostClock())
+    pump = ModbusPump(table(line.path, unit=17, baud=19200), HostClock())
     assert (await pump.connect()).model == "Modbus RTU pump, unit 17"
     await pump.close()

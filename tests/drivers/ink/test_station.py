@@ -19,7 +19,7 @@ from brushloop.drivers.errors import (
     ProtocolViolation,
 )
 from brushloop.drivers.ink.port import InkRefused
-from brushloop.drivers.ink.station import InkStation, StationOptions, seal, unseal
+from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal, unseal
 from brushloop.drivers.protocols import Ink
 from brushloop.drivers.sim.faults.kinds import InkFault
 from brushloop.drivers.sim.instruments.ink_station import PtyLine, StationFirmware
@@ -39,8 +39,12 @@ class StillClock:
 
 
 def station_at(path: str, **options: float) -> InkStation:
-    made = StationOptions(path, **{"timeout_s": TIMEOUT_S, "s_per_ml": 0.0, "connect_attempts": 2, **options})
-    return InkStation(made, HostClock())
+    made = {"timeout_s": TIMEOUT_S, "s_per_ml": 0.0, "connect_attempts": 2, **options}
+    return InkStation(table(path), HostClock(), **made)
+
+
+def table(path: str) -> InkStationConfig:
+    return InkStationConfig(kind="ink-station", port=path, dose_ml=2.0)
 
 
 @pytest.fixture
@@ -293,7 +297,7 @@ async def test_a_dose_beyond_the_limits_is_never_sent(expected_protocol):
 
 async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(line: PtyLine, firmware: StationFirmware):
     clock = StillClock()
-    station = InkStation(StationOptions(line.path, timeout_s=0.05, s_per_ml=0.0, attempts=1), clock)
+    station = InkStation(table(line.path), clock, timeout_s=0.05, s_per_ml=0.0, attempts=1)
     await station.connect()
     await station.dose(2.0)
     clock.ns = 30 * 10**9

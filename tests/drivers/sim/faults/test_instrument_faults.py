@@ -12,7 +12,7 @@ from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
-from brushloop.drivers.ink.station import InkStation, StationOptions, unseal
+from brushloop.drivers.ink.station import InkStation, InkStationConfig, unseal
 from brushloop.drivers.sim.faults.kinds import Device, Fault
 from brushloop.drivers.sim.rig import HOST, Faults, LoopbackRig
 
@@ -26,7 +26,7 @@ async def begun(rig: LoopbackRig) -> None:
 @pytest.fixture
 async def station(rig: LoopbackRig) -> AsyncIterator[InkStation]:
     assert rig.ink is not None
-    station = InkStation(StationOptions(rig.ink.path, timeout_s=0.1), HostClock())
+    station = InkStation(InkStationConfig(kind="ink-station", port=rig.ink.path), HostClock(), timeout_s=0.1)
     await station.connect()
     yield station
     await station.close()

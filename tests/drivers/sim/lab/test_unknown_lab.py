@@ -22,7 +22,7 @@ from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.lab.facts import draw, in_picture
 from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab
 from brushloop.drivers.sim.lab.places import CORNERS, corner
-from brushloop.drivers.sim.lab.seen import truth, truth_text
+from brushloop.drivers.sim.lab.seen import truth
 from brushloop.drivers.sim.rig import _at_sensor
 from brushloop.drivers.sim.world import tool_of
 
@@ -201,7 +201,7 @@ def test_what_is_seen_names_no_truth(lab: UnknownLab):
 
 
 def test_the_truth_is_json_with_what_a_first_day_finds():
-    known = json.loads(truth_text(draw(1), None))
+    known = json.loads(json.dumps(truth(draw(1), None)))
     assert {"tool", "paper", "board", "well", "park_mm", "camera", "force"} <= set(known)
 
 
