@@ -13,8 +13,6 @@ from rich.style import Style
 from textual.geometry import Size
 from textual.strip import Strip
 
-from brushloop.collect.tui.levels import RGB, Coloured, fitted, grays, runs, sampled
-
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -25,31 +23,33 @@ FLAT = 3
 """Grays by which the pixels of a cell may differ without being drawn as dots: noise of the paper and of the camera."""
 EMPTY = 0x2800
 """The braille pattern without dots; its 256 patterns follow each other."""
+STEADY = 0.8
+"""A level is kept while the picture stays within this many levels of it: most changes of a camera are noise."""
 ROWS, COLUMNS = 4, 2
 BITS = (0x01, 0x08, 0x02, 0x10, 0x04, 0x20, 0x40, 0x80)
 """The bit of each dot, row by row."""
-GRAYS = grays(LEVELS)
+RGB = tuple[int, int, int]
+GRAYS: list[RGB] = [(gray, gray, gray) for gray in (round(255 * level / (LEVELS - 1)) for level in range(LEVELS))]
 
 
 class Cells:
     """A picture fitted into this many cells of the terminal."""
 
-    def __init__(self, image: NDArray[np.uint8] | Coloured | None, size: Size, before: Cells | None = None) -> None:
-        """`before` is the picture before, of which the grays stay that are still right; see `fitted`."""
+    def __init__(self, image: NDArray[np.uint8] | None, size: Size, before: Cells | None = None) -> None:
+        """`image` is gray, (h, w), or in few colours, (h, w, 3) RGB. `before` is the picture before, of which the grays
+        stay that are still right; see `_fitted`."""
         self.codes: NDArray[np.int64] | None = None
         """(lines, columns): 256 * (number of the pair of colours) + dots; None without a picture or a place for it."""
         self._levels: NDArray[np.int64] | None = None
         self._colours = GRAYS
-        pixels = image.pixels if isinstance(image, Coloured) else image
-        if pixels is None or not pixels.size or size.width < 1 or size.height < 1:
+        if image is None or not image.size or size.width < 1 or size.height < 1:
             return
         width, height = COLUMNS * size.width, ROWS * size.height
-        if isinstance(image, Coloured):
-            self._colours = image.colours
-            blocks = _blocks(sampled(image.pixels, width, height))
-            dots, ground, other = _by_colour(blocks, len(image.colours))
+        if image.ndim == 3:
+            numbers, self._colours = _sampled(image, width, height)
+            dots, ground, other = _by_colour(_blocks(numbers), len(self._colours))
         else:
-            self._levels = fitted(pixels, width, height, LEVELS, ROWS, None if before is None else before._levels)
+            self._levels = _fitted(image, width, height, None if before is None else before._levels)
             dots, ground, other = _by_gray(_blocks(self._levels))
         self.codes = (other * len(self._colours) + ground) * 256 + dots
 
@@ -59,12 +59,54 @@ class Cells:
         line = self.codes[y]
         out: list[Segment] = []
         at = 0
-        for pair, count in runs(line >> 8):
+        for pair, count in _runs(line >> 8):
             other, ground = divmod(pair, len(self._colours))
             text = "".join(chr(EMPTY + dots) for dots in (line[at : at + count] & 255).tolist())
             out.append(Segment(text, _style(self._colours[other], self._colours[ground])))
             at += count
         return Strip(out, len(line))
+
+
+def _fitted(image: NDArray[np.uint8], width: int, height: int, before: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    """Scale the (h, w) gray picture into `width` x `height`, its shape kept, in grays 0 to `LEVELS` - 1.
+
+    The rows of the result are a multiple of `ROWS`. Levels of the picture `before` that are still right within `STEADY`
+    stay.
+    """
+    import cv2
+    import numpy as np
+
+    scale = min(width / image.shape[1], height / image.shape[0])
+    columns, rows = max(1, int(image.shape[1] * scale)), max(1, int(image.shape[0] * scale / ROWS)) * ROWS
+    small = np.asarray(cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA), np.int64) * (LEVELS - 1)
+    made = (small + 127) // 255
+    if before is None or before.shape != made.shape:
+        return made
+    return np.where(np.abs(small - 255 * before) < 255 * STEADY, before, made)
+
+
+def _runs(values: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """(value, count) of each run of equal values."""
+    import numpy as np
+
+    starts = np.flatnonzero(np.concatenate(([True], values[1:] != values[:-1])))
+    counts = np.diff(np.append(starts, len(values)))
+    return list(zip(values[starts].tolist(), counts.tolist(), strict=True))
+
+
+def _sampled(pixels: NDArray[np.uint8], width: int, height: int) -> tuple[NDArray[np.int64], list[RGB]]:
+    """Scale a picture in few colours into `width` x `height` without mixing them, the shape kept.
+
+    Returns the number of each pixel's colour, and the colours.
+    """
+    import cv2
+    import numpy as np
+
+    scale = min(width / pixels.shape[1], height / pixels.shape[0])
+    size = max(1, int(pixels.shape[1] * scale)), max(1, int(pixels.shape[0] * scale))
+    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST))
+    colours, numbers = np.unique(small.reshape(-1, 3), axis=0, return_inverse=True)
+    return np.asarray(numbers.reshape(small.shape[:2]), np.int64), [(r, g, b) for r, g, b in colours.tolist()]
 
 
 def _blocks(pixels: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from brushloop.collect.tui.levels import Coloured, grays
 from brushloop.collect.tui.pictures import binary_picture
 from brushloop.collect.tui.text import condition_text
 
@@ -42,9 +41,9 @@ class LargeCapture:
     csim: float | None
     checks: tuple[AnyCheck, ...]
 
-    def pictures(self) -> dict[str, NDArray[np.uint8] | Coloured]:
+    def pictures(self) -> dict[str, NDArray[np.uint8]]:
         """The pictures there are, by name, in the order in which they are shown."""
-        found: dict[str, NDArray[np.uint8] | Coloured] = {}
+        found: dict[str, NDArray[np.uint8]] = {}
         if self.photo is not None:
             found["photograph"] = self.photo
         if self.binary is not None:
@@ -69,25 +68,25 @@ def title_of(press: Press) -> str:
     return f"{press.stroke_id}   {condition_text(press.condition)}"
 
 
-def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> Coloured:
+def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """The edge of the predicted mark on the photograph of the same field."""
     import cv2
     import numpy as np
 
     small = cv2.resize(photo, (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_AREA)
-    levels = (np.asarray(small, np.int64) * (PHOTO_GRAYS - 1) + 127) // 255
+    levels = (np.asarray(small, np.int64) * (PHOTO_GRAYS - 1) + 127) // 255 * 255 // (PHOTO_GRAYS - 1)
     mask = cv2.resize(predicted.astype(np.uint8), (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_LINEAR)
     edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    pixels = cv2.drawContours(levels.astype(np.uint8), edges, -1, PHOTO_GRAYS, LINE_PX)
-    return Coloured(np.asarray(pixels, np.uint8), (*grays(PHOTO_GRAYS), PREDICTED))
+    picture = np.repeat(levels.astype(np.uint8)[..., None], 3, axis=2)
+    return np.asarray(cv2.drawContours(picture, edges, -1, PREDICTED, LINE_PX), np.uint8)
 
 
-def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> Coloured:
+def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Where both have ink, only the capture has it, and only the prediction has it."""
     import numpy as np
 
-    pixels = np.where(captured, np.where(predicted, 1, 2), np.where(predicted, 3, 0))
-    return Coloured(pixels.astype(np.uint8), (WHITE, BOTH, CAPTURED, PREDICTED))
+    colours = np.array((WHITE, PREDICTED, CAPTURED, BOTH), np.uint8)
+    return colours[2 * captured.astype(np.uint8) + predicted]
 
 
 def number_text(value: float | None) -> str:

@@ -13,7 +13,6 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from brushloop.collect.tui.dots import Cells
-from brushloop.collect.tui.levels import Coloured
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,18 +31,18 @@ class CellPicture(Widget):
 
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
-        self._image: NDArray[np.uint8] | Coloured | None = None
+        self._image: NDArray[np.uint8] | None = None
         self._cells = Cells(None, Size())
         self._made_for: Size | None = None
 
-    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
+    def show(self, image: NDArray[np.uint8] | None) -> None:
         """Draw the lines of this picture that changed; nothing where it is the same object."""
         if image is self._image:
             return
         self._image, before = image, self._cells.codes
         self._fit(self._cells)
         codes = self._cells.codes
-        if before is None or codes is None or before.shape != codes.shape or isinstance(image, Coloured):
+        if before is None or codes is None or before.shape != codes.shape or image is None or image.ndim == 3:
             self.refresh()
             return
         for y in (before != codes).any(axis=1).nonzero()[0].tolist():
@@ -73,13 +72,13 @@ class ImagePicture(Container):
     def __init__(self, widget: type[Any], id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
         self._inner: Any = widget()
-        self._image: NDArray[np.uint8] | Coloured | None = None
+        self._image: NDArray[np.uint8] | None = None
 
     def compose(self) -> ComposeResult:
         """Lay out textual-image's own widget."""
         yield self._inner
 
-    def show(self, image: NDArray[np.uint8] | Coloured | None) -> None:
+    def show(self, image: NDArray[np.uint8] | None) -> None:
         """Draw this picture, unless it is the same object."""
         if image is self._image:
             return
@@ -87,11 +86,8 @@ class ImagePicture(Container):
         if image is None:
             self._inner.image = None
             return
-        import numpy as np
         from PIL import Image
 
-        if isinstance(image, Coloured):
-            image = np.array(image.colours, np.uint8)[image.pixels]
         self._inner.image = Image.fromarray(image)
 
 

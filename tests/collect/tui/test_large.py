@@ -9,7 +9,16 @@ import numpy as np
 from brushloop.collect.quality.verdict import Check, Failure
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen, words_content
-from brushloop.collect.tui.large import difference, limit_text, of_last, over_photograph
+from brushloop.collect.tui.large import (
+    BOTH,
+    CAPTURED,
+    PREDICTED,
+    WHITE,
+    difference,
+    limit_text,
+    of_last,
+    over_photograph,
+)
 from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.text import age_text
 from brushloop.collect.tui.widgets import KeyBar
@@ -60,10 +69,10 @@ async def test_the_last_capture_says_its_age() -> None:
 def test_a_difference_has_four_colours_and_an_overlay_the_line_of_the_prediction() -> None:
     captured, predicted = np.zeros((128, 128), bool), np.zeros((128, 128), bool)
     captured[40:60, 40:80] = predicted[50:70, 40:80] = True
-    pixels = difference(captured, predicted).pixels
-    assert [int(pixels[y, 60]) for y in (10, 45, 55, 65)] == [0, 2, 1, 3]
+    pixels = difference(captured, predicted)
+    assert [tuple(pixels[y, 60].tolist()) for y in (10, 45, 55, 65)] == [WHITE, CAPTURED, BOTH, PREDICTED]
     over = over_photograph(np.full((500, 500), 255, np.uint8), predicted)
-    line = over.pixels == len(over.colours) - 1
+    line = (over == PREDICTED).all(axis=-1)
     assert 0 < line.mean() < 0.05
     assert not line[:140].any()
 

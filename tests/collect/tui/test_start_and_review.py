@@ -19,7 +19,6 @@ from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.dots import Cells
 from brushloop.collect.tui.finish_screen import FinishScreen, run_command, verdict_content
 from brushloop.collect.tui.force_text import plot, plot_title, scale_n, spark
-from brushloop.collect.tui.levels import Coloured
 from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.start_screen import StartScreen
@@ -284,7 +283,8 @@ def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:
     numbers = np.zeros((4, 4), np.uint8)
     numbers[:, 2] = 1
     numbers[1, 3] = 2
-    strip = Cells(Coloured(numbers, ((255, 255, 255), (0, 0, 0), (0, 114, 178))), Size(2, 1)).strip(0)
+    colours = np.array(((255, 255, 255), (0, 0, 0), (0, 114, 178)), np.uint8)
+    strip = Cells(colours[numbers], Size(2, 1)).strip(0)
     assert strip.text[0] == "⠀"
     assert {str(part.style) for part in strip} == {
         "rgb(255,255,255) on rgb(255,255,255)",
