@@ -20,9 +20,9 @@ from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Alignment, Field, Tone, covered
-from brushloop.calibrate.compare.images import brush_of, prepare_press, simulated
+from brushloop.calibrate.compare.images import brush_of, prepare_press, rectified, simulated
 from brushloop.calibrate.compare.similarity import csim, ssim
-from brushloop.calibrate.crops import ink_of, rectified
+from brushloop.calibrate.crops import ink_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
@@ -128,7 +128,7 @@ class RecordedPress:
 
     @cached_property
     def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
-        raster, steps = rectified(self._capture, self._session.applied)
+        raster, steps = rectified(self._capture, self._session.applied, Field())
         return raster, ink_of(self._capture, steps)
 
 

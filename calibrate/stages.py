@@ -9,7 +9,7 @@ import numpy as np
 
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
-from brushloop.calibrate.crops import rectified
+from brushloop.calibrate.compare.images import rectified
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
 from brushloop.calibrate.stroke.preprocess import Steps, preprocess, to_levels
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
@@ -56,7 +56,7 @@ class Trace:
 def trace_capture(capture: Capture, calibration: Calibration | None, where: str) -> Trace:
     """Trace a capture of a session, as `rectified` crops it, or as an import brings it. Raises `CaptureRefused`."""
     image = capture.image()
-    raster, steps = rectified(capture, calibration)
+    raster, steps = rectified(capture, calibration, Field())
     if calibration is None:
         return _traced(raster, steps, where, Params(), (_captured(image), Stage("rectify", raster, SCALE)))
     k1, k2, p1, p2, k3 = calibration.lens.distortion

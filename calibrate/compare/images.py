@@ -28,13 +28,13 @@ from brushloop.calibrate.compare.field import (
     to_tone,
 )
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.params import PX_PER_MM, Params
-from brushloop.calibrate.stroke.preprocess import Prepared, prepare
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
+from brushloop.calibrate.stroke.preprocess import Prepared, Steps, prepare, preprocess
 from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
 from brushloop.model.brush import Brush
 from brushloop.model.loops import Loop
 from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Header, Stroke
+from brushloop.sessions.records import Header
 
 if TYPE_CHECKING:
     from brushloop.model.outline import Shape
@@ -42,34 +42,59 @@ if TYPE_CHECKING:
 
 Pixels = NDArray[np.uint8]
 """Ink from 0 to 255."""
+SPECK_SHARE = 0.002
+"""Smallest share of a figure's ink that counts; lower than for a press, because a figure may have dots."""
 MAX_UNPACKED_BYTES = 256 * (len(KEYS) + 1) * SIZE_PX**2
 
 
-def prepare_press(capture: Capture, calibration: Calibration | None, view: Field) -> Prepared:
-    """Rectify a stroke to the millimetre field, by the calibration or by the import's own scale.
+def rectified(capture: Capture, calibration: Calibration | None, view: Field) -> tuple[Gray, Steps]:
+    """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
 
-    Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a picture that cannot be read.
+    A press is cropped to the field around its zero-touch point, a stroke that travels to its paper cell; an imported
+    photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a
+    picture that cannot be read.
     """
-    stroke = capture.stroke
-    if capture.bad:
-        raise CaptureRefused(stroke.stroke_id, capture.bad)
-    image, params = capture.image(), Params.of(calibration)
-    left, top = (v * PX_PER_MM for v in view.anchor_mm)
-    if stroke.anchor_mm is not None and calibration is not None:
-        window = view.window_mm(stroke.anchor_mm)
+    stroke, image, params = capture.stroke, capture.image(), Params.of(calibration)
+    if calibration is not None and stroke.anchor_mm is not None:
+        window, (left_mm, top_mm) = view.window_mm(stroke.anchor_mm), view.anchor_mm
+        if stroke.kind == "drag" and stroke.cell_mm is not None:
+            window = x_mm, y_mm, _, height_mm = stroke.cell_mm
+            left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + height_mm - stroke.anchor_mm[1]
         raster = rectify_by(image, calibration, window, capture.where)
-        return prepare(raster, (left, top), capture.where, params, _cell_px(stroke, window))
+        cell_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
+        anchor = (left_mm * PX_PER_MM, top_mm * PX_PER_MM)
+        return raster, preprocess(raster, anchor, capture.where, params, cell_px)
     if stroke.px_per_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
     raster = rescale(image, stroke.px_per_mm, capture.where)
-    if stroke.anchor_px is None:
+    anchor = None if stroke.anchor_px is None else on_raster(stroke.anchor_px, stroke.px_per_mm)
+    return raster, preprocess(raster, anchor, capture.where, params)
+
+
+def prepare_press(capture: Capture, calibration: Calibration | None, view: Field) -> Prepared:
+    """Rectify a stroke to the millimetre field. Raises as `rectified` does."""
+    stroke = capture.stroke
+    if capture.bad:
+        raise CaptureRefused(stroke.stroke_id, capture.bad)
+    _, steps = rectified(capture, calibration, view)
+    if calibration is not None and stroke.anchor_mm is not None:
+        return steps.prepared
+    if steps.prepared.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
-    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm)
-    return crop_at_anchor(prepare(raster, anchor, capture.where, params), anchor, view)
+    return crop_at_anchor(steps.prepared, steps.prepared.anchor_px, view)
 
 
-def _cell_px(stroke: Stroke, window: tuple[float, float, float, float]) -> tuple[int, int, int, int] | None:
-    return None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
+def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
+    """Rectify a whole paper cell: all ink in it belongs to its figure, however far apart the strokes are.
+
+    Raises `CaptureRefused` for a stroke without a cell, or without ink in it.
+    """
+    cell_mm = capture.stroke.cell_mm
+    if cell_mm is None:
+        raise CaptureRefused(capture.stroke.stroke_id, "has no paper cell")
+    raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
+    whole = {"join_mm": math.hypot(*cell_mm[2:]), "speck_share": SPECK_SHARE}
+    return prepare(raster, None, capture.where, Params(**(calibration.preprocess | whole)))
 
 
 def captured_images(stroke_id: str, prepared: Prepared) -> dict[Key, Image]:

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.images import prepare_cell
 from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, LENGTH_NAME, depth_of, prepare_drag
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
-from brushloop.calibrate.stroke.preprocess import prepare
-from brushloop.calibrate.stroke.rectify import on_raster, rectify_by, rescale
+from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header, Stroke
@@ -36,9 +36,6 @@ MARGIN_MM = 16.0
 NODES = 28
 COMMANDS = ("length_mm", "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
 ENDS, SHARE_ENDS, SHARE_MID = "depth_ends_mm", "z_frac_ends", "z_frac_mid"
-SPECK_SHARE = 0.002
-"""Smallest share of the ink that counts as ink of a figure. It is lower than for a press, because a figure may have
-dots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,14 +200,11 @@ def _figure(
 ) -> tuple[list[Floats], tuple[NDArray[np.float32], tuple[str, ...]]]:
     stroke = capture.stroke
     paths = figures.get(stroke.stroke_id.rpartition("-r")[0])
-    if paths is None or stroke.cell_mm is None:
+    if paths is None:
         raise CaptureRefused(stroke.stroke_id, "is not a figure of the recorded protocol")
     if any(len(path) < 2 for path in paths):
         raise CaptureRefused(stroke.stroke_id, "has a stroke with only one point")
-    raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
-    # All ink of the cell belongs to the figure, however far apart its strokes are.
-    reach = {"join_mm": float(np.hypot(*stroke.cell_mm[2:])), "speck_share": SPECK_SHARE}
-    prepared = prepare(raster, None, capture.where, Params(**(calibration.preprocess | reach)))
+    prepared = prepare_cell(capture, calibration)
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
     return paths, (_shrunk(prepared.mask, x_mm, y_mm), ())

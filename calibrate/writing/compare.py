@@ -14,21 +14,16 @@ import numpy as np
 
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import SIZE_PX, Image, Tone
+from brushloop.calibrate.compare.images import prepare_cell
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.session import calibration_of
-from brushloop.calibrate.stroke.params import Params
-from brushloop.calibrate.stroke.preprocess import Prepared, prepare
-from brushloop.calibrate.stroke.rectify import rectify_by
 from brushloop.calibrate.writing.plan_record import FigureRecord, PlanRecord, points_digest
 from brushloop.calibrate.writing.scores import Character, Ink, Table3Row, WrittenScore, score_character, table_3
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, counted, unseen
-
-SPECK_SHARE = 0.002
-"""Lower than for a press: relative to its longest stroke, a character's dot is smaller than a drop is to a press."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,25 +131,16 @@ def _check_points(recording: Recording, plan: PlanRecord) -> None:
 
 def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
     """Return the ink on the character's paper cell, and whether it reaches the edge. Raises `CaptureRefused`."""
-    stroke = capture.stroke
-    if stroke.cell_mm is None:
-        raise CaptureRefused(stroke.stroke_id, "has no paper cell")
-    _, _, size_x_mm, size_y_mm = stroke.cell_mm
+    _, _, size_x_mm, size_y_mm = capture.stroke.cell_mm or (0.0,) * 4
     if not math.isclose(size_x_mm, size_y_mm):
-        raise CaptureRefused(stroke.stroke_id, f"its cell is {size_x_mm:g} x {size_y_mm:g} mm, but must be square")
-    raster = rectify_by(capture.image(), calibration, stroke.cell_mm, capture.where)
-    prepared = _whole_cell(raster, capture.where, calibration, math.hypot(size_x_mm, size_y_mm))
+        what = f"its cell is {size_x_mm:g} x {size_y_mm:g} mm, but must be square"
+        raise CaptureRefused(capture.stroke.stroke_id, what)
+    prepared = prepare_cell(capture, calibration)
     return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
 
 
 def _small(image: Image) -> Image:
     return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
-
-
-def _whole_cell(raster: np.ndarray, where: str, calibration: Calibration, reach_mm: float) -> Prepared:
-    """Prepare a whole cell: all its ink belongs to the character, however far apart the strokes are."""
-    params = calibration.preprocess | {"join_mm": reach_mm, "speck_share": SPECK_SHARE}
-    return prepare(raster.astype(np.uint8), None, where, Params(**params))
 
 
 def read_reference(path: Path) -> Image:
