@@ -90,7 +90,7 @@ def preprocess(
 ) -> None:
     """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
     from brushloop.calibrate.files import check_target
-    from brushloop.calibrate.show_stages import show_photograph, show_stroke
+    from brushloop.calibrate.stages import show_photograph, show_stroke
     from brushloop.sessions.terminal import shown
 
     check_target(out, ".png", capture, before)

@@ -1,8 +1,11 @@
-"""Every stage from a photograph to a 128 x 128 stroke as a picture, with the numbers that were fitted in each."""
+"""Show every stage from a photograph to a 128 x 128 stroke in a picture, and write the numbers fitted in each."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import textwrap
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,17 +13,20 @@ import numpy as np
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
 from brushloop.calibrate.compare.images import rectified
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_gray, write_whole
+from brushloop.calibrate.report import picture_grid, printable, save_picture, show_picture
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stroke.difference import new_stroke
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
 from brushloop.calibrate.stroke.preprocess import Steps, preprocess, to_levels
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
-from brushloop.sessions.recording import Capture
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.terminal import Progress, counted, unseen
 
-TILE_PX = 300
-CAPTION_PX = 74
 COLUMNS = 4
 SCALE = {"px_per_mm": PX_PER_MM}
-LINES = 3
-FONT, HEIGHT, STEP_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 16
+TITLE_CHARS = 52
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +57,45 @@ class Trace:
     def log(self) -> dict[str, float]:
         """Every fitted number as `stage.name`."""
         return {f"{stage.name}.{name}": value for stage in self.stages for name, value in stage.values.items()}
+
+
+def show_stroke(session: Path, stroke: str, out: Path, progress: Progress = unseen) -> Trace:
+    """Show a stroke of a session by its name, or the first one if the name is empty, as a validation sees it.
+
+    Raises `CalibrationError` where the session was not calibrated.
+    """
+    recording = Recording(session)
+    for capture in counted(recording.captures(), "strokes read", recording.strokes(), progress):
+        if stroke in ("", capture.stroke.stroke_id):
+            break
+    else:
+        raise CalibrationError(str(recording.path), f"holds no stroke {stroke!r}")
+    calibration = calibration_of(recording, capture.stroke, recording.sha256, None)
+    return _written(trace_capture(capture, calibration, f"{recording.path.name} {capture.stroke.stroke_id}"), out)
+
+
+def show_photograph(path: Path, px_per_mm: float | None, before: Path | None, out: Path) -> Trace:
+    """Show a flat photograph of known scale. Raises `CalibrationError`."""
+    if px_per_mm is None:
+        raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
+    image = read_gray(path)
+    if before is not None:
+        image = only_new(read_gray(before), image, px_per_mm, str(path))
+    trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), Params())
+    return _written(trace, out)
+
+
+def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
+    """A page with only the ink that is new since `before`, black on white. Raises `CaptureRefused`."""
+    new = new_stroke(before, after, px_per_mm, where)
+    return np.rint(255.0 * (1.0 - new.soft)).astype(np.uint8)
+
+
+def _written(trace: Trace, out: Path) -> Trace:
+    draw_stages(trace, out)
+    numbers = {"where": trace.where, "params": asdict(trace.params), "fitted": trace.log, "flags": list(trace.flags)}
+    write_whole(out.with_suffix(".json"), json.dumps(numbers, indent=2) + "\n")
+    return trace
 
 
 def trace_capture(capture: Capture, calibration: Calibration | None, where: str) -> Trace:
@@ -85,21 +130,18 @@ def _captured(image: Gray) -> Stage:
     return Stage("captured", image, {"width_px": float(image.shape[1]), "height_px": float(image.shape[0])})
 
 
-def contact_sheet(trace: Trace) -> Gray:
-    """(h, w) gray: a tile for each stage with its name and numbers below, flags in the last line."""
+def draw_stages(trace: Trace, path: Path) -> None:
+    """Write a PNG with a picture of each stage, its name and numbers above, and the flags below. Raises OSError."""
     rows = -(-len(trace.stages) // COLUMNS)
-    sheet = np.full(
-        (rows * (TILE_PX + CAPTION_PX) + 30 + STEP_PX * len(trace.flags), COLUMNS * (TILE_PX + 10)), 255, np.uint8
-    )
-    for number, stage in enumerate(trace.stages):
-        row, column = divmod(number, COLUMNS)
-        _tile(sheet, stage, number + 1, 5 + column * (TILE_PX + 10), 5 + row * (TILE_PX + CAPTION_PX))
-    below = rows * (TILE_PX + CAPTION_PX) + STEP_PX
-    for k, line in enumerate((trace.where, *trace.flags)):
-        cv2.putText(
-            sheet, line.encode("ascii", "replace").decode(), (8, below + STEP_PX * k), FONT, HEIGHT, 0, 1, cv2.LINE_AA
-        )
-    return sheet
+    figure, axes = picture_grid(rows, COLUMNS, (12.4, 3.8 * rows + 0.2 * len(trace.flags)))
+    for axis in axes.flat[len(trace.stages) :]:
+        axis.axis("off")
+    for number, (axis, stage) in enumerate(zip(axes.flat, trace.stages, strict=False), start=1):
+        numbers = ", ".join(f"{name} {value:.4g}" for name, value in stage.values.items())
+        title = textwrap.fill(f"{number} {stage.name}: {numbers}", TITLE_CHARS)
+        show_picture(axis, (1.0 - stage.image / 255.0).astype(np.float32), title, fontsize=7)
+    figure.supxlabel("\n".join(map(printable, (trace.where, *trace.flags))), fontsize=8)
+    save_picture(figure, path)
 
 
 def _traced(raster: Gray, steps: Steps, where: str, params: Params, before: tuple[Stage, ...]) -> Trace:
@@ -179,21 +221,3 @@ def _cross(image: Gray, anchor: tuple[float, float] | None) -> Gray:
         cv2.drawMarker(drawn, place, 255, cv2.MARKER_CROSS, 40, 7)
         cv2.drawMarker(drawn, place, 0, cv2.MARKER_CROSS, 40, 3)
     return drawn
-
-
-def _tile(sheet: Gray, stage: Stage, number: int, left: int, top: int) -> None:
-    height, width = stage.image.shape
-    scale = min(TILE_PX / width, TILE_PX / height)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = cv2.resize(stage.image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
-    sheet[top : top + size[1], left : left + size[0]] = small
-    cv2.rectangle(sheet, (left - 1, top - 1), (left + size[0], top + size[1]), 160, 1)
-    lines = [f"{number} {stage.name}"]
-    for name, value in stage.values.items():
-        word = f"{name} {value:.4g}"
-        if len(lines) > 1 and len(lines[-1]) + len(word) < 40:
-            lines[-1] += f", {word}"
-        else:
-            lines.append(word)
-    for k, line in enumerate(lines[: LINES + 1]):
-        cv2.putText(sheet, line, (left, top + TILE_PX + 14 + STEP_PX * k), FONT, HEIGHT, 0, 1, cv2.LINE_AA)
