@@ -6,12 +6,12 @@ Heavy imports wait until they are needed, so that the screen is up first.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from brushloop.collect.engine.open_or_resume import Opening
     from brushloop.collect.headless import RunnableEngine
     from brushloop.collect.rig.doctor import Finding
     from brushloop.sessions.show import Details, Summary
@@ -31,12 +31,8 @@ class Paths:
     protocol: Path = Path("protocol.toml")
 
 
-class EngineFor(Protocol):
-    """Makes the engine of a run; see `collect.start.engine_for`."""
-
-    def __call__(self, opening: Opening, *, watched: bool, guided: bool, preview: bool) -> RunnableEngine:
-        """Make an engine that is not started yet. Raises `ConfigError`."""
-        ...
+EngineFor = Callable[..., "RunnableEngine"]
+"""Makes the engine of a run, not yet started; see `collect.start.engine_for`."""
 
 
 class SessionBrowser:
