@@ -83,7 +83,7 @@ def show(
 
     from brushloop.collect.rig.config import load_rig
     from brushloop.collect.rig.picture import check_picture, draw_rig
-    from brushloop.collect.rig.show import rig_json, rig_table
+    from brushloop.collect.rig.places import rig_json, rig_table
 
     if picture is not None:
         check_picture(picture)

@@ -7,6 +7,7 @@ import math
 from collections.abc import AsyncGenerator, Sequence
 from dataclasses import replace
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from brushloop.collect.errors import CannotTeach
@@ -14,7 +15,6 @@ from brushloop.collect.rig.devices import sole_driver
 from brushloop.collect.teach.arm_reader import ArmReader
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Brought, JogStep, JogView, Target, TargetKind, WentBack
-from brushloop.collect.teach.maths.box import hull
 from brushloop.collect.teach.maths.tip import tip_of
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
@@ -146,3 +146,18 @@ def limits_so_far(book: Notebook, flange: Pose, tool: Tool) -> Limits:
     qx, qy, qz, qw = (float(v) for v in turn.as_quat())
     cone_deg = max(lean(Pose(*here_mm, qx, qy, qz, qw))[0] + CONE_ROOM_DEG, LEAST_CONE_DEG)
     return Limits(x_mm, y_mm, (low_mm - BELOW_MM, high_mm), cone_deg, MOST_MM_S, ACC_MM_S2)
+
+
+Point = tuple[float, float, float]
+
+
+def hull(
+    points: Sequence[Point], margin_mm: float
+) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+    """Ranges of x, y and z around these points, widened by the margin in x and y, and upward in z; rounded outward."""
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    return (
+        (math.floor(low[0] - margin_mm), math.ceil(high[0] + margin_mm)),
+        (math.floor(low[1] - margin_mm), math.ceil(high[1] + margin_mm)),
+        (math.floor(10.0 * low[2]) / 10.0, math.ceil(high[2] + margin_mm)),
+    )

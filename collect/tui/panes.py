@@ -16,10 +16,9 @@ from brushloop.collect.engine.control import FINAL
 from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
 from brushloop.collect.headless import eta_text, minutes_text, no_pose_text
 from brushloop.collect.quality.verdict import Check
-from brushloop.collect.tui.force_text import scale_n, spark
 from brushloop.collect.tui.large import limit_sign, number_text
 from brushloop.collect.tui.pictures import Pictures, binary_picture
-from brushloop.collect.tui.text import age_text, bar_text, condition_text, one_line, tip_text
+from brushloop.collect.tui.text import age_text, bar_text, condition_text, one_line, scale_n, spark, tip_text
 from brushloop.collect.tui.widgets import Line, entitle
 from brushloop.sessions.records import Condition
 

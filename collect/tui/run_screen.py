@@ -16,11 +16,10 @@ from textual.screen import Screen
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.headless import no_pose_text
-from brushloop.collect.tui.force_text import plot, plot_title
 from brushloop.collect.tui.keys import RUN_BAR, keys_in
 from brushloop.collect.tui.panes import LEGEND, CapturePane, Grid, figures_content, sheet_content, sheet_title
 from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain
+from brushloop.collect.tui.text import SHORT_STOP, SOFTWARE_STOP, one_line, plain, plot, plot_title
 from brushloop.collect.tui.widgets import NARROW_COLUMNS, KeyBar, Line, entitle
 
 OVER = "Over: q leaves"

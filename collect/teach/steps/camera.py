@@ -5,15 +5,26 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import itertools
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from brushloop.calibrate.board.artefact import lens_file
 from brushloop.calibrate.board.detect import BoardView, find_board
-from brushloop.calibrate.board.intrinsics import GOOD_VIEWS, RMS_LIMIT_PX, Fitted, fit_lens
+from brushloop.calibrate.board.intrinsics import (
+    GOOD_VIEWS,
+    GRID,
+    RMS_LIMIT_PX,
+    Fitted,
+    distinct_views,
+    fit_lens,
+    guidance,
+    held,
+    nominal_normals,
+)
 from brushloop.calibrate.board.spec import BoardSpec, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
@@ -30,8 +41,7 @@ from brushloop.collect.teach.cameras import (
     taught_camera,
 )
 from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.guide import Brought, Target
-from brushloop.collect.teach.maths.coverage import coverage_picture, still_missing
+from brushloop.collect.teach.guide import Brought, Picture, Target
 from brushloop.collect.teach.steps.sheet import board_of
 from brushloop.collect.teach.store import Notebook, StepName
 from brushloop.drivers.errors import DeviceError
@@ -277,3 +287,35 @@ def taken(notebook: Notebook, folder: Path) -> list[str]:
 def digest(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+WIDTH_PX = 320
+SEEN, UNSEEN, CORNER = 90, 40, 255
+
+
+def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:
+    """Instructions for further photographs; empty where the views suffice. At least one view."""
+    distinct, _ = distinct_views(views)
+    normals = nominal_normals(distinct)
+    slants_deg = np.degrees(np.arccos(np.clip(normals[:, 2], -1.0, 1.0))).tolist()
+    return guidance(distinct, slants_deg, int(held(normals).max()) + 1)
+
+
+def coverage_picture(views: Sequence[BoardView]) -> Picture:
+    """A map of the camera's picture: corners seen so far as dots, and parts where none was seen darker."""
+    width, height = views[0].size_px
+    scale = WIDTH_PX / width
+    rows_px = round(height * scale)
+    picture = np.full((rows_px, WIDTH_PX), SEEN, np.uint8)
+    places = np.concatenate([view.pixels for view in views]) * scale
+    columns, rows = GRID
+    for row in range(rows):
+        for column in range(columns):
+            left, right = WIDTH_PX * column // columns, WIDTH_PX * (column + 1) // columns
+            top, bottom = rows_px * row // rows, rows_px * (row + 1) // rows
+            x, y = places[:, 0], places[:, 1]
+            if not ((x >= left) & (x < right) & (y >= top) & (y < bottom)).any():
+                picture[top:bottom, left:right] = UNSEEN
+    for x, y in places.tolist():
+        cv2.circle(picture, (round(x), round(y)), 1, (CORNER,), -1)
+    return picture

@@ -10,7 +10,7 @@ from brushloop.collect.planning.limit_check import ask_reach
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.picture import draw_rig
 from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.maths.box import Point, hull
+from brushloop.collect.teach.jog import Point, hull
 from brushloop.collect.teach.rig_text import rig_of
 from brushloop.collect.teach.steps.places import sheet_corners, sheet_heights, tips
 from brushloop.collect.teach.store import Notebook, StepName, Taught, Value, now_utc

@@ -7,8 +7,18 @@ import time
 from collections.abc import Callable
 
 from brushloop.drivers.errors import ProtocolViolation
-from brushloop.drivers.ink.modbus import WRITE_BYTES, WRITE_REGISTER, exception, read_write, seal, unseal
-from brushloop.drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, STOP
+from brushloop.drivers.ink.pump import (
+    MAX_RPM,
+    RUN_REGISTER,
+    SPEED_REGISTER,
+    STOP,
+    WRITE_BYTES,
+    WRITE_REGISTER,
+    exception,
+    read_write,
+    seal,
+    unseal,
+)
 
 FULL_SPEED = 2
 

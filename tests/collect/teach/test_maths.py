@@ -15,7 +15,7 @@ from brushloop.calibrate.board.register import mixed_up, register
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.teach.maths.box import hull
+from brushloop.collect.teach.jog import hull
 from brushloop.collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
 from brushloop.collect.teach.maths.tip import AxisFit, elsewhere, find_axis, find_tip, tip_of
 from brushloop.drivers.samples import Pose

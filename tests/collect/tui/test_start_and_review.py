@@ -18,10 +18,10 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.dots import Cells
 from brushloop.collect.tui.finish_screen import FinishScreen, run_command, verdict_content
-from brushloop.collect.tui.force_text import plot, plot_title, scale_n, spark
 from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.collect.tui.text import plot, plot_title, scale_n, spark
 from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.terminal import Progress
 from brushloop.sessions.verify import Finding, Verdict

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from brushloop.drivers.arcs.lag import LagMeter
+from brushloop.drivers.arcs.telemetry import LagMeter
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.samples import Pose, PoseSample, Stamp
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera
-from brushloop.drivers.camera.health import Fault, FrameHealth
+from brushloop.drivers.camera.opencv import Fault, FrameHealth
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.samples import Stamp

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 
 from brushloop.drivers.errors import ProtocolViolation
-from brushloop.drivers.ink import modbus
+from brushloop.drivers.ink import pump as modbus
 from brushloop.drivers.ink import station as line
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, bytewise, mutated, noise, pieces, truncated
 

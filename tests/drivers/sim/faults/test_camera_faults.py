@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
-from brushloop.drivers.camera.health import Fault as Judgement
-from brushloop.drivers.camera.health import FrameHealth
+from brushloop.drivers.camera.opencv import Fault as Judgement
+from brushloop.drivers.camera.opencv import FrameHealth
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.samples import Stamp
