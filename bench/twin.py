@@ -15,8 +15,7 @@ from bench.harness import BenchError, Result
 from brushloop.calibrate.compare.ceiling import CEILING
 from brushloop.calibrate.fit.heldout import BEZIER
 from brushloop.sessions.terminal import shown
-from brushloop.twin.run import fit_twin, workers
-from brushloop.twin.score import TWIN
+from brushloop.twin.run import TWIN, fit_twin, workers
 
 REPEATS = 3
 """Presses of each cell: 45 in all."""

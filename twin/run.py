@@ -19,7 +19,6 @@ from brushloop.calibrate.fit.captures import Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import (
     BEZIER,
     HeldOut,
-    Images,
     Scores,
     image_of,
     refit_bezier,
@@ -27,10 +26,8 @@ from brushloop.calibrate.fit.heldout import (
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.config import SoundHead
 from brushloop.sessions.terminal import Progress, unseen
-from brushloop.twin.constants import SHAPE, SPREAD, Constant, Vector, brush_at, offset_at, with_values
-from brushloop.twin.drawing import Cell
-from brushloop.twin.quality import sound_head
-from brushloop.twin.score import TWIN, parts_of, predicted
+from brushloop.twin.constants import SHAPE, SPREAD, Constant, Offset, Vector, brush_at, offset_at, with_values
+from brushloop.twin.drawing import Cell, Images, draw
 from brushloop.twin.shape import (
     COARSE,
     FINE,
@@ -54,6 +51,19 @@ WIDER = 3.5
 than the derivatives at one point say. It was chosen on two brushes of `DEVELOPMENT` in `bench/brushfit_brushes.py`."""
 Keep = Callable[[str, Found], None]
 """Called after each step with its name and the point that the search has reached."""
+PARTS = 3
+TWIN = "twin"
+VOTES = 7
+"""Presses of the twin that are averaged to one prediction."""
+FIRST_SEED = 900
+PRESSES = 3
+"""Presses of each cell."""
+HEAD_SEED = 300
+MARGIN_MM = 0.8
+"""How far the head of a sound mark may lie from where it lay in these presses: the touch point is off by up to 0.5 mm,
+and other presses differ."""
+LEAST_MISPLACED_MM = 1.6
+"""The limit of the quality checks by default: a smaller one is not needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,3 +286,37 @@ def _estimate(constant: Constant, scales: float, error: float) -> Estimate:
     low, high = constant.bounds
     inside = low + 0.01 < scales < high - 0.01
     return Estimate(constant, constant.value(scales), *ends, determined=bool(error < MOST_SD and inside))
+
+
+def parts_of(cells: Sequence[Cell]) -> list[list[int]]:
+    """Numbers of the cells in each part, along the diagonals of the grid of depths and tilts."""
+    heights, tilts = sorted({h for h, _ in cells}), sorted({a for _, a in cells})
+    diagonal = [(heights.index(h) + tilts.index(a)) % PARTS for h, a in cells]
+    parts = [[k for k, at in enumerate(diagonal) if at == part] for part in range(PARTS)]
+    return [part for part in parts if part and len(part) < len(cells)]
+
+
+def predicted(spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid) -> dict[Cell, Images]:
+    """Mean ink of several presses of the twin in each cell."""
+    drawn = draw(spec, offset, cells, grid, VOTES, FIRST_SEED)
+    return dict(zip(cells, drawn.mean(axis=1), strict=True))
+
+
+def sound_head(spec: BrushSpec, cells: Sequence[Cell], grid: Grid) -> SoundHead | None:
+    """The settings of the quality checks with which presses of the twin in these cells pass; None without ink."""
+    drawn = draw(spec, Offset(0.0, 0.0, 0.0), cells, grid, PRESSES, HEAD_SEED)
+    heads_mm = [at for cell in drawn for image in cell if (at := _head_mm(image, grid)) is not None]
+    if not heads_mm:
+        return None
+    middle_mm = 0.5 * (min(heads_mm) + max(heads_mm))
+    reach_mm = max(heads_mm) - middle_mm
+    return SoundHead(round(middle_mm, 1), round(max(reach_mm + MARGIN_MM, LEAST_MISPLACED_MM), 1))
+
+
+def _head_mm(image: Images, grid: Grid) -> float | None:
+    """Where the mark begins along +x: its end near the point of touch, away from its tip."""
+    columns = np.flatnonzero((image > 0.5).any(axis=0))
+    if not columns.size:
+        return None
+    left, right = grid.x_mm[columns[0]] - 0.5 * grid.px_mm, grid.x_mm[columns[-1]] + 0.5 * grid.px_mm
+    return float(-left if abs(left) < abs(right) else right)

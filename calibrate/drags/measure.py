@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.line import Line, fit_line
-from brushloop.calibrate.stroke.components import components, fill_holes
 from brushloop.calibrate.stroke.measure import Measured, measure, outline
 from brushloop.calibrate.stroke.params import Gray, Mask, Params
-from brushloop.calibrate.stroke.preprocess import Prepared, preprocess, touches_edge
+from brushloop.calibrate.stroke.preprocess import Prepared, components, fill_holes, preprocess, touches_edge
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture

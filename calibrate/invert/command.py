@@ -5,6 +5,7 @@ Importing this module loads torch.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from html import escape
@@ -14,8 +15,8 @@ from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.fit.artefact import BrushFit
-from brushloop.calibrate.invert.files import COLUMNS, csv_rows, write_inversion
 from brushloop.calibrate.invert.invert import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
@@ -28,7 +29,15 @@ from brushloop.calibrate.invert.invert import (
 from brushloop.model.fitted import NAMES
 from brushloop.model.fitted_shape import fitted_model
 from brushloop.model.inversion.press import Range
+from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, unseen
+
+PROTOCOL = "protocol-replay.toml"
+MAX_ROWS = 10_000
+COLUMNS = (
+    "stroke_id", "depth_mm", "tilt_deg", "depth_sd_mm", "tilt_sd_deg", "rms", "flags",
+    "commanded_depth_mm", "commanded_tilt_deg", "source",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,3 +142,44 @@ def _settings(request: RecoverRequest) -> Settings:
         raise CalibrationError("--depth-range", f"ends before the fitted brush marks, at {least:.2f} mm")
     within, model = Range((least, within.depth_mm[1]), within.tilt_deg), fitted_model(press)
     return Settings(model.name, model, frozenset(artefact.cells), request.lam, within, request.anchor_sd_mm, view)
+
+
+def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1) -> Path:
+    """Write `out` and the protocol beside it, which presses each stroke `repeats` times in an order drawn with `seed`.
+
+    Returns the protocol's path. Raises `CalibrationError` and OSError.
+    """
+    if not made.rows:
+        why = f": {made.refused[0][0]}: {made.refused[0][1]}" if made.refused else ""
+        raise CalibrationError(str(made.recording), f"no stroke could be recovered{why}")
+    if len(made.rows) * repeats > MAX_ROWS:
+        problem = f"{len(made.rows) * repeats} strokes with repeats, a protocol holds at most {MAX_ROWS}"
+        raise CalibrationError(str(made.recording), problem)
+    if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
+        raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(out, csv_text(COLUMNS, csv_rows(made)))
+    protocol = out.parent / PROTOCOL
+    write_whole(protocol, replay_toml(made, out.name, repeats, seed))
+    return protocol
+
+
+def csv_rows(made: Inversion) -> Iterator[list[str]]:
+    """One row per stroke; depths and tilts to three decimals, deviations to three figures."""
+    for row in made.rows:
+        asked = ["" if v is None else f"{v:g}" for v in (row.commanded_depth_mm, row.commanded_tilt_deg)]
+        numbers = [f"{row.depth_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.depth_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
+        yield [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, str(made.header.source)]
+
+
+def replay_toml(made: Inversion, name: str, repeats: int = 1, seed: int = 1) -> str:
+    """The `replay` protocol for the CSV file `name`."""
+    return (
+        f"# Recovered by {made.settings.model} from {made.header.session_id} ({made.header.source}), "
+        f"recording sha256 {made.recording_sha256}.\n"
+        'kind = "replay"\n'
+        f"of = {json.dumps(made.header.session_id, ensure_ascii=False)}\n"
+        f"file = {json.dumps(name, ensure_ascii=False)}\n"
+        f"repeats = {repeats}\n"
+        f"seed = {seed}\n"
+    )

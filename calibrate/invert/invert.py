@@ -7,18 +7,20 @@ describes the brush.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import Field, Image, covered
 from brushloop.calibrate.compare.images import brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.invert.model_error import NORMAL_95, Cell, model_sd
+from brushloop.calibrate.line import student_95
 from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.model.brush import DomainError
@@ -41,6 +43,13 @@ MOST = 0.8
 BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
+Floats = NDArray[np.float64]
+Cell = tuple[float, float]
+"""Depth in mm and tilt in deg."""
+LEAST_CELLS = 3
+"""With fewer other cells, the model error is unknown."""
+NORMAL_95 = 1.96
+ROUNDS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,3 +274,44 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, flo
             inside = np.abs(off) <= NORMAL_95 * sd
             scatter = float(off.std(ddof=1)) if len(off) > 1 else None
             yield name, float(off.mean()), scatter, float(inside.mean()), len(off)
+
+
+def model_sd(off: Floats, sd: Floats, cells: list[Cell], fitted: Collection[Cell] = ()) -> Floats:
+    """Standard deviation of the model error of N presses, (N,); NaN where too few other cells are known.
+
+    `off` (N,) is recovered - commanded, NaN where no command is known; `sd` (N,) is the standard deviation from the
+    image alone. `fitted` are the cells that the brush was fitted to. The result is enlarged by Student's t with a
+    degree of freedom for each cell, so that 1.96 times it covers 95 % with few cells.
+    """
+    out = np.full(len(off), np.nan)
+    known = np.isfinite(off) & np.isfinite(sd)
+    for cell in set(cells):
+        others = [k for k, other in enumerate(cells) if other != cell and known[k]]
+        unseen = [] if cell in fitted else [k for k in others if cells[k] not in fitted]
+        found = [_spread(off[k], sd[k], len({cells[at] for at in k})) for k in (others, unseen) if k]
+        if len({cells[k] for k in others}) >= LEAST_CELLS:
+            out[[k for k, other in enumerate(cells) if other == cell]] = max(found)
+    return out
+
+
+def common_variance(off: Floats, sd: Floats) -> float:
+    """The variance v for which the mean of off^2 / (sd^2 + v) is 1; 0 where the deviations `sd` alone explain `off`.
+
+    A press that its image hardly determines counts little, however large its deviation.
+    """
+    variance = 0.0
+    square = np.maximum(sd**2, 1e-12)
+    for _ in range(ROUNDS):  # Newton's method, which approaches the root of a convex function from below
+        weight = 1.0 / (square + variance)
+        excess = float(np.mean(off**2 * weight)) - 1.0
+        if excess < 1e-9:
+            break
+        variance += excess / float(np.mean((off * weight) ** 2))
+    return variance
+
+
+def _spread(off: Floats, sd: Floats, cells: int) -> float:
+    """The deviation from presses of so many cells, enlarged; 0 from too few."""
+    if cells < LEAST_CELLS:
+        return 0.0
+    return math.sqrt(common_variance(off, sd)) * student_95(cells) / NORMAL_95

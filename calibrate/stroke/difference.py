@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.components import parts_near
 from brushloop.calibrate.stroke.params import Floats, Gray, Mask, Soft
-from brushloop.calibrate.stroke.preprocess import LIGHT_ROUNDS
+from brushloop.calibrate.stroke.preprocess import LIGHT_ROUNDS, parts_near
 
 DARK_SHARE = 0.6
 """A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""

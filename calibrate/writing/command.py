@@ -14,7 +14,7 @@ from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import Written
 from brushloop.calibrate.writing.compare import compare_written, read_reference
 from brushloop.calibrate.writing.footprint import fit_session, load_footprint
-from brushloop.calibrate.writing.learn import learned
+from brushloop.calibrate.writing.learn import learned, lost_in_words
 from brushloop.calibrate.writing.plan import Settings
 from brushloop.calibrate.writing.plan import plan as planned
 from brushloop.calibrate.writing.plan_files import PICTURE as PLAN_PICTURE
@@ -22,7 +22,6 @@ from brushloop.calibrate.writing.plan_files import write_plan, write_record
 from brushloop.calibrate.writing.plan_record import PlannedBy, load_plan
 from brushloop.calibrate.writing.practice import TILT_DEG, write_practice
 from brushloop.calibrate.writing.report import PICTURE, summary, write_written
-from brushloop.calibrate.writing.rounds import lost_in_words
 from brushloop.model.brush import Brush, DomainError
 from brushloop.model.characters.brush import Reach
 from brushloop.model.characters.plan import Cell

@@ -24,8 +24,8 @@ from brushloop.calibrate.report import (
     write_files,
 )
 from brushloop.calibrate.writing.compare import WritingComparison
-from brushloop.calibrate.writing.picture import code_points
-from brushloop.calibrate.writing.rounds import phase_table, round_of
+from brushloop.calibrate.writing.learn import phase_table, round_of
+from brushloop.calibrate.writing.plan_files import code_points
 from brushloop.calibrate.writing.scores import FILE as NUMBERS
 from brushloop.calibrate.writing.scores import (
     HEADLINE,

@@ -14,7 +14,7 @@ import brushloop.__main__
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.drivers.sim.brush_file import load_brush
 from brushloop.twin.file import notes_path
-from brushloop.twin.score import PARTS
+from brushloop.twin.run import PARTS
 from brushloop.twin.shape import Found, Round
 from tests.photographed import imported_presses
 from tests.twin.serial import Serial
@@ -39,7 +39,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"COARSE": (first,), "FINE": last, "workers": _in_this_process}.items():
         monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
     monkeypatch.setattr("brushloop.twin.shape.INDIVIDUALS", range(2))
-    monkeypatch.setattr("brushloop.twin.score.VOTES", 1)
+    monkeypatch.setattr("brushloop.twin.run.VOTES", 1)
 
 
 def made(session: Path, out: Path) -> str:

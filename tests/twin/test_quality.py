@@ -12,7 +12,7 @@ from bench.brushfit_presses import grid
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush_file import PAPER, load_brush
-from brushloop.twin.quality import LEAST_MISPLACED_MM, sound_head
+from brushloop.twin.run import LEAST_MISPLACED_MM, sound_head
 
 CELLS = [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
 

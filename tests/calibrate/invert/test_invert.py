@@ -12,7 +12,7 @@ import pytest
 
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.invert.files import PROTOCOL, write_inversion
+from brushloop.calibrate.invert.command import PROTOCOL, write_inversion
 from brushloop.calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.presses import ReplayConfig

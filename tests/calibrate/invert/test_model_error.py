@@ -5,8 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brushloop.calibrate.invert.invert import NO_MODEL_ERROR, NOT_INFORMATIVE, Row, covers_most, with_model_error
-from brushloop.calibrate.invert.model_error import common_variance, model_sd
+from brushloop.calibrate.invert.invert import (
+    NO_MODEL_ERROR,
+    NOT_INFORMATIVE,
+    Row,
+    common_variance,
+    covers_most,
+    model_sd,
+    with_model_error,
+)
 
 CELLS = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
 

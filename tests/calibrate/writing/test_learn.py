@@ -11,11 +11,10 @@ import pytest
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.compare import WritingComparison, as_ink
-from brushloop.calibrate.writing.learn import MOST_MM, learned, missed, reach_of
+from brushloop.calibrate.writing.learn import MOST_MM, learned, lost_by_phase, missed, phase_table, reach_of, round_of
 from brushloop.calibrate.writing.plan_files import figure_record
 from brushloop.calibrate.writing.plan_record import PlanRecord, arrays
 from brushloop.calibrate.writing.report import write_written
-from brushloop.calibrate.writing.rounds import lost_by_phase, phase_table, round_of
 from brushloop.calibrate.writing.scores import Character, score_character
 from brushloop.model.characters.ink import swept
 from brushloop.model.characters.lead import covered, drawn, first_lead, lead
