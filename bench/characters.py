@@ -22,11 +22,11 @@ from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.field import SIZE_PX, Alignment, Tone
 from brushloop.calibrate.compare.similarity import Polarity
 from brushloop.calibrate.writing.compare import WritingComparison, as_ink
+from brushloop.calibrate.writing.footprint import PER_FIGURE, practice_strokes
 from brushloop.calibrate.writing.learn import learned, lost_in_words, round_of
 from brushloop.calibrate.writing.plan import Settings, plan
 from brushloop.calibrate.writing.plan_files import record_of
 from brushloop.calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, arrays
-from brushloop.calibrate.writing.practice import PER_FIGURE, practice_strokes
 from brushloop.calibrate.writing.scores import HEADLINE, Character, compare_ink
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.drag import Waypoint

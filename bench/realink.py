@@ -21,9 +21,8 @@ from bench.realink_network import train_and_predict
 from bench.realink_sessions import SESSION_SPLITS, measure_sessions
 from bench.realink_strokes import PX_PER_MM, Strokes, load, region
 from brushloop.calibrate.compare.similarity import binary_scores
-from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, fit_drags
+from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, Residual, captured_distance, fit_drags, threshold
 from brushloop.calibrate.drags.predict import STAMP_ABOVE, STAMP_SPREAD_MM
-from brushloop.calibrate.drags.residual import Residual, captured_distance, threshold
 from brushloop.model.drag import ink as chance
 
 SPLIT_SEED = 0

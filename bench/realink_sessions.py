@@ -20,9 +20,9 @@ from bench.realink_network import train_and_predict
 from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
 from brushloop.calibrate.compare.similarity import binary_scores
 from brushloop.calibrate.drags.captures import Drawn
+from brushloop.calibrate.drags.fit import captured_distance, clipped
 from brushloop.calibrate.drags.predict import BETWEEN_SESSIONS, Predictor, learn
 from brushloop.calibrate.drags.predicted import correction_helps
-from brushloop.calibrate.drags.residual import captured_distance, clipped
 from brushloop.calibrate.drags.run import adapt, different
 
 SESSION_SPLITS = 5

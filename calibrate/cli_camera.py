@@ -140,8 +140,7 @@ def drift(
     lens: LensOption = None,
 ) -> None:
     """Show pix2len at each view of the board in a session, and its trend. Exit code 5 on warnings."""
-    from brushloop.calibrate.board.drift import board_over_session
-    from brushloop.calibrate.board.session import board_of, known_lens
+    from brushloop.calibrate.board.session import board_of, board_over_session, known_lens
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
 

@@ -17,8 +17,7 @@ from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit
 from brushloop.calibrate.drags.captures import COMMANDS, commanded_path
-from brushloop.calibrate.drags.fit import INK_ABOVE
-from brushloop.calibrate.drags.residual import RIDGE, Residual, captured_distance
+from brushloop.calibrate.drags.fit import INK_ABOVE, RIDGE, Residual, captured_distance
 from brushloop.model.drag import DragModel, distances, trails
 
 Floats = NDArray[np.float64]

@@ -10,8 +10,16 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.similarity import binary_scores
 from brushloop.calibrate.drags.artefact import DragArtefact, Kept, Stamps
-from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, DragFit, fit_drags
-from brushloop.calibrate.drags.residual import Residual, captured_distance, clipped, threshold
+from brushloop.calibrate.drags.fit import (
+    INK_ABOVE,
+    SPREAD_MM,
+    DragFit,
+    Residual,
+    captured_distance,
+    clipped,
+    fit_drags,
+    threshold,
+)
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.model.drag import DragModel, distances, ink, trails
 

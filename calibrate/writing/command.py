@@ -13,14 +13,13 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import Written
 from brushloop.calibrate.writing.compare import compare_written, read_reference
-from brushloop.calibrate.writing.footprint import fit_session, load_footprint
+from brushloop.calibrate.writing.footprint import TILT_DEG, fit_session, load_footprint, write_practice
 from brushloop.calibrate.writing.learn import learned, lost_in_words
 from brushloop.calibrate.writing.plan import Settings
 from brushloop.calibrate.writing.plan import plan as planned
 from brushloop.calibrate.writing.plan_files import PICTURE as PLAN_PICTURE
 from brushloop.calibrate.writing.plan_files import write_plan, write_record
 from brushloop.calibrate.writing.plan_record import PlannedBy, load_plan
-from brushloop.calibrate.writing.practice import TILT_DEG, write_practice
 from brushloop.calibrate.writing.report import PICTURE, summary, write_written
 from brushloop.model.brush import Brush, DomainError
 from brushloop.model.characters.brush import Reach

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.field import Image, Tone
-from brushloop.calibrate.drags.residual import captured_distance
+from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.compare import WritingComparison, as_ink
 from brushloop.calibrate.writing.plan_files import as_points, encoded, ways_of

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.drift import drift
+from brushloop.calibrate.board.session import drift
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.board.view import preflight, see_board_and_lens
 from brushloop.calibrate.errors import CalibrationError

@@ -7,9 +7,8 @@ import pytest
 from brushloop.calibrate.artefact import put_to_use
 from brushloop.calibrate.drags import predicted, run
 from brushloop.calibrate.drags.captures import Drawn, commanded_path
-from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, determined, fit_drags
+from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, Residual, determined, fit_drags, threshold
 from brushloop.calibrate.drags.predict import BETWEEN_SESSIONS, Learned, learn, predictors
-from brushloop.calibrate.drags.residual import Residual, threshold
 from brushloop.calibrate.drags.run import different
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.model.drag import DragModel, distances, ink, trails

@@ -11,7 +11,7 @@ from bench import realink, realink_sessions
 from bench.realink import circles, predict, score, split
 from bench.realink_strokes import BIG, DATA, PX_PER_MM, load
 from brushloop.calibrate.drags.captures import commanded_path
-from brushloop.calibrate.drags.residual import captured_distance
+from brushloop.calibrate.drags.fit import captured_distance
 
 real = pytest.mark.skipif(not (DATA / BIG).is_dir(), reason="the folder of real strokes is not here")
 

@@ -10,8 +10,16 @@ import pytest
 from brushloop.calibrate.drags.captures import Drawn
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing import footprint
-from brushloop.calibrate.writing.footprint import FOLDER, FootprintArtefact, fit_session, load_footprint
-from brushloop.calibrate.writing.practice import FIGURES, MARGIN, practice_strokes, write_practice
+from brushloop.calibrate.writing.footprint import (
+    FIGURES,
+    FOLDER,
+    MARGIN,
+    FootprintArtefact,
+    fit_session,
+    load_footprint,
+    practice_strokes,
+    write_practice,
+)
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.model.characters.brush import Reach
