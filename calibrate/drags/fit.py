@@ -3,9 +3,9 @@
 The fit minimises the squared difference between captured ink and the model's probability of ink, with an edge that
 varies by `SPREAD_MM` from stroke to stroke. This gives the best image on average, and so the best cosine similarity.
 Optional columns for each stroke (its place on the page) shift the whole stroke, by the error of the calibration of
-arm against camera there. What the lag misses is learned from the training strokes by kernel ridge regression on clipped
-signed distances. The probability above which a pixel counts as ink is half of the attainable Dice score, which maximises
-that score's expectation; it is estimated by how well each training stroke is predicted from those of other commands.
+arm against camera there. What the lag misses is learned from the training strokes by kernel ridge regression on
+clipped signed distances. The probability above which a pixel counts as ink is half of the attainable Dice score,
+which maximises that score's expectation: it is estimated from how strokes of other commands predict each stroke.
 """
 
 from __future__ import annotations
