@@ -1,0 +1,555 @@
+"""Every damage by name: what verify tells, what repair gives back, and how the session goes on afterwards."""
+
+import errno
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from typer.testing import CliRunner
+
+from brushloop.sessions import mcap_writer
+from brushloop.sessions import repair as repairs
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError, SessionLocked
+from brushloop.sessions.events import StepKind
+from brushloop.sessions.export import export
+from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import HEADER_NOTE
+from brushloop.sessions.repair import repair_session
+from brushloop.sessions.show import Summary, details, summaries
+from brushloop.sessions.store import SessionStore
+from brushloop.sessions.verify import verify_session
+from tests.command import brushloop
+from tests.journal_lines import read_lines
+
+ID, OTHER = "2026-01-02-grid-01", "2026-01-03-grid-01"
+BOTH = ("H13-a05-r00", "H13-a05-r01")
+AGAIN = "capture H13-a05-r00; it is done again when the session goes on"
+
+
+def file_of(folder, key):
+    [line] = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == "done" and line["key"] == key]
+    return folder / line["file"]
+
+
+def cut(path, share):
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+
+def flip(path, at):
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+
+
+def lines_of(folder):
+    return (folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+
+
+def keep_lines(folder, keep):
+    (folder / JOURNAL_NAME).write_bytes(b"".join(keep(lines_of(folder))))
+
+
+def chunks(path):
+    with path.open("rb") as file:
+        return make_reader(file).get_summary().chunk_indexes
+
+
+@pytest.fixture
+def folder(make, store):
+    """An open session of two strokes, released."""
+    make.collect(store)
+    store.release()
+    return store.folder
+
+
+@pytest.fixture
+def closed(make, store):
+    """A closed session of two strokes, released."""
+    make.collect(store)
+    store.close()
+    store.release()
+    return store.folder
+
+
+@pytest.fixture
+def other(make, tmp_path):
+    """A closed session of the same protocol, so that its steps have the same keys; it was stopped earlier."""
+    store = make.store(tmp_path / OTHER, session_id=OTHER)
+    make.collect(store, 1)
+    store.close()
+    store.release()
+    return store.folder
+
+
+@pytest.fixture
+def repair(make):
+    return lambda folder: repair_session(folder, make.clock())
+
+
+@pytest.fixture
+def go_on(make):
+    """Opens the session as the next process would; released at the end."""
+    opened = []
+
+    def go_on(folder):
+        opened.append(SessionStore(folder, None, make.clock()))
+        return opened[-1]
+
+    yield go_on
+    for store in opened:
+        store.release()
+
+
+@dataclass
+class Case:
+    """What is done to a session, part of what verify says, what repair reports as lost, and the strokes that remain."""
+
+    damage: object
+    """Called with the folder and that of another session."""
+    told: str
+    lost: list = field(default_factory=list)
+    strokes: tuple = BOTH
+
+
+def photograph_bit(folder, _):
+    path = file_of(folder, "H13-a05-r00 capture")
+    chunk = chunks(path)[1]
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
+
+
+def end_of_step(kind):
+    """Neither the journal nor the file tells the end of the step."""
+
+    def damage(folder, _):
+        path = file_of(folder, f"H13-a05-r01 {kind}")
+        done = b'"done"', path.name.encode()
+        at = next(n for n, line in enumerate(lines_of(folder)) if all(word in line for word in done))
+        keep_lines(folder, lambda lines: lines[:at])
+        flip(path, path.read_bytes().index(b"brushloop.done") + 40)
+
+    return damage
+
+
+def configuration(folder, _):
+    (folder / "rig.toml").write_text('name = "another"\n')
+    (folder / "protocol.toml").unlink()
+
+
+def steps_of_closed(folder, _):
+    for stroke in BOTH:
+        cut(file_of(folder, f"{stroke} capture"), 0.3)
+    file_of(folder, "board").unlink()
+
+
+def steps_and_merged(folder, _):
+    for path in folder.glob("*-capture-*.mcap"):
+        path.write_bytes(b"")
+    final = folder / f"{ID}.mcap"
+    final.write_bytes(final.read_bytes()[: chunks(final)[-2].chunk_start_offset])
+
+
+def merged_alone(folder, other):
+    for path in folder.glob("0*.mcap"):
+        path.unlink()
+    shutil.copy(other / JOURNAL_NAME, folder)
+
+
+def step_of_another(folder, other):
+    path = next(iter(sorted(folder.glob("*-capture-*.mcap"))))
+    (folder / f"{ID}.mcap").unlink()
+    shutil.copy(other / path.name, path)
+
+
+def all_but_the_recording(folder, _):
+    for path in [folder / JOURNAL_NAME, *folder.glob("0*.mcap*")]:
+        path.unlink()
+    (folder / f"{ID}.mcap").write_bytes((folder / f"{ID}.mcap").read_bytes()[:-40])
+
+
+def stroke_bit(path, _):
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    [stroke] = [number for number, channel in summary.channels.items() if channel.topic == "/stroke"]
+    chunk = next(chunk for chunk in summary.chunk_indexes if stroke in chunk.message_index_offsets)
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
+
+
+FOREIGN = f"is of another session, '{OTHER}'"
+CASES = {
+    "open: a step is cut": Case(
+        lambda f, _: cut(file_of(f, "H13-a05-r00 capture"), 0.3), "(capture H13-a05-r00)", [AGAIN], BOTH[1:]
+    ),
+    "open: a bit of a photograph": Case(photograph_bit, "messages lost: 1 of /camera/still", [AGAIN], BOTH[1:]),
+    "open: a press loses poses": Case(
+        lambda f, _: cut(file_of(f, "H13-a05-r00 press"), 0.3),
+        "(press H13-a05-r00)",
+        ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 1 of /step, 5 of /robot/tcp"],
+    ),
+    "open: the index of a step": Case(
+        lambda f, _: file_of(f, "H13-a05-r00 capture").write_bytes(
+            file_of(f, "H13-a05-r00 capture").read_bytes()[:-40]
+        ),
+        "(capture H13-a05-r00) its index",
+    ),
+    "open: another step's file": Case(
+        lambda f, _: shutil.copy(file_of(f, "H13-a05-r01 capture"), file_of(f, "H13-a05-r00 capture")),
+        "has changed since it was recorded",
+        [AGAIN],
+        BOTH[1:],
+    ),
+    "open: no journal": Case(lambda f, _: (f / JOURNAL_NAME).unlink(), "is missing, though the folder holds"),
+    "open: a journal without its last lines": Case(
+        lambda f, _: keep_lines(f, lambda lines: lines[:5]), "does not mention 0002-press-H13-a05-.mcap"
+    ),
+    "open: a bit of a line": Case(
+        lambda f, _: flip(f / JOURNAL_NAME, (f / JOURNAL_NAME).read_bytes().index(b'"result":{"kind":"press"')),
+        "line 8 does not match its CRC",
+    ),
+    "open: the end of a capture": Case(end_of_step("capture"), "does not match its CRC"),
+    "open: the end of a press": Case(
+        end_of_step("press"),
+        "is finished, but the result of its step cannot be read",
+        ["press H13-a05-r01, whose file is finished, but the result of its step cannot be read"],
+    ),
+    "open: the configuration": Case(configuration, "is missing, or has changed since the session was started"),
+    "open: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
+    "closed: steps": Case(steps_of_closed, "(board) is missing, though the journal says it was finished"),
+    "closed: steps and merged file": Case(steps_and_merged, "its index", ["capture H13-a05-r01"], BOTH[:1]),
+    "closed: no merged file": Case(lambda f, _: (f / f"{ID}.mcap").unlink(), "is missing, though the journal says"),
+    "closed: the merged file of another": Case(
+        lambda f, other: shutil.copy(other / f"{OTHER}.mcap", f / f"{ID}.mcap"), FOREIGN
+    ),
+    "closed: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
+    "closed: the journal of another and no steps": Case(merged_alone, FOREIGN),
+    "closed: a step of another": Case(step_of_another, FOREIGN, ["capture H13-a05-r00"], BOTH[1:]),
+    "closed: a file of another that is not listed": Case(
+        lambda f, other: shutil.copy(next(other.glob("*-capture-*.mcap")), f / "0099-capture-0123abcd.mcap"), FOREIGN
+    ),
+    "renamed: a step": Case(lambda f, _: next(f.glob("*-capture-*.mcap")).unlink(), "is missing, though"),
+    "renamed: the journal": Case(
+        lambda f, _: keep_lines(f, lambda lines: [b"{oops\n", *lines[:-1]]), "line 1 does not match its CRC"
+    ),
+    "renamed: all but the recording": Case(all_but_the_recording, "its index"),
+    "renamed: the recording": Case(lambda f, _: cut(f / f"{ID}.mcap", 0.1), "its index"),
+    "lone: a bit of a stroke": Case(stroke_bit, "the chunk at byte", ["strokes that cannot be read: 1"], BOTH[1:]),
+}
+
+
+@pytest.fixture
+def damaged(request, make, store, tmp_path, monkeypatch):
+    """The session or recording of a case, in small chunks, before the damage."""
+    monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
+    make.collect(store)
+    state = request.param.partition(":")[0]
+    if state != "open":
+        store.close()
+    store.release()
+    if state == "renamed":
+        return shutil.copytree(store.folder, tmp_path / "elsewhere" / "s1")
+    return Path(shutil.copy(store.folder / f"{ID}.mcap", tmp_path)) if state == "lone" else store.folder
+
+
+@pytest.mark.parametrize(("damaged", "case"), CASES.items(), ids=CASES, indirect=["damaged"])
+def test_damage_is_told_and_repaired(make, damaged, case, other, repair, go_on):
+    case.damage(damaged, other)
+    before = make.tree(damaged.parent)
+    found = [f"{finding.file}: {finding.what}" for finding in verify_session(damaged).findings]
+    assert any(case.told in line for line in found), found
+    assert make.tree(damaged.parent) == before, "verify changed something"
+    report = repair(damaged)
+    assert (report.lost, report.lossless) == (case.lost, not case.lost)
+    kept = [data for data in make.tree(damaged.parent).values() if data]
+    assert all(any(data in other for other in kept) for data in before.values() if data), "a damaged file is gone"
+    assert repair(damaged).did == []
+    verdict = verify_session(damaged)
+    assert verdict.sound, verdict.findings
+    final = go_on(damaged).close() if verdict.state == "open" else Recording(damaged).path
+    assert tuple(make.stroke_names(final)) == case.strokes
+
+
+@pytest.mark.parametrize(
+    ("event", "name"),
+    [
+        ("open", "header"),
+        ("begin", "attempt"),
+        ("begin", "kind"),
+        ("done", "file"),
+        ("done", "result"),
+        ("void", "attempt"),
+        ("sheet", "sheet"),
+    ],
+)
+def test_a_line_without_a_field_is_damage_for_every_command(make, folder, repair, go_on, event, name):
+    store = go_on(folder)
+    store.fresh_sheet()
+    store.release()
+    make.rewrite_journal(folder, lambda line: {k: v for k, v in line.items() if line["event"] != event or k != name})
+    message = f"'{name}' of event '{event}' is missing"
+    with pytest.raises(SessionDamaged, match=message):
+        details(folder)
+    assert message in str(verify_session(folder).findings)
+    repair(folder)
+    assert verify_session(folder).sound
+
+
+def test_a_sound_session_is_left_as_it_is(make, store, repair):
+    make.collect(store)
+    opened = verify_session(store.folder)
+    assert (opened.sound, opened.state, opened.files, opened.strokes) == (True, "open", 5, 2)
+    store.close()
+    store.release()
+    closed = verify_session(store.folder)
+    assert (closed.sound, closed.state, closed.files, closed.messages) == (True, "closed", 6, opened.messages)
+    before = make.tree(store.folder)
+    report = repair(store.folder)
+    assert (report.did, report.lost, report.strokes) == ([], [], 2)
+    assert make.tree(store.folder) == before
+
+
+def test_a_damaged_step_is_refused_with_the_way_out(folder, go_on):
+    cut(file_of(folder, "H13-a05-r00 capture"), 0.3)
+    store = go_on(folder)
+    for refused in (store.verify, store.close):
+        with pytest.raises(SessionDamaged, match="has changed") as caught:
+            refused()
+        assert caught.value.exit_code == 6
+        assert caught.value.__notes__[-1] == f"Try `brushloop sessions repair {folder}`."
+
+
+def test_a_journal_without_its_last_lines_is_not_gone_on_with(folder, go_on):
+    keep_lines(folder, lambda lines: lines[:5])
+    with pytest.raises(SessionDamaged, match=r"does not mention 0002-press-H13-a05-\.mcap: lines are missing"):
+        go_on(folder)
+
+
+def test_after_the_repair_the_lost_step_is_done_again(make, folder, repair, go_on):
+    cut(file_of(folder, "H13-a05-r00 capture"), 0.3)
+    repair(folder)
+    store = go_on(folder)
+    assert set(store.state.done) == {"board", "H13-a05-r00 press", "H13-a05-r01 press", "H13-a05-r01 capture"}
+    make.take(store, "H13-a05-r00 capture", [make.still(0), make.stroke(0)], make.captured("H13-a05-r00", 0))
+    assert make.events(folder, "begin")[-1]["attempt"] == 2
+    assert sorted(make.stroke_names(store.close())) == list(BOTH)
+
+
+def test_a_photograph_lost_with_its_sheet_gone_has_the_stroke_pressed_again(make, store, repair, go_on):
+    make.collect(store)
+    store.fresh_sheet()
+    store.release()
+    cut(file_of(store.folder, "H13-a05-r00 capture"), 0.3)
+    repair(store.folder)
+    assert set(go_on(store.folder).state.done) == {"board", "H13-a05-r01 press", "H13-a05-r01 capture"}
+
+
+def test_a_rebuilt_journal_is_the_one_that_was(make, folder, repair, go_on):
+    def lines():
+        return [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] in ("begin", "done")]
+
+    before = lines()
+    (folder / JOURNAL_NAME).unlink()
+    repair(folder)
+    assert sorted(lines(), key=str) == sorted(before, key=str)
+    store = go_on(folder)
+    assert (store.header, store.state.used_patches) == (make.header, {(0, 0), (0, 1), (0, 2)})
+
+
+def test_an_attempt_that_was_done_again_since_is_not_given_back_twice(make, folder, repair, go_on):
+    keep_lines(folder, lambda lines: lines[:-1])
+    store = go_on(folder)
+    make.take(store, "H13-a05-r01 capture", [make.still(1), make.stroke(1)], make.captured("H13-a05-r01", 1))
+    store.release()
+    assert repair(folder).did == []
+    assert tuple(make.stroke_names(go_on(folder).close())) == BOTH
+
+
+def test_where_nobody_knows_which_patch_was_pressed_the_sheet_is_not_used_again(make, folder, repair, go_on):
+    keep_lines(folder, lambda lines: [line for line in lines if b'"file":"0001-press' not in line])
+    cut(folder / "0001-press-H13-a05-.mcap.part", 0.1)
+    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in repair(folder).lost[1]
+    store = go_on(folder)
+    with pytest.raises(SessionError, match="run the same command with --sheet 2"):
+        store.begin("H15-a05", StepKind.PRESS, patch=7)
+    store.fresh_sheet()
+    make.perform(store, "H15-a05", patch=0)
+    store.release()
+    assert verify_session(folder).sound
+
+
+def test_an_import_keeps_every_stroke_whose_photograph_is_whole(make, photos, out, run, repair, monkeypatch):
+    monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
+    asked = {"px_per_mm": "10", "depth_mm": "13", "tilt_deg": "5", "start_x_px": "1", "start_y_px": "1"}
+    make.photographs(photos, *({"file": f"{n}.png"} | asked for n in range(5)))
+    cut(run(), 0.3)
+    report = repair(out)
+    kept = [capture.still_png for capture in Recording(out).captures()]
+    assert 0 < len(kept) < 5
+    assert kept == [make.png(n) for n in range(len(kept))]
+    assert (report.strokes, report.lossless) == (len(kept), False)
+
+
+def test_a_repair_that_was_cut_short_comes_to_the_same_end(make, folder, repair, go_on, monkeypatch):
+    cut(file_of(folder, "H13-a05-r00 press"), 0.3)
+    path = file_of(folder, "H13-a05-r01 capture")
+    path.write_bytes(path.read_bytes()[:-40])
+    with monkeypatch.context() as killed:
+        killed.setattr(repairs, "fsync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            repair(folder)
+    repair(folder)
+    assert verify_session(folder).sound
+    assert tuple(make.stroke_names(go_on(folder).close())) == BOTH
+
+
+def test_a_session_that_another_process_has_is_neither_repaired_nor_closed(make, store, repair):
+    make.collect(store)
+    before = make.tree(store.folder)
+    with pytest.raises(SessionLocked):
+        repair(store.folder)
+    assert isinstance(CliRunner().invoke(app, ["close", str(store.folder)]).exception, SessionLocked)
+    assert make.tree(store.folder) == before
+
+
+def test_a_full_disk_leaves_the_damaged_file_with_its_name(folder, repair, monkeypatch):
+    path = file_of(folder, "H13-a05-r00 capture")
+    path.write_bytes(path.read_bytes()[:-40])
+    data = path.read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr("os.fsync", full)
+        with pytest.raises(DiskFull, match="No space left"):
+            repair(folder)
+    assert path.read_bytes() == data
+    assert repair(folder).lossless
+
+
+def test_a_folder_that_may_not_be_written_is_a_session_error(folder, repair, read_only_disk):
+    cut(file_of(folder, "H13-a05-r00 capture"), 0.3)
+    read_only_disk()
+    with pytest.raises(SessionError, match="Read-only file system"):
+        repair(folder)
+
+
+def test_nothing_to_rebuild_from_is_reported(tmp_path, repair):
+    (tmp_path / JOURNAL_NAME).write_bytes(b"\x00" * 50)
+    with pytest.raises(SessionDamaged, match="no file holds its header"):
+        repair(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "code", "message"),
+    [(None, 0, "nothing was changed"), (40, 0, "nothing was lost"), (6000, 3, "lost: capture H13-a05-r00")],
+)
+def test_the_exit_code_distinguishes_lossless_from_lossy(folder, damage, code, message):
+    path = file_of(folder, "H13-a05-r00 capture")
+    if damage:
+        path.write_bytes(path.read_bytes()[:-damage])
+        ran = CliRunner().invoke(app, ["verify", str(folder)])
+        assert (ran.exit_code, f"damaged: {path.name}: (capture H13-a05-r00) " in ran.output) == (6, True)
+    ran = CliRunner().invoke(app, ["repair", str(folder)])
+    assert (ran.exit_code, message in ran.output) == (code, True), ran.output
+    ran = CliRunner().invoke(app, ["verify", str(folder)])
+    assert (ran.exit_code, f"{ID} (open) is sound: " in ran.output) == (0, True)
+
+
+def test_close_writes_the_merged_file_of_a_session_left_open(make, folder):
+    assert CliRunner().invoke(app, ["close", str(folder)]).exit_code == 0
+    assert tuple(make.stroke_names(folder / f"{ID}.mcap")) == BOTH
+    assert "is closed" in str(CliRunner().invoke(app, ["close", str(folder)]).exception)
+
+
+def test_what_is_wrong_within_a_message_is_damage_though_every_crc_holds(make, store, tmp_path):
+    make.take(store, "a", [make.still(0, b"no image"), make.stroke(0)], make.captured("", 0))
+    [finding] = verify_session(store.folder).findings
+    assert finding.what.endswith("the image 0 on /camera/still is not a complete PNG or JPEG image")
+    [finding] = verify_session(make.record(tmp_path / "a.mcap", make.still(1), make.stroke(2))).findings
+    assert finding.what == "stroke H13-a05-r02 names still 2, which is not there"
+
+
+def test_a_header_with_one_wrong_letter_is_damage(make, tmp_path):
+    path = make.record(tmp_path / "a.mcap", *make.strokes(1))
+    flip(path, path.read_bytes().index(b"goat"))
+    assert "'brushloop.header' does not match its CRC" in str(verify_session(path).findings)
+
+
+def test_a_line_cut_off_by_a_crash_is_a_note_and_no_damage(folder):
+    with (folder / JOURNAL_NAME).open("ab") as file:
+        file.write(b'{"t_ns":17,"ev')
+    verdict = verify_session(folder)
+    assert (verdict.sound, "last line was cut off" in verdict.notes[0]) == (True, True)
+
+
+def test_a_renamed_session_is_sound_and_every_command_finds_its_recording(make, closed, repair, tmp_path):
+    copy = shutil.copytree(closed, tmp_path / "elsewhere" / "s1")
+    before = make.tree(copy)
+    assert verify_session(copy).sound
+    assert repair(copy).did == []
+    assert list(summaries(copy.parent)) == [Summary("s1", "closed", "loopback rig", 2, f"{ID}.mcap")]
+    export(copy, tmp_path / "exported", "png")
+    assert {name: data for name, data in make.tree(copy).items() if name != ".lock"} == {
+        name: data for name, data in before.items() if name != ".lock"
+    }
+    (copy / f"{ID}.mcap").rename(copy / "s1.mcap")
+    assert verify_session(copy).sound
+    assert details(copy).file == "s1.mcap"
+
+
+def test_an_open_session_may_be_renamed(folder, go_on, tmp_path):
+    renamed = folder.rename(tmp_path / "s1")
+    assert (verify_session(renamed).sound, details(renamed).state) == (True, "open")
+    assert go_on(renamed).close() == renamed / "s1.mcap"
+    assert verify_session(renamed).sound
+
+
+LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, lambda: 0)]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
+    store.begin("k", StepKind.PRESS, patch=0).writer.abandon()
+    (part,) = store.folder.glob("*.part")
+    (tmp_path / "empty").mkdir()
+    before = make.tree(tmp_path)
+    for path, message in (
+        (part, f"was never finished, .* Give the session's folder, {store.folder}"),
+        (tmp_path / "empty", r"it holds neither journal\.jsonl nor a recording empty\.mcap"),
+        (tmp_path, rf"is not a session but holds 1 of them: give one, such as {store.folder}"),
+        (tmp_path / "gone", "no such session"),
+    ):
+        with pytest.raises(InputError, match=message) as refused:
+            look(path)
+        assert refused.value.exit_code == 2
+    assert make.tree(tmp_path) == before
+
+
+def test_a_session_that_lost_its_merged_file_is_sent_to_repair(closed):
+    (closed / f"{ID}.mcap").unlink()
+    with pytest.raises(InputError, match=f"has lost its recording .*`brushloop sessions repair {closed}` makes"):
+        Recording(closed)
+
+
+@pytest.mark.parametrize("command", ["verify", "repair"])
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+def test_a_recording_of_another_program_is_no_session_and_not_damaged(tmp_path, command, compression):
+    path = tmp_path / "drive.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start("ros2", "another recorder")
+        schema = writer.register_schema("geometry_msgs/Pose", "ros2msg", b"float64 x")
+        channel = writer.register_channel("/stroke", "cdr", schema)
+        writer.add_message(channel, 1, b"\0\1\0\0", 1)
+        writer.add_metadata("trip", {"car": "blue"})
+        writer.finish()
+    before = path.read_bytes()
+    ran = brushloop("sessions", command, path)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    what = f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}"
+    assert ran.stderr == f"brushloop: {path}: {what}\n"
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])
