@@ -14,7 +14,6 @@ import pytest
 
 import brushloop.__main__
 from brushloop.sessions.events import StepKind
-from brushloop.sessions.store import SessionStore
 from brushloop.sessions.terminal import plain
 from tests.sessions.conftest import Make
 
@@ -22,9 +21,7 @@ HOSTILE = "\x1b]0;owned\x07\x1b]52;c;cm0gLXJm\x07\x1b[2J\x9b31m\u202eltr\r[bold]
 NAME = HOSTILE.replace("/", "")
 """The same, as a file may be called."""
 ACTED_ON = [*map(chr, [*range(9), *range(11, 32), *range(127, 160)]), "\u202e", "\u2028"]
-HEADER = Make.header.model_copy(
-    update=dict.fromkeys(("software", "brush", "lens", "ink", "paper", "robot", "robot_firmware", "licence"), HOSTILE)
-)
+HEADER = dict.fromkeys(("software", "brush", "lens", "ink", "paper", "robot", "robot_firmware", "licence"), HOSTILE)
 
 
 def with_profile(png: bytes) -> bytes:
@@ -40,8 +37,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a session that says such things wherever a text is free: one closed, one open, one damaged."""
     make, folder = Make(), tmp_path_factory.mktemp("foreign")
     for name in ("closed", "open", "damaged"):
-        header = HEADER.model_copy(update={"session_id": name, "protocol": HOSTILE})
-        store = SessionStore.create(folder / name, header, make.snapshots, make.clock())
+        store = make.store(folder / name, **HEADER, session_id=name, protocol=HOSTILE)
         shown = [make.still(0), make.stroke(0, stroke_id=f"key{NAME}")]
         make.take(store, "key", shown, make.captured(f"key{NAME}", 0), 1)
         store.void(store.begin("cut", StepKind.PRESS, patch=2, press=make.press(HOSTILE)), HOSTILE)
@@ -55,8 +51,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "photos").mkdir()
     (folder / "photos" / "profile.png").write_bytes(with_profile(make.png()))
     (folder / "photos" / "table.csv").write_text("file,px_per_mm,start_x_px,start_y_px\nprofile.png,1,0,12\n")
-    header = make.header.model_copy(update={"session_id": "profile"})
-    store = SessionStore.create(folder / "profile", header, make.snapshots, make.clock())
+    store = make.store(folder / "profile", session_id="profile")
     still = make.still(0, with_profile(make.png()))
     make.take(
         store,

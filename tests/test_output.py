@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.sessions.store import SessionStore
 from tests.command import brushloop
 from tests.sessions.conftest import Make
 
@@ -21,11 +20,7 @@ PROCESS = [sys.executable, "-m", "brushloop"]
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a closed session that was written with a brush of Chinese name."""
     make, folder = Make(), tmp_path_factory.mktemp("output")
-    header = make.header.model_copy(update={"session_id": "s", "brush": "羊毫 é"})
-    store = SessionStore.create(folder / "s", header, make.snapshots, make.clock())
-    make.collect(store)
-    store.close()
-    store.release()
+    make.session(folder / "s", closed=True, session_id="s", brush="羊毫 é")
     return folder
 
 

@@ -23,6 +23,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, encode_line
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
+from brushloop.sessions.repair import Report, repair_session
 from brushloop.sessions.store import SessionStore
 from tests.journal_lines import read_lines
 
@@ -122,6 +123,15 @@ class Make:
             attempt.writer.write(message)
         store.done(attempt, result)
 
+    def session(self, folder: Path, strokes: int = 2, *, closed: bool = False, **fields: Any) -> Path:
+        """The folder of a session that was collected and that no process has."""
+        store = self.store(folder, **fields)
+        self.collect(store, strokes)
+        if closed:
+            store.close()
+        store.release()
+        return folder
+
     def messages(self, path: Path) -> Counter[tuple[str, int, int, int, bytes]]:
         """Every message, as any MCAP reader finds it, CRCs checked."""
         with path.open("rb") as file:
@@ -172,6 +182,40 @@ def store(make: Make, tmp_path: Path) -> Iterator[SessionStore]:
     made = make.store(tmp_path / make.header.session_id)
     yield made
     made.release()
+
+
+@pytest.fixture
+def opened(make: Make, tmp_path: Path) -> Path:
+    """The folder of an open session of two strokes."""
+    return make.session(tmp_path / make.header.session_id)
+
+
+@pytest.fixture
+def closed(make: Make, tmp_path: Path) -> Path:
+    """The folder of a closed session of two strokes."""
+    return make.session(tmp_path / make.header.session_id, closed=True)
+
+
+@pytest.fixture
+def resume(make: Make) -> Iterator[Callable[[SessionStore | Path], SessionStore]]:
+    """Opens a session as the next process would, after the one that has it."""
+    stores: list[SessionStore] = []
+
+    def resume(session: SessionStore | Path) -> SessionStore:
+        if isinstance(session, SessionStore):
+            session.release()
+            session = session.folder
+        stores.append(SessionStore(session, None, make.clock()))
+        return stores[-1]
+
+    yield resume
+    for store in stores:
+        store.release()
+
+
+@pytest.fixture
+def repair(make: Make) -> Callable[[Path], Report]:
+    return lambda path: repair_session(path, make.clock())
 
 
 PRESSES = ImportOptions(kind="press", licence="CC0-1.0", origin="a museum", brush="wolf")

@@ -1,4 +1,4 @@
-"""Show: what is in a session, for people and as JSON."""
+"""Show and list: what is in a session and which sessions there are, for people and as JSON."""
 
 import json
 
@@ -6,21 +6,21 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.sessions.cli import app
-from brushloop.sessions.errors import InputError
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import mark_bad_or_good
-from brushloop.sessions.show import GridCell, details, ranges
-from brushloop.sessions.store import SessionStore
+from brushloop.sessions.show import GridCell, Summary, details, ranges, summaries
+from brushloop.sessions.terminal import counted, lines_of, shown
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
 
 
 @pytest.fixture
 def store(make, tmp_path):
-    header = make.header.model_copy(update={"protocol": PROTOCOL, "robot": "aubo_i5", "robot_firmware": "24"})
-    made = SessionStore.create(tmp_path / header.session_id, header, make.snapshots, make.clock())
-    yield made
-    made.release()
+    """An open session that knows what was planned."""
+    store = make.store(tmp_path / make.header.session_id, protocol=PROTOCOL, robot="aubo_i5", robot_firmware="24")
+    yield store
+    store.release()
 
 
 def press(make, store, stroke_id, depth_mm, patch):
@@ -91,6 +91,72 @@ def test_the_command_prints_it_and_json_holds_all_of_it(collected):
     assert as_json["sheets"] == {"1": [0, 1, 2], "2": [0]}
 
 
-def test_what_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no such session"):
-        details(tmp_path / "gone")
+@pytest.fixture
+def root(make, tmp_path, out, photos, run):
+    """`sessions/` with one session of every state, and two folders that are none."""
+    root = out.parent
+    make.photographs(
+        photos,
+        {"file": "a.png", "px_per_mm": "10", "depth_mm": "13", "tilt_deg": "5"}
+        | {"start_x_px": "1", "start_y_px": "1"},
+    )
+    run()
+    for name, strokes in (("2026-01-02-grid-01", 3), ("2026-01-02-grid-02", 1)):
+        store = make.store(root / name)
+        for number in range(strokes):
+            make.perform(store, f"stroke {number}")
+        if strokes == 3:
+            store.close()
+        store.release()
+    (root / "notes").mkdir()
+    (root / "readme.txt").write_text("no session")
+    return root
+
+
+def test_every_session_is_reported_in_one_line(root):
+    assert list(summaries(root)) == [
+        Summary("2026-01-02-grid-01", "closed", "loopback rig", 3, "2026-01-02-grid-01.mcap"),
+        Summary("2026-01-02-grid-02", "open", "", 1, ""),
+        Summary("from-elsewhere", "imported", "imported photographs", 1, "from-elsewhere.mcap"),
+    ]
+
+
+def test_a_damaged_session_hides_no_other(root):
+    merged = root / "2026-01-02-grid-01" / "2026-01-02-grid-01.mcap"
+    merged.write_bytes(merged.read_bytes()[:-9])
+    journal = root / "2026-01-02-grid-02" / JOURNAL_NAME
+    journal.write_text("{oops\n" + journal.read_text())
+    assert [(row.session_id, row.state, row.file) for row in summaries(root)] == [
+        ("2026-01-02-grid-01", "damaged", merged.name),
+        ("2026-01-02-grid-02", "damaged", JOURNAL_NAME),
+        ("from-elsewhere", "imported", "from-elsewhere.mcap"),
+    ]
+
+
+def test_a_session_that_crashed_before_closed_is_open_though_its_file_is_there(root):
+    journal = root / "2026-01-02-grid-01" / JOURNAL_NAME
+    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:-1]))
+    assert next(summaries(root)) == Summary("2026-01-02-grid-01", "open", "", 3, "")
+
+
+def test_the_command_lists_them(root):
+    ran = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["list", str(root)])
+    assert ran.exit_code == 0
+    for word in ("2026-01-02-grid-01", "closed", "open", "imported photographs", "from-elsewhere.mcap"):
+        assert word in ran.output
+
+
+def test_long_work_prints_a_line_now_and_then(capsys):
+    now_s = 0.0
+    update = lines_of(lambda: now_s)
+    for done in range(41):
+        now_s = 0.5 * done
+        update("captures", done, 40)
+    printed = capsys.readouterr().err.splitlines()
+    assert printed == [f"captures: {done} of 40" for done in (10, 20, 30, 40)]
+
+
+def test_work_that_ends_soon_says_nothing(capsys):
+    with shown() as progress:
+        assert list(counted("abc", "letters", 3, progress)) == ["a", "b", "c"]
+    assert capsys.readouterr().err == ""

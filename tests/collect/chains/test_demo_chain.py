@@ -24,7 +24,6 @@ from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import CollectRequest
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
-from brushloop.sessions.store import SessionStore
 from tests.sessions.conftest import Make
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
@@ -41,19 +40,10 @@ class Chain:
     def collected(self, _say: object, request: CollectRequest) -> int:
         self.ran.append("collect")
         rig = load_rig(request.config)
-        header = Make.header.model_copy(
-            update={
-                "brush": rig.brush.name,
-                "ink": rig.ink.name,
-                "paper": rig.paper.name,
-                "session_id": f"grid-{1 + len(list(request.out.glob('*')))}",
-                "protocol": load_protocol(request.protocol).model_dump_json(),
-            }
-        )
-        store = SessionStore.create(request.out / header.session_id, header, Make.snapshots, Make().clock())
-        Make().collect(store)
-        store.close()
-        store.release()
+        session_id = f"grid-{1 + len(list(request.out.glob('*')))}"
+        known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
+        protocol = load_protocol(request.protocol).model_dump_json()
+        Make().session(request.out / session_id, closed=True, session_id=session_id, protocol=protocol, **known)
         return self.collect_code
 
     def validated(self, request: Request, _progress: object) -> ValidationOutput:
@@ -185,8 +175,7 @@ def test_the_command_passes_on_what_was_asked_for(monkeypatch: pytest.MonkeyPatc
 def test_the_sheet_is_not_changed_under_a_session_that_has_begun(chain: Chain, tmp_path: Path) -> None:
     def killed(request: LoopRequest, _say: object) -> None:
         chain.ran.append("loop is killed")
-        header = Make.header.model_copy(update={"session_id": "replay-1"})
-        SessionStore.create(tmp_path / "sessions" / "replay-1", header, Make.snapshots, Make().clock()).release()
+        Make().store(tmp_path / "sessions" / "replay-1", session_id="replay-1").release()
         raise CollectAborted("the power failed")
 
     with pytest.MonkeyPatch.context() as patched:

@@ -14,7 +14,6 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
-from brushloop.sessions.store import SessionStore
 from tests.sessions.conftest import Make
 
 SETTINGS = Settings(
@@ -68,11 +67,7 @@ def test_a_session_of_another_ink_is_not_the_one_that_a_chain_asks_for(tmp_path:
         rig = load_rig(rigs[ink])
         known = {"brush": rig.brush.name, "ink": rig.ink.name, "paper": rig.paper.name}
         asked = {"session_id": f"grid-{number}", "protocol": load_protocol(protocol).model_dump_json()}
-        header = Make.header.model_copy(update=known | asked)
-        store = SessionStore.create(root / header.session_id, header, Make.snapshots, Make().clock())
-        Make().collect(store)
-        store.close()
-        store.release()
+        Make().session(root / f"grid-{number}", closed=True, **known, **asked)
     assert finished_session(root, rigs["sumi"], protocol) == root / "grid-1"
     assert finished_session(root, rigs["walnut"], protocol) == root / "grid-2"
     assert finished_session(root, rigs["red"], protocol) is None
