@@ -121,7 +121,6 @@ def export(
     crops: Annotated[
         bool, typer.Option("--crops", help="Rectified crops at 20 px/mm with masks, instead of photographs.")
     ] = False,
-    frames: Annotated[bool, typer.Option("--frames", help="With --crops: the whole photographs as well.")] = False,
     calibration: Annotated[
         Path | None, typer.Option(help="With --crops: the calibration; the one in use by default.")
     ] = None,
@@ -134,8 +133,8 @@ def export(
     from brushloop.sessions.export import export as write
     from brushloop.sessions.terminal import shown
 
-    if not crops and (frames or calibration is not None):
-        raise CalibrationError("--frames" if frames else "--calibration", "needs --crops")
+    if not crops and calibration is not None:
+        raise CalibrationError("--calibration", "needs --crops")
 
     def make_cropper(recording: Recording) -> Cropper:
         from brushloop.calibrate.crops import cropper_of
@@ -143,7 +142,7 @@ def export(
         return cropper_of(recording, calibration)
 
     with shown() as progress:
-        left_out = write(session, out, kind, progress, make_cropper if crops else None, frames=frames)
+        left_out = write(session, out, kind, progress, make_cropper if crops else None)
     say(f"Exported into {out}")
     for stroke_id, reason in left_out:
         say(f"left out: {stroke_id}: {reason}", err=True)

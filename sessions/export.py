@@ -4,9 +4,9 @@ Every export is a folder, written under a temporary name and renamed when comple
 written to. The images are the photographs as they were recorded, byte for byte, or crops and masks by a cropper, one at
 a time; the tables are held in memory. `header.json` says where everything comes from.
 
-`png`      images/, with a cropper masks/ and, if asked, frames/; strokes.csv, poses.csv, forces.csv
+`png`      images/, with a cropper masks/; strokes.csv, poses.csv, forces.csv
 `npz`      strokes.npz, which loads without pickle: an array per column of the table of strokes, (n,), NaN where a value
-           is missing; image_0000, ... (h, w) uint8 gray, also mask_0000 and frame_0000; pose_<column> (m,),
+           is missing; image_0000, ... (h, w) uint8 gray, also mask_0000; pose_<column> (m,),
            pose_position_mm (m, 3), pose_quaternion (m, 4); with a force sensor force_<column> (k,), force_wrench (k, 6)
 `parquet`  what Hugging Face `datasets` loads: a data set card, and the tables strokes/, poses/, forces/ with columns
            named as LeRobot names them; an image is a struct {bytes, path}. `timestamp` is the measured time in seconds
@@ -51,8 +51,8 @@ FILE = "train-00000-of-00001.parquet"
 LICENCE_ID = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
 """What a card may give as `license`; any other text is given as `license_name`."""
 TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
-CROP_TEXT_COLUMNS = ("mask_file", "flags", "frame_file")
-"""Texts of a stroke that only exports of crops have, the last only with whole frames."""
+CROP_TEXT_COLUMNS = ("mask_file", "flags")
+"""Texts of a stroke that only exports of crops have."""
 PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 """Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
@@ -121,9 +121,7 @@ Cropper = Callable[[Capture], Crop | str]
 class Export:
     """The rows from which every format is written: strokes with their pictures, poses, and forces."""
 
-    def __init__(
-        self, recording: Recording, progress: Progress = unseen, cropper: Cropper | None = None, frames: bool = False
-    ) -> None:
+    def __init__(self, recording: Recording, progress: Progress = unseen, cropper: Cropper | None = None) -> None:
         """Raises `SessionDamaged` where a stroke appears twice."""
         self.recording = recording
         self._progress = progress
@@ -138,9 +136,9 @@ class Export:
         """`passed`, or `failed: ...`, by the name of each stroke that was judged."""
         self.left_out: list[tuple[str, str]] = []
         """(stroke, reason) of those that could not be cropped; filled while the captures are read."""
-        self.pictures = ("image",) if cropper is None else ("image", "mask", "frame") if frames else ("image", "mask")
+        self.pictures = ("image",) if cropper is None else ("image", "mask")
         """Names of the pictures that each stroke has."""
-        self.text_columns = TEXT_COLUMNS if cropper is None else TEXT_COLUMNS + CROP_TEXT_COLUMNS[: len(self.pictures)]
+        self.text_columns = TEXT_COLUMNS if cropper is None else TEXT_COLUMNS + CROP_TEXT_COLUMNS
         self.series = (POSES, FORCES) if recording.counts.get(Topic.WRENCH, 0) else (POSES,)
 
     def captures(self) -> Iterator[tuple[Row, dict[str, bytes]]]:
@@ -156,10 +154,10 @@ class Export:
                     continue
                 scale = (crop.px_per_mm, crop.px_per_mm)
                 row |= {**_pair("anchor", "px", crop.anchor_px), **_pair("px_per_mm", "", scale), "flags": crop.flags}
-                pictures = {"image": crop.image_png, "mask": crop.mask_png, "frame": capture.still_png}
-            for name in self.pictures:
-                row[file_column(name)] = _file_name(index, capture.stroke.stroke_id, name, pictures[name])
-            yield row, {name: pictures[name] for name in self.pictures}
+                pictures = {"image": crop.image_png, "mask": crop.mask_png}
+            for name, data in pictures.items():
+                row[file_column(name)] = _file_name(index, capture.stroke.stroke_id, name, data)
+            yield row, pictures
 
     def row(self, index: int, stroke: Stroke) -> Row:
         """Every value of a stroke that does not need its photograph."""
@@ -242,15 +240,12 @@ def export(
     kind: str,
     progress: Progress = unseen,
     make_cropper: Callable[[Recording], Cropper] | None = None,
-    *,
-    frames: bool = False,
 ) -> list[tuple[str, str]]:
     """Export a session into the new or empty folder `out` as `png`, `npz` or `parquet`.
 
-    With `make_cropper`, every photograph is replaced by a crop and its mask; `frames` keeps the whole photograph as
-    well. Returns (stroke, reason) of the strokes that could not be cropped. Raises `InputError` for an unknown format,
-    a folder that is not empty, or a session of which no stroke can be cropped, `SessionDamaged` for a recording that
-    cannot be read; nothing is left behind then.
+    With `make_cropper`, every photograph is replaced by a crop and its mask. Returns (stroke, reason) of the strokes
+    that could not be cropped. Raises `InputError` for an unknown format, a folder that is not empty, or a session of
+    which no stroke can be cropped, `SessionDamaged` for a recording that cannot be read; nothing is left behind then.
     """
     writers = {"png": write_png, "npz": write_npz, "parquet": write_parquet}
     if (write := writers.get(kind)) is None:
@@ -263,7 +258,7 @@ def export(
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         check_room(out.parent, recording.path.stat().st_size)
-        exported = Export(recording, progress, None if make_cropper is None else make_cropper(recording), frames)
+        exported = Export(recording, progress, None if make_cropper is None else make_cropper(recording))
         with staged_folder(out) as stage:
             write(exported, stage)
             origin = {"file": recording.path.name, "sha256": recording.sha256}

@@ -49,13 +49,13 @@ def session(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory
 
 @pytest.fixture(scope="module")
 def exported(session: Path) -> Path:
-    """The session calibrated and exported as PNG, with whole frames."""
+    """The session calibrated and exported as PNG."""
     refused = run("sessions", "export", session, session.parent / "early", "--crops")
     assert f"is not calibrated: run `brushloop calibrate {session}`" in str(refused.exception)
     assert not (session.parent / "early").exists()
     calibrate_session(session)
     out = session.parent / "exported"
-    ran = run("sessions", "export", session, out, "--crops", "--frames")
+    ran = run("sessions", "export", session, out, "--crops")
     assert ran.exit_code == 0, ran.output
     return out
 
@@ -77,11 +77,6 @@ def test_crops_and_masks_lie_over_the_true_marks(exported: Path, shot: Shot) -> 
         truth = true_mask(shot, Field().window_mm(anchor), 20.0)
         assert ((mask > 0) & truth).sum() / ((mask > 0) | truth).sum() >= 0.9
         assert crop[mask > 0].mean() < 0.5 * crop[mask == 0].mean()
-
-
-def test_the_whole_frame_is_the_photograph_as_it_was_taken(exported: Path, shot: Shot) -> None:
-    frame = cv2.imread(str(exported / rows_of(exported)[1]["frame_file"]), cv2.IMREAD_GRAYSCALE)
-    np.testing.assert_array_equal(frame, shot.image)
 
 
 @pytest.mark.soak  # importing `datasets` takes longer than everything else here
@@ -135,8 +130,8 @@ def test_a_session_without_any_crop_and_options_without_crops_are_refused(tmp_pa
     session = imported(tmp_path, False)
     ran = run("sessions", "export", session, tmp_path / "o", "--crops")
     assert "holds no stroke that can be cropped: 0 is blank" in str(ran.exception)
-    ran = run("sessions", "export", session, tmp_path / "o", "--frames")
-    assert str(ran.exception) == "--frames: needs --crops"
+    ran = run("sessions", "export", session, tmp_path / "o", "--calibration", "x.json")
+    assert str(ran.exception) == "--calibration: needs --crops"
     assert not (tmp_path / "o").exists()
 
 
