@@ -73,15 +73,6 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(whole, path):
     assert refused > FLIPS / 2
 
 
-def test_bytes_of_garbage_are_refused_and_never_another_error(whole, path):
-    chosen = random.Random(7)
-    for _ in range(100):
-        data, at = bytearray(whole), chosen.randrange(8, len(whole))
-        data[at : at + 8] = chosen.choice([b"\xff" * 8, bytes(8), chosen.randbytes(8)])
-        path.write_bytes(data)
-        refusal(path)
-
-
 def with_chunk(whole, **changes):
     """The same file, its first chunk's fields changed in place; lengths stay."""
     index = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes[0]
@@ -112,14 +103,3 @@ def test_a_chunk_compressed_in_a_way_that_cannot_be_bounded_is_refused(whole, pa
     path.write_bytes(with_chunk(whole, compression="lz4!"))
     with pytest.raises(SessionDamaged, match="allowed: zstd or none"):
         list(Recording(path).captures())
-
-
-def test_a_file_that_may_not_be_read_is_refused(whole, path, monkeypatch):
-    path.write_bytes(whole)
-
-    def refuse(*_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("pathlib.Path.open", refuse)
-    with pytest.raises(InputError, match="cannot open: Permission denied"):
-        Recording(path)

@@ -1,6 +1,7 @@
-"""Exports: what other tools read back is what was recorded, and a folder is whole or not there."""
+"""Exports: what other tools read back is what was recorded, formulas are text, and a folder is whole or not there."""
 
 import csv
+import io
 import json
 import sys
 
@@ -9,22 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
+from brushloop.sessions.disk import as_cell, as_text, csv_text, number
 from brushloop.sessions.errors import InputError, SessionError
-from brushloop.sessions.events import PressResult
+from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.export import export
+from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import decode_gray
-from brushloop.sessions.recording import Recording
+from brushloop.sessions.recording import Recording, unlike, waits_of
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
-
-
-@pytest.fixture
-def session(make, store):
-    """A closed session of two strokes, five poses each."""
-    make.collect(store)
-    store.close()
-    store.release()
-    return store.folder
 
 
 @pytest.fixture
@@ -64,18 +58,18 @@ def rows_of(table):
         return list(csv.DictReader(file))
 
 
-def test_png_and_csv_hold_the_photographs_byte_for_byte(make, session, to):
+def test_png_and_csv_hold_the_photographs_byte_for_byte(make, closed, to):
     to.mkdir()  # an empty folder is used
-    export(session, to, "png")
+    export(closed, to, "png")
     strokes = rows_of(to / "strokes.csv")
     assert [row["stroke_id"] for row in strokes] == ["H13-a05-r00", "H13-a05-r01"]
     assert [(to / row["file"]).read_bytes() for row in strokes] == [make.png(0), make.png(1)]
     assert {row["source"] for row in strokes} == {"loopback rig"}
-    assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(session).sha256
+    assert json.loads((to / "header.json").read_text())["exported_from"]["sha256"] == Recording(closed).sha256
 
 
-def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, session, to):
-    export(session, to, "png")
+def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, closed, to):
+    export(closed, to, "png")
     poses = rows_of(to / "poses.csv")
     frames = [(row["episode_index"], row["frame_index"]) for row in poses]
     assert frames == [(str(episode), str(frame)) for episode in range(2) for frame in range(5)]
@@ -106,8 +100,8 @@ def test_force_and_quality_are_exported_with_each_stroke(felt, to):
     assert (stroke["quality"], stroke["marked_bad"]) == ("failed: dry", "")
 
 
-def test_npz_loads_without_pickle(make, session, felt, to):
-    export(session, to, "npz")
+def test_npz_loads_without_pickle(make, closed, felt, to):
+    export(closed, to, "npz")
     with np.load(to / "strokes.npz", allow_pickle=False) as arrays:
         assert arrays["stroke_id"].tolist() == ["H13-a05-r00", "H13-a05-r01"]
         np.testing.assert_array_equal(arrays["image_0001"], decode_gray(make.png(1), "made"))
@@ -126,9 +120,9 @@ def test_equal_recordings_make_equal_arrays(few, tmp_path):
     assert (tmp_path / "out" / "strokes.npz").read_bytes() == (tmp_path / "again" / "strokes.npz").read_bytes()
 
 
-def test_parquet_is_what_datasets_reads(make, session, to):
+def test_parquet_is_what_datasets_reads(make, closed, to):
     parquet = pytest.importorskip("pyarrow.parquet")
-    export(session, to, "parquet")
+    export(closed, to, "parquet")
     table = parquet.read_table(to / "strokes" / "train-00000-of-00001.parquet")
     assert [image["bytes"] for image in table["image"].to_pylist()] == [make.png(0), make.png(1)]
     features = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
@@ -161,10 +155,10 @@ def test_hugging_face_datasets_loads_strokes_poses_and_forces(make, felt, to):
     assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
 
 
-def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(session, to, monkeypatch):
+def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(closed, to, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match="parquet needs pyarrow: pip install pyarrow"):
-        export(session, to, "parquet")
+        export(closed, to, "parquet")
     assert list(to.parent.glob("*exported*")) == []
 
 
@@ -186,11 +180,11 @@ def test_a_damaged_photograph_leaves_nothing(make, tmp_path, to):
     assert list(tmp_path.glob("*exported*")) == []
 
 
-def test_a_folder_that_holds_anything_is_left_as_it_is(session, to):
+def test_a_folder_that_holds_anything_is_left_as_it_is(closed, to):
     to.mkdir()
     (to / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="not an empty folder"):
-        export(session, to, "png")
+        export(closed, to, "png")
     assert [path.name for path in to.iterdir()] == ["notes.txt"]
 
 
@@ -202,11 +196,83 @@ def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
     assert names == ["0000-______etc_x.png", "0001-a_b.png", "0002-a_b.png", f"0003-{'_' * 80}.png"]
 
 
-def test_an_unknown_format_is_refused(session, to):
-    with pytest.raises(InputError, match="'zarr', allowed: png, npz, parquet"):
-        export(session, to, "zarr")
-
-
-def test_the_command(session, to):
-    ran = CliRunner().invoke(app, ["sessions", "export", str(session), str(to), "--format", "npz"])
+def test_the_command(closed, to):
+    ran = CliRunner().invoke(app, ["sessions", "export", str(closed), str(to), "--format", "npz"])
     assert (ran.exit_code, ran.output) == (0, f"Exported into {to}\n")
+
+
+def test_a_wait_belongs_to_the_take_that_the_photograph_shows(make, store):
+    for still, wait_s in ((3, 1.1), (6, 7.0), (9, None)):
+        captured = CaptureResult(press=make.press("a", dip_to_touch_s=wait_s), still=still)
+        store.done(store.begin(f"k{still}", StepKind.CAPTURE), captured)
+    assert waits_of(store.state) == {3: 1.1, 6: 7.0}
+
+
+def test_the_first_press_of_a_session_that_looked_after_its_dip_is_named():
+    waits = {"first": 10.2, "second": 1.1, "third": 1.2, "fourth": 1.0}
+    assert unlike(waits) == {"first": "touched the paper 10.2 s after its dip, the others after 1.1 s"}
+
+
+@pytest.mark.parametrize(
+    ("waits", "far"),
+    [
+        ([1.0, 1.1, 9.0], []),  # three cannot tell which of them is the odd one
+        ([1.0, 1.1, 1.2, 3.1], []),  # less than two seconds
+        ([1.0, 1.1, 1.2, 3.2], [3]),
+        ([4.0, 8.0, 12.0, 16.0, 20.0], []),  # a session whose waits spread widely anyhow
+        ([20.0, 20.1, 20.0, 5.0, 20.2], [3]),  # too early counts as well
+        ([], []),
+    ],
+)
+def test_far_is_two_seconds_and_three_median_deviations(waits: list[float], far: list[int]):
+    assert list(unlike(dict(enumerate(waits)))) == far
+
+
+def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp_path):
+    fields = [{"dip_to_touch_s": wait} for wait in (1.0, 1.1, 10.0, 1.2)] + [{}]
+    messages = [message for n, one in enumerate(fields) for message in (make.still(n), make.stroke(n, **one))]
+    export(make.record(tmp_path / "a.mcap", *messages), tmp_path / "out", "png")
+    with (tmp_path / "out" / "strokes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["dip_to_touch_s"] for row in rows] == ["1.0", "1.1", "10.0", "1.2", ""]
+    assert [row["dip_to_touch_unlike"] for row in rows] == ["0.0", "0.0", "1.0", "0.0", ""]
+
+
+FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1", "''=1", "＝1"]
+
+
+@pytest.mark.parametrize("text", FORMULAS)
+def test_a_formula_is_written_as_text_and_read_as_it_was(text):
+    cell, other = next(csv.reader(io.StringIO(csv_text([text, "plain"], [], "\r\n"), newline="")))
+    assert cell == f"'{text}"
+    assert (as_text(cell), other) == (text, "plain")
+
+
+@pytest.mark.parametrize("value", [-1.5, 3, None, "-0.5", "+1e3", "", "H13-a05", "it's", "'quoted'", "字"])
+def test_numbers_stay_numbers_and_other_text_stays_itself(value):
+    assert as_cell(value) == value
+
+
+def test_names_go_out_and_in_again_by_our_own_importer(make, tmp_path, photos, run):
+    names = ["=1+1", "@home", "-2-3", "-5", "'=x", "a"]
+    rows = [{"file": f"{k}.png", "name": str(as_cell(name)), "px_per_mm": "5"} for k, name in enumerate(names)]
+    make.photographs(photos, *rows)
+    recorded = run(ImportOptions())
+    assert [stroke.stroke_id for stroke in Recording(recorded).stroke_records()] == names
+
+    export(recorded, tmp_path / "exported", "png")
+    with (tmp_path / "exported" / "strokes.csv").open(newline="", encoding="utf-8") as file:
+        cells = [row["stroke_id"] for row in csv.DictReader(file)]
+    assert cells == ["'=1+1", "'@home", "'-2-3", "-5", "''=x", "a"]
+    assert [as_text(cell) for cell in cells] == names
+
+
+@pytest.mark.parametrize(("text", "value"), [("10", 10.0), (" -.5 ", -0.5), ("+1.e3", 1000.0), ("2.5E-1", 0.25)])
+def test_a_number_is_read_as_it_is_written(text: str, value: float) -> None:
+    assert number(text) == value
+
+
+@pytest.mark.parametrize("text", ["1_0", "1e1_0", "nan", "-inf", "1e999", "", "0x10", "1,5", "1 0", "１０"])
+def test_what_nobody_writes_as_a_number_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a finite number"):
+        number(text)

@@ -38,13 +38,6 @@ def test_every_stroke_comes_with_the_still_that_shows_it(make, path):
     assert Recording(path).strokes() == 3
 
 
-def test_an_image_that_cannot_be_decoded_names_its_stroke(make, path):
-    make.record(path, make.still(0, b"no image"), make.stroke(0))
-    [capture] = Recording(path).captures()
-    with pytest.raises(SessionDamaged, match="stroke H13-a05-r00"):
-        capture.image()
-
-
 def test_captures_are_lazy_so_that_a_session_need_not_fit_in_memory(make, path):
     make.record(path, *make.strokes(20), make.stroke(1, stroke_id="names a still long gone", still=3))
     captures = Recording(path).captures()
@@ -73,11 +66,6 @@ def test_stills_are_found_by_the_kind_of_their_step(make, path):
     assert list(Recording(path).stills_of("dip")) == []
 
 
-def test_an_attachment_that_is_not_there_is_named(make, path):
-    with pytest.raises(InputError, match=r"holds no rig\.toml"):
-        Recording(make.record(path)).attachment("rig.toml")
-
-
 @pytest.mark.parametrize("content", [b"", b"{}", b"hello, world: this is no recording\n" * 30, None], ids=str)
 def test_what_is_no_mcap_file_is_refused(path, content):
     if content is not None:
@@ -90,11 +78,6 @@ def test_an_open_session_is_refused_with_the_way_out(make, store):
     make.perform(store, "a")
     with pytest.raises(InputError, match="still open: run the same `brushloop collect` again"):
         Recording(store.folder)
-
-
-def test_an_mcap_file_that_is_not_ours_is_refused(path):
-    with pytest.raises(InputError, match="without brushloop's header"):
-        Recording(foreign(path, metadata={"ros": {"a": "b"}}, messages=[("/tf", "json", b"{}")]))
 
 
 @pytest.mark.parametrize(

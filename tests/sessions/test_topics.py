@@ -129,12 +129,3 @@ def test_the_foxglove_layout_asks_for_topics_and_fields_that_there_are(make, sto
     for topic, path in asked:
         for field in filter(None, path.split(".")[1:2] + path.split(".")[-1:]):
             assert field in fields[topic], f"{topic}{path}"
-
-
-def test_the_foxglove_layout_places_every_panel_once():
-    layout = json.loads(LAYOUT.read_text())
-
-    def panels(node):
-        return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
-
-    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
