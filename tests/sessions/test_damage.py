@@ -1,105 +1,471 @@
-"""Damage anywhere in an MCAP file: read as it was written, or refused in one line that names the file."""
+"""Every damage by name: what verify tells, what repair gives back, and how the session goes on afterwards."""
 
-import io
-import random
+import errno
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
-import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.reader import make_reader
-from mcap.records import Chunk
+from mcap.writer import CompressionType, Writer
+from typer.testing import CliRunner
 
-from brushloop.sessions.errors import InputError, SessionDamaged
+from brushloop.sessions import mcap_writer
+from brushloop.sessions import repair as repairs
+from brushloop.sessions.cli import app
+from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError
+from brushloop.sessions.events import StepKind
+from brushloop.sessions.export import export
+from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import HEADER_NOTE
+from brushloop.sessions.repair import repair_session
+from brushloop.sessions.show import Summary, details, summaries
+from brushloop.sessions.verify import verify_session
+from tests.command import brushloop
+from tests.journal_lines import read_lines
 
-CUTS = 120
-FLIPS = 400
+ID, OTHER = "2026-01-02-grid-01", "2026-01-03-grid-01"
+BOTH = ("H13-a05-r00", "H13-a05-r01")
+AGAIN = "capture H13-a05-r00; it is done again when the session goes on"
+
+
+def file_of(folder, key):
+    [line] = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == "done" and line["key"] == key]
+    return folder / line["file"]
+
+
+def cut(path, share):
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+
+def flip(path, at):
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+
+
+def lines_of(folder):
+    return (folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+
+
+def keep_lines(folder, keep):
+    (folder / JOURNAL_NAME).write_bytes(b"".join(keep(lines_of(folder))))
+
+
+def chunks(path):
+    with path.open("rb") as file:
+        return make_reader(file).get_summary().chunk_indexes
 
 
 @pytest.fixture
-def whole(make, store):
-    """A merged recording with attachments, metadata and two strokes, as bytes."""
-    make.perform(store, "a")
-    make.perform(store, "b")
-    return store.close().read_bytes()
+def other(make, tmp_path):
+    """A closed session of the same protocol, so that its steps have the same keys; it was stopped earlier."""
+    return make.session(tmp_path / OTHER, 1, closed=True, session_id=OTHER)
+
+
+@dataclass
+class Case:
+    """What is done to a session, part of what verify says, what repair reports as lost, and the strokes that remain."""
+
+    damage: object
+    """Called with the folder and that of another session."""
+    told: str
+    lost: list = field(default_factory=list)
+    strokes: tuple = BOTH
+
+
+def photograph_bit(folder, _):
+    path = file_of(folder, "H13-a05-r00 capture")
+    chunk = chunks(path)[1]
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
+
+
+def end_of_step(kind):
+    """Neither the journal nor the file tells the end of the step."""
+
+    def damage(folder, _):
+        path = file_of(folder, f"H13-a05-r01 {kind}")
+        done = b'"done"', path.name.encode()
+        at = next(n for n, line in enumerate(lines_of(folder)) if all(word in line for word in done))
+        keep_lines(folder, lambda lines: lines[:at])
+        flip(path, path.read_bytes().index(b"brushloop.done") + 40)
+
+    return damage
+
+
+def configuration(folder, _):
+    (folder / "rig.toml").write_text('name = "another"\n')
+    (folder / "protocol.toml").unlink()
+
+
+def steps_of_closed(folder, _):
+    for stroke in BOTH:
+        cut(file_of(folder, f"{stroke} capture"), 0.3)
+    file_of(folder, "board").unlink()
+
+
+def steps_and_merged(folder, _):
+    for path in folder.glob("*-capture-*.mcap"):
+        path.write_bytes(b"")
+    final = folder / f"{ID}.mcap"
+    final.write_bytes(final.read_bytes()[: chunks(final)[-2].chunk_start_offset])
+
+
+def merged_alone(folder, other):
+    for path in folder.glob("0*.mcap"):
+        path.unlink()
+    shutil.copy(other / JOURNAL_NAME, folder)
+
+
+def step_of_another(folder, other):
+    path = next(iter(sorted(folder.glob("*-capture-*.mcap"))))
+    (folder / f"{ID}.mcap").unlink()
+    shutil.copy(other / path.name, path)
+
+
+def all_but_the_recording(folder, _):
+    for path in [folder / JOURNAL_NAME, *folder.glob("0*.mcap*")]:
+        path.unlink()
+    (folder / f"{ID}.mcap").write_bytes((folder / f"{ID}.mcap").read_bytes()[:-40])
+
+
+def stroke_bit(path, _):
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    [stroke] = [number for number, channel in summary.channels.items() if channel.topic == "/stroke"]
+    chunk = next(chunk for chunk in summary.chunk_indexes if stroke in chunk.message_index_offsets)
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
+
+
+FOREIGN = f"is of another session, '{OTHER}'"
+CASES = {
+    "open: a step is cut": Case(
+        lambda f, _: cut(file_of(f, "H13-a05-r00 capture"), 0.3), "(capture H13-a05-r00)", [AGAIN], BOTH[1:]
+    ),
+    "open: a bit of a photograph": Case(photograph_bit, "messages lost: 1 of /camera/still", [AGAIN], BOTH[1:]),
+    "open: a press loses poses": Case(
+        lambda f, _: cut(file_of(f, "H13-a05-r00 press"), 0.3),
+        "(press H13-a05-r00)",
+        ["messages in 0002-press-H13-a05-.mcap (press H13-a05-r00): 1 of /step, 5 of /robot/tcp"],
+    ),
+    "open: the index of a step": Case(
+        lambda f, _: file_of(f, "H13-a05-r00 capture").write_bytes(
+            file_of(f, "H13-a05-r00 capture").read_bytes()[:-40]
+        ),
+        "(capture H13-a05-r00) its index",
+    ),
+    "open: another step's file": Case(
+        lambda f, _: shutil.copy(file_of(f, "H13-a05-r01 capture"), file_of(f, "H13-a05-r00 capture")),
+        "has changed since it was recorded",
+        [AGAIN],
+        BOTH[1:],
+    ),
+    "open: no journal": Case(lambda f, _: (f / JOURNAL_NAME).unlink(), "is missing, though the folder holds"),
+    "open: a journal without its last lines": Case(
+        lambda f, _: keep_lines(f, lambda lines: lines[:5]), "does not mention 0002-press-H13-a05-.mcap"
+    ),
+    "open: a bit of a line": Case(
+        lambda f, _: flip(f / JOURNAL_NAME, (f / JOURNAL_NAME).read_bytes().index(b'"result":{"kind":"press"')),
+        "line 8 does not match its CRC",
+    ),
+    "open: the end of a capture": Case(end_of_step("capture"), "does not match its CRC"),
+    "open: the end of a press": Case(
+        end_of_step("press"),
+        "is finished, but the result of its step cannot be read",
+        ["press H13-a05-r01, whose file is finished, but the result of its step cannot be read"],
+    ),
+    "open: the configuration": Case(configuration, "is missing, or has changed since the session was started"),
+    "open: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
+    "closed: steps": Case(steps_of_closed, "(board) is missing, though the journal says it was finished"),
+    "closed: steps and merged file": Case(steps_and_merged, "its index", ["capture H13-a05-r01"], BOTH[:1]),
+    "closed: no merged file": Case(lambda f, _: (f / f"{ID}.mcap").unlink(), "is missing, though the journal says"),
+    "closed: the merged file of another": Case(
+        lambda f, other: shutil.copy(other / f"{OTHER}.mcap", f / f"{ID}.mcap"), FOREIGN
+    ),
+    "closed: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
+    "closed: the journal of another and no steps": Case(merged_alone, FOREIGN),
+    "closed: a step of another": Case(step_of_another, FOREIGN, ["capture H13-a05-r00"], BOTH[1:]),
+    "closed: a file of another that is not listed": Case(
+        lambda f, other: shutil.copy(next(other.glob("*-capture-*.mcap")), f / "0099-capture-0123abcd.mcap"), FOREIGN
+    ),
+    "renamed: a step": Case(lambda f, _: next(f.glob("*-capture-*.mcap")).unlink(), "is missing, though"),
+    "renamed: the journal": Case(
+        lambda f, _: keep_lines(f, lambda lines: [b"{oops\n", *lines[:-1]]), "line 1 does not match its CRC"
+    ),
+    "renamed: all but the recording": Case(all_but_the_recording, "its index"),
+    "renamed: the recording": Case(lambda f, _: cut(f / f"{ID}.mcap", 0.1), "its index"),
+    "lone: a bit of a stroke": Case(stroke_bit, "the chunk at byte", ["strokes that cannot be read: 1"], BOTH[1:]),
+}
 
 
 @pytest.fixture
-def path(tmp_path):
-    return tmp_path / "damaged.mcap"
+def damaged(request, make, tmp_path, monkeypatch):
+    """The session or recording of a case, in small chunks, before the damage."""
+    monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 256)
+    state = request.param.partition(":")[0]
+    folder = make.session(tmp_path / ID, closed=state != "open")
+    if state == "renamed":
+        return shutil.copytree(folder, tmp_path / "elsewhere" / "s1")
+    return Path(shutil.copy(folder / f"{ID}.mcap", tmp_path)) if state == "lone" else folder
 
 
-def everything(path):
-    """All that a reader can get out of a recording."""
-    recording = Recording(path)
-    captures = [(capture.stroke.stroke_id, capture.still_png) for capture in recording.captures()]
-    rig = recording.attachment("rig.toml")
-    return recording.header, captures, rig, recording.strokes(), list(recording.stills_of("board"))
+@pytest.mark.parametrize(("damaged", "case"), CASES.items(), ids=CASES, indirect=["damaged"])
+def test_damage_is_told_and_repaired(make, damaged, case, other, repair, resume):
+    case.damage(damaged, other)
+    before = make.tree(damaged.parent)
+    found = [f"{finding.file}: {finding.what}" for finding in verify_session(damaged).findings]
+    assert any(case.told in line for line in found), found
+    assert make.tree(damaged.parent) == before, "verify changed something"
+    report = repair(damaged)
+    assert (report.lost, report.lossless) == (case.lost, not case.lost)
+    kept = [data for data in make.tree(damaged.parent).values() if data]
+    assert all(any(data in other for other in kept) for data in before.values() if data), "a damaged file is gone"
+    assert repair(damaged).did == []
+    verdict = verify_session(damaged)
+    assert verdict.sound, verdict.findings
+    final = resume(damaged).close() if verdict.state == "open" else Recording(damaged).path
+    assert tuple(make.stroke_names(final)) == case.strokes
 
 
-def refusal(path):
-    """The error in one line, None where it was read; anything but our own errors fails the test."""
-    try:
-        everything(path)
-    except (InputError, SessionDamaged) as error:
-        message = str(error)
-    else:
-        return None
-    assert message.startswith(str(path))
-    assert "\n" not in message
-    return message
+@pytest.mark.parametrize(
+    ("event", "name"),
+    [
+        ("open", "header"),
+        ("begin", "attempt"),
+        ("begin", "kind"),
+        ("done", "file"),
+        ("done", "result"),
+        ("void", "attempt"),
+        ("sheet", "sheet"),
+    ],
+)
+def test_a_line_without_a_field_is_damage_for_every_command(make, opened, repair, resume, event, name):
+    store = resume(opened)
+    store.fresh_sheet()
+    store.release()
+    make.rewrite_journal(opened, lambda line: {k: v for k, v in line.items() if line["event"] != event or k != name})
+    message = f"'{name}' of event '{event}' is missing"
+    with pytest.raises(SessionDamaged, match=message):
+        details(opened)
+    assert message in str(verify_session(opened).findings)
+    repair(opened)
+    assert verify_session(opened).sound
 
 
-def test_a_file_cut_short_anywhere_is_refused(whole, path):
-    chosen = random.Random(5)
-    for cut in [*range(12), *range(len(whole) - 60, len(whole)), *chosen.choices(range(len(whole)), k=CUTS)]:
-        path.write_bytes(whole[:cut])
-        assert refusal(path), f"cut at {cut} of {len(whole)} was not noticed"
+def test_a_sound_session_is_left_as_it_is(make, store, repair):
+    make.collect(store)
+    opened = verify_session(store.folder)
+    assert (opened.sound, opened.state, opened.files, opened.strokes) == (True, "open", 5, 2)
+    store.close()
+    store.release()
+    closed = verify_session(store.folder)
+    assert (closed.sound, closed.state, closed.files, closed.messages) == (True, "closed", 6, opened.messages)
+    before = make.tree(store.folder)
+    report = repair(store.folder)
+    assert (report.did, report.lost, report.strokes) == ([], [], 2)
+    assert make.tree(store.folder) == before
 
 
-def test_a_flipped_bit_is_refused_or_changes_nothing(whole, path):
-    path.write_bytes(whole)
-    as_written = everything(path)
-    chosen = random.Random(6)
-    refused = 0
-    for _ in range(FLIPS):
-        data, at = bytearray(whole), chosen.randrange(len(whole))
-        data[at] ^= 1 << chosen.randrange(8)
-        path.write_bytes(data)
-        if refusal(path):
-            refused += 1
-        else:
-            assert everything(path) == as_written, f"bit at {at} changed what was read, unnoticed"
-    assert refused > FLIPS / 2
+def test_a_damaged_step_is_refused_with_the_way_out(opened, resume):
+    cut(file_of(opened, "H13-a05-r00 capture"), 0.3)
+    store = resume(opened)
+    for refused in (store.verify, store.close):
+        with pytest.raises(SessionDamaged, match="has changed") as caught:
+            refused()
+        assert caught.value.exit_code == 6
+        assert caught.value.__notes__[-1] == f"Try `brushloop sessions repair {opened}`."
 
 
-def with_chunk(whole, **changes):
-    """The same file, its first chunk's fields changed in place; lengths stay."""
-    index = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes[0]
-    start = index.chunk_start_offset
-    builder = RecordBuilder()
-    chunk = Chunk.read(ReadDataStream(io.BytesIO(whole[start + 9 :])))
-    for name, value in changes.items():
-        setattr(chunk, name, value)
-    chunk.write(builder)
-    return whole[:start] + builder.end() + whole[start + index.chunk_length :]
+def test_a_journal_without_its_last_lines_is_not_gone_on_with(opened, resume):
+    keep_lines(opened, lambda lines: lines[:5])
+    with pytest.raises(SessionDamaged, match=r"does not mention 0002-press-H13-a05-\.mcap: lines are missing"):
+        resume(opened)
 
 
-def test_a_chunk_that_states_a_terabyte_is_refused_before_it_is_unpacked(whole, path):
-    path.write_bytes(with_chunk(whole, uncompressed_size=1 << 40))
-    with pytest.raises(SessionDamaged, match="exceeds"):
-        list(Recording(path).captures())
+def test_after_the_repair_the_lost_step_is_done_again(make, opened, repair, resume):
+    cut(file_of(opened, "H13-a05-r00 capture"), 0.3)
+    repair(opened)
+    store = resume(opened)
+    assert set(store.state.done) == {"board", "H13-a05-r00 press", "H13-a05-r01 press", "H13-a05-r01 capture"}
+    make.take(store, "H13-a05-r00 capture", [make.still(0), make.stroke(0)], make.captured("H13-a05-r00", 0))
+    assert make.events(opened, "begin")[-1]["attempt"] == 2
+    assert sorted(make.stroke_names(store.close())) == list(BOTH)
 
 
-def test_a_zstd_frame_that_states_a_terabyte_is_refused_before_it_is_unpacked(whole, path):
-    index = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes[0]
-    frame = zstandard.FRAME_HEADER + b"\xe0" + (1 << 40).to_bytes(8, "little")
-    path.write_bytes(with_chunk(whole, data=frame.ljust(index.compressed_size, b"\0")))
-    with pytest.raises(SessionDamaged, match="chunk of 1099511627776 bytes exceeds"):
-        list(Recording(path).captures())
+def test_a_photograph_lost_with_its_sheet_gone_has_the_stroke_pressed_again(make, store, repair, resume):
+    make.collect(store)
+    store.fresh_sheet()
+    store.release()
+    cut(file_of(store.folder, "H13-a05-r00 capture"), 0.3)
+    repair(store.folder)
+    assert set(resume(store.folder).state.done) == {"board", "H13-a05-r01 press", "H13-a05-r01 capture"}
 
 
-def test_a_chunk_compressed_in_a_way_that_cannot_be_bounded_is_refused(whole, path):
-    path.write_bytes(with_chunk(whole, compression="lz4!"))
-    with pytest.raises(SessionDamaged, match="allowed: zstd or none"):
-        list(Recording(path).captures())
+def test_a_rebuilt_journal_is_the_one_that_was(make, opened, repair, resume):
+    def lines():
+        return [line for line in read_lines(opened / JOURNAL_NAME) if line["event"] in ("begin", "done")]
+
+    before = lines()
+    (opened / JOURNAL_NAME).unlink()
+    repair(opened)
+    assert sorted(lines(), key=str) == sorted(before, key=str)
+    store = resume(opened)
+    assert (store.header, store.state.used_patches) == (make.header, {(0, 0), (0, 1), (0, 2)})
+
+
+def test_an_attempt_that_was_done_again_since_is_not_given_back_twice(make, opened, repair, resume):
+    keep_lines(opened, lambda lines: lines[:-1])
+    store = resume(opened)
+    make.take(store, "H13-a05-r01 capture", [make.still(1), make.stroke(1)], make.captured("H13-a05-r01", 1))
+    store.release()
+    assert repair(opened).did == []
+    assert tuple(make.stroke_names(resume(opened).close())) == BOTH
+
+
+def test_where_nobody_knows_which_patch_was_pressed_the_sheet_is_not_used_again(make, opened, repair, resume):
+    keep_lines(opened, lambda lines: [line for line in lines if b'"file":"0001-press' not in line])
+    cut(opened / "0001-press-H13-a05-.mcap.part", 0.1)
+    assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in repair(opened).lost[1]
+    store = resume(opened)
+    with pytest.raises(SessionError, match="run the same command with --sheet 2"):
+        store.begin("H15-a05", StepKind.PRESS, patch=7)
+    store.fresh_sheet()
+    make.perform(store, "H15-a05", patch=0)
+    store.release()
+    assert verify_session(opened).sound
+
+
+def test_a_repair_that_was_cut_short_comes_to_the_same_end(make, opened, repair, resume, monkeypatch):
+    cut(file_of(opened, "H13-a05-r00 press"), 0.3)
+    path = file_of(opened, "H13-a05-r01 capture")
+    path.write_bytes(path.read_bytes()[:-40])
+    with monkeypatch.context() as killed:
+        killed.setattr(repairs, "fsync_folder", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            repair(opened)
+    repair(opened)
+    assert verify_session(opened).sound
+    assert tuple(make.stroke_names(resume(opened).close())) == BOTH
+
+
+def test_a_full_disk_leaves_the_damaged_file_with_its_name(opened, repair, monkeypatch):
+    path = file_of(opened, "H13-a05-r00 capture")
+    path.write_bytes(path.read_bytes()[:-40])
+    data = path.read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr("os.fsync", full)
+        with pytest.raises(DiskFull, match="No space left"):
+            repair(opened)
+    assert path.read_bytes() == data
+    assert repair(opened).lossless
+
+
+def test_nothing_to_rebuild_from_is_reported(tmp_path, repair):
+    (tmp_path / JOURNAL_NAME).write_bytes(b"\x00" * 50)
+    with pytest.raises(SessionDamaged, match="no file holds its header"):
+        repair(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "code", "message"),
+    [(None, 0, "nothing was changed"), (40, 0, "nothing was lost"), (6000, 3, "lost: capture H13-a05-r00")],
+)
+def test_the_exit_code_distinguishes_lossless_from_lossy(opened, damage, code, message):
+    path = file_of(opened, "H13-a05-r00 capture")
+    if damage:
+        path.write_bytes(path.read_bytes()[:-damage])
+        ran = CliRunner().invoke(app, ["verify", str(opened)])
+        assert (ran.exit_code, f"damaged: {path.name}: (capture H13-a05-r00) " in ran.output) == (6, True)
+    ran = CliRunner().invoke(app, ["repair", str(opened)])
+    assert (ran.exit_code, message in ran.output) == (code, True), ran.output
+    ran = CliRunner().invoke(app, ["verify", str(opened)])
+    assert (ran.exit_code, f"{ID} (open) is sound: " in ran.output) == (0, True)
+
+
+def test_close_writes_the_merged_file_of_a_session_left_open(make, opened):
+    assert CliRunner().invoke(app, ["close", str(opened)]).exit_code == 0
+    assert tuple(make.stroke_names(opened / f"{ID}.mcap")) == BOTH
+    assert "is closed" in str(CliRunner().invoke(app, ["close", str(opened)]).exception)
+
+
+def test_what_is_wrong_within_a_message_is_damage_though_every_crc_holds(make, store, tmp_path):
+    make.take(store, "a", [make.still(0, b"no image"), make.stroke(0)], make.captured("", 0))
+    [finding] = verify_session(store.folder).findings
+    assert finding.what.endswith("the image 0 on /camera/still is not a complete PNG or JPEG image")
+    [finding] = verify_session(make.record(tmp_path / "a.mcap", make.still(1), make.stroke(2))).findings
+    assert finding.what == "stroke H13-a05-r02 names still 2, which is not there"
+
+
+def test_a_line_cut_off_by_a_crash_is_a_note_and_no_damage(opened):
+    with (opened / JOURNAL_NAME).open("ab") as file:
+        file.write(b'{"t_ns":17,"ev')
+    verdict = verify_session(opened)
+    assert (verdict.sound, "last line was cut off" in verdict.notes[0]) == (True, True)
+
+
+def test_a_renamed_session_is_sound_and_every_command_finds_its_recording(make, closed, repair, tmp_path):
+    copy = shutil.copytree(closed, tmp_path / "elsewhere" / "s1")
+    before = make.tree(copy)
+    assert verify_session(copy).sound
+    assert repair(copy).did == []
+    assert list(summaries(copy.parent)) == [Summary("s1", "closed", "loopback rig", 2, f"{ID}.mcap")]
+    export(copy, tmp_path / "exported", "png")
+    assert {name: data for name, data in make.tree(copy).items() if name != ".lock"} == {
+        name: data for name, data in before.items() if name != ".lock"
+    }
+    (copy / f"{ID}.mcap").rename(copy / "s1.mcap")
+    assert verify_session(copy).sound
+    assert details(copy).file == "s1.mcap"
+
+
+def test_an_open_session_may_be_renamed(opened, resume, tmp_path):
+    renamed = opened.rename(tmp_path / "s1")
+    assert (verify_session(renamed).sound, details(renamed).state) == (True, "open")
+    assert resume(renamed).close() == renamed / "s1.mcap"
+    assert verify_session(renamed).sound
+
+
+LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, lambda: 0)]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
+    store.begin("k", StepKind.PRESS, patch=0).writer.abandon()
+    (part,) = store.folder.glob("*.part")
+    (tmp_path / "empty").mkdir()
+    before = make.tree(tmp_path)
+    for path, message in (
+        (part, f"was never finished, .* Give the session's folder, {store.folder}"),
+        (tmp_path / "empty", r"it holds neither journal\.jsonl nor a recording empty\.mcap"),
+        (tmp_path, rf"is not a session but holds 1 of them: give one, such as {store.folder}"),
+        (tmp_path / "gone", "no such session"),
+    ):
+        with pytest.raises(InputError, match=message) as refused:
+            look(path)
+        assert refused.value.exit_code == 2
+    assert make.tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["verify", "repair"])
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+def test_a_recording_of_another_program_is_no_session_and_not_damaged(tmp_path, command, compression):
+    path = tmp_path / "drive.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start("ros2", "another recorder")
+        schema = writer.register_schema("geometry_msgs/Pose", "ros2msg", b"float64 x")
+        channel = writer.register_channel("/stroke", "cdr", schema)
+        writer.add_message(channel, 1, b"\0\1\0\0", 1)
+        writer.add_metadata("trip", {"car": "blue"})
+        writer.finish()
+    before = path.read_bytes()
+    ran = brushloop("sessions", command, path)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    what = f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}"
+    assert ran.stderr == f"brushloop: {path}: {what}\n"
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])

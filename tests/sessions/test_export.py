@@ -141,20 +141,6 @@ def test_parquet_is_what_datasets_reads(make, closed, to):
     assert "Source: **loopback rig**" in card
 
 
-@pytest.mark.soak  # importing `datasets` takes longer than everything else here
-def test_hugging_face_datasets_loads_strokes_poses_and_forces(make, felt, to):
-    datasets = pytest.importorskip("datasets", reason="needs `pip install datasets`, which the lock leaves out")
-    export(felt, to, "parquet")
-    cache = str(to.parent / "cache")
-    strokes, poses, forces = (
-        datasets.load_dataset(str(to), name, split="train", cache_dir=cache) for name in ("strokes", "poses", "forces")
-    )
-    assert strokes[0]["stroke_id"] == "H13-a05-r00"
-    np.testing.assert_array_equal(strokes[0]["image"], decode_gray(make.png(0), "made"))
-    assert poses[0]["observation.state"][:3] == [1.0, 2.0, 3.0]
-    assert forces[1]["observation.force"] == [0.1, 0.0, -1.0, 0.0, 0.0, 0.0]
-
-
 def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(closed, to, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match="parquet needs pyarrow: pip install pyarrow"):

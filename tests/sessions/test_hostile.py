@@ -8,6 +8,7 @@ import shutil
 import sys
 
 import pytest
+import zstandard
 from click.testing import CliRunner
 from typer.main import get_command
 
@@ -16,6 +17,8 @@ from brushloop.sessions.disk import bare_name
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.store import SessionStore, open_sessions
+from brushloop.sessions.verify import verify_session
+from tests.command import brushloop
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"
@@ -210,3 +213,33 @@ def test_what_is_no_bare_name(name):
 def test_a_bare_name():
     assert bare_name("0001-press-1f3a9c02.mcap") == "0001-press-1f3a9c02.mcap"
     assert bare_name("übung 10:30.mcap")
+
+
+HUGE = 40 * 2**30
+
+
+def test_a_journal_of_40_gb_ends_in_one_line_hides_no_other_and_is_made_again(make, tmp_path, repair):
+    huge, sound = (make.session(tmp_path / name, session_id=name) for name in ("huge", "sound"))
+    os.truncate(huge / JOURNAL_NAME, HUGE)
+    for words in (("sessions", "show", huge), ("sessions", "close", huge), ("validate", huge)):
+        ran = brushloop(*words, cwd=tmp_path)
+        assert (ran.returncode, "is larger than 268435456 bytes" in ran.stderr) == (6, True)
+        assert "Traceback" not in ran.stderr
+    assert open_sessions(tmp_path) == [sound]
+    assert repair(huge).lossless
+    assert (huge / f"{JOURNAL_NAME}.damaged-1").stat().st_size == HUGE
+    assert verify_session(huge).sound
+
+
+def test_too_little_memory_is_no_damage(make, closed, repair, monkeypatch):
+    before = make.tree(closed)
+
+    def exhausted(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(zstandard, "ZstdDecompressor", exhausted)
+    monkeypatch.setattr(zstandard, "decompress", exhausted)
+    for look in (verify_session, repair):
+        with pytest.raises(MemoryError):
+            look(closed)
+    assert make.tree(closed) == before

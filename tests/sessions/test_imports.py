@@ -7,10 +7,8 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from brushloop.sessions import imports
-from brushloop.sessions.cli import app
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.recording import Recording
@@ -140,47 +138,27 @@ def row(file="a.png", scale="1", depth="1", tilt="1", more=""):
 
 REFUSED = [
     ("", "table.csv: line 1: column `file` is missing; found: none"),
-    ("name,px_per_mm", "column `file` is missing; found: name, px_per_mm"),
     (HEAD, "has no rows"),
     ("file,depth_mm,tilt_deg", "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing"),
-    ("file,px_per_mm_x,depth_mm,tilt_deg,start_x_px,start_y_px", "column `px_per_mm_y` is missing"),
-    ("file,px_per_mm,tilt_deg", "column `depth_mm` is missing"),
-    ("file,px_per_mm,depth_mm", "column `tilt_deg` is missing"),
     ("file,px_per_mm,depth_mm,tilt_deg", "column `start_x_px` is missing"),
-    ("file,px_per_mm,depth_mm,tilt_deg,start_x_px", "column `start_y_px` is missing"),
     (f"{HEAD},l_furlong", "must end in one of: mm, cm, m, in, deg"),
     (f"{HEAD},l_mm,l_cm", "column `l_mm` occurs twice"),
-    (f"{HEAD},file", "column `file` occurs twice"),
-    (f"{HEAD},", "column `` has no known unit"),
     ('"fi\nle",px_per_mm', "line 2: 'fi\\nle' holds control characters"),
     (row(depth="deep"), "line 2: column `depth_mm`: 'deep' is not a finite"),
-    (row(depth="1_0"), "line 2: column `depth_mm`: '1_0' is not a finite"),
-    (row(tilt="nan"), "line 2: column `tilt_deg`: 'nan' is not a finite"),
     (row(scale="inf"), "line 2: column `px_per_mm`: 'inf' is not a finite"),
     (f"{HEAD},l_m\na.png,1,1,1,1,1,1e308", "column `l_m`: '1e308', allowed: -1000 to 1000"),
     (row(scale="0"), "line 2: column `px_per_mm`: '0', allowed: 0.01 to"),
     (row(depth="-13"), "line 2: column `depth_mm`: '-13', allowed: 0 to 500"),
-    (row(depth="1e300"), "line 2: column `depth_mm`: '1e300', allowed: 0 to 500"),
-    (row(tilt="-5"), "line 2: column `tilt_deg`: '-5', allowed: 0 to 90"),
     (f"{HEAD},depth_mid_cm\na.png,1,1,1,1,1,-1.5", "column `depth_mid_cm`: '-1.5', allowed: 0 to 50"),
-    (f"{HEAD},bend_mm\na.png,1,1,1,1,1,1e300", "column `bend_mm`: '1e300', allowed: -1e+06 to 1e+06"),
     (f"{HEAD}\na.png,1,1,1,1", "line 2: 5 fields, expected 6"),
-    (row(more=",1"), "line 2: 7 fields, expected 6"),
     (row(more="\u2028,1"), "line 2: 7 fields"),
     (row(more="\n\n./a.png,1,1,1,1,1"), "line 4: stroke a appears twice"),
     (row("c.png"), "line 2: file 'c.png' is not in photos/"),
-    (row(""), "line 2: file '' is not in photos/"),
-    (row("."), "line 2: file '.' is not in photos/"),
     (row("../x.png"), "line 2: file '../x.png' is not in photos/"),
     (row("/x.png"), "line 2: file '/x.png' is not in photos/"),
     (row("link.png"), "line 2: file 'link.png' is not in photos/"),
-    (row("loop.png"), "line 2: file 'loop.png' is not in photos/"),
-    (row("x" * 5000), "line 2: file 'xxx"),
     (row('"a\n.png"'), "line 3: 'a\\n.png' holds control"),
-    (row("a\0.png"), "line 2: 'a\\x00.png' holds"),
     (row('"a.png"x'), "line 2: ',' expected after '\"'"),
-    (row('"' + "a" * 200_000), "line 2: "),
-    (row("text.png"), "photos/text.png: is not a complete PNG or JPEG image"),
     (row("cut.png"), "photos/cut.png: is not a complete PNG or JPEG image"),
     ("file,größe_mm\n".encode("latin-1"), "photos/table.csv: is not UTF-8 text"),
 ]
@@ -190,8 +168,6 @@ REFUSED = [
 def test_a_table_that_cannot_be_used_is_refused(make, tmp_path, photos, rows, refusal, text, message):
     (tmp_path / "x.png").write_bytes(make.png())
     (photos / "link.png").symlink_to(tmp_path / "x.png")
-    (photos / "loop.png").symlink_to(photos / "loop.png")
-    (photos / "text.png").write_text("no image")
     (photos / "cut.png").write_bytes(make.png()[:-20])
     rows.write_bytes(text if isinstance(text, bytes) else text.encode())
     assert message in refusal()
@@ -231,11 +207,6 @@ def test_an_existing_session_is_never_overwritten(rows, out, refusal):
     assert "exists already" in refusal()
 
 
-def test_a_name_that_is_no_session_id_is_refused(rows, photos, tmp_path):
-    with pytest.raises(InputError, match="a session's name is letters"):
-        imports.import_photographs(photos, rows, tmp_path / "-x y", ImportOptions(), "", lambda: 0)
-
-
 @pytest.mark.parametrize("call", ["mkdir", "fsync"])
 def test_a_disk_without_room_is_refused(rows, photos, refusal, monkeypatch, call):
     (photos.parent / "sessions").mkdir()
@@ -245,12 +216,6 @@ def test_a_disk_without_room_is_refused(rows, photos, refusal, monkeypatch, call
 
     monkeypatch.setattr(os, call, full)
     assert refusal() == "sessions/from-elsewhere: cannot write: No space left on device"
-
-
-def test_the_command_imports(rows, photos, out):
-    arguments = ["import", str(photos), "--csv", str(rows), "--out", str(out), "--kind", "press"]
-    ran = CliRunner().invoke(app, arguments)
-    assert (ran.exit_code, ran.output) == (0, f"Imported into {out / 'from-elsewhere.mcap'}\n")
 
 
 def test_a_refusal_of_the_command_is_one_line_on_stderr_and_exit_code_2(make, tmp_path, rows):

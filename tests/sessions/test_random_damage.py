@@ -20,9 +20,10 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import breakup_chunk
 
-from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import PressResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
 from brushloop.sessions.repair import repair_session
 from brushloop.sessions.store import SessionStore
@@ -229,6 +230,21 @@ def may_be_sound(whole, folder, before, damage):
     return not others and journal.startswith(before[JOURNAL_NAME])
 
 
+def read_of(path):
+    """All that a reader gets out of a recording; None where it is refused in one line that names the file."""
+    try:
+        recording = Recording(path)
+        captures = [(capture.stroke, capture.still_png) for capture in recording.captures()]
+        rig = recording.attachment("rig.toml")
+    except (InputError, SessionDamaged) as error:
+        message = str(error)
+    else:
+        return recording.header, captures, rig
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    return None
+
+
 def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file() and path.name != ".lock"}
 
@@ -250,6 +266,9 @@ def check(make, whole, root, chosen):
 
 def judged(make, whole, root, folder, damage):
     before = contents(folder)
+    if whole.lone:
+        name = f"{folder.name}.mcap"
+        assert read_of(folder / name) in (None, read_of(whole.folder / name)), "something changed was read"
     verdict = verify_session(folder)
     assert not verdict.sound or may_be_sound(whole, folder, before, damage), "verify says sound"
     assert contents(folder) == before, "verify changed something"

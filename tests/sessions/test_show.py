@@ -10,7 +10,7 @@ from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import mark_bad_or_good
 from brushloop.sessions.show import GridCell, Summary, details, ranges, summaries
-from brushloop.sessions.terminal import counted, lines_of, shown
+from brushloop.sessions.terminal import lines_of
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
 
@@ -154,9 +154,3 @@ def test_long_work_prints_a_line_now_and_then(capsys):
         update("captures", done, 40)
     printed = capsys.readouterr().err.splitlines()
     assert printed == [f"captures: {done} of 40" for done in (10, 20, 30, 40)]
-
-
-def test_work_that_ends_soon_says_nothing(capsys):
-    with shown() as progress:
-        assert list(counted("abc", "letters", 3, progress)) == ["a", "b", "c"]
-    assert capsys.readouterr().err == ""

@@ -4,11 +4,9 @@ import datetime as dt
 import errno
 import io
 import itertools
-import json
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections import namedtuple
 from pathlib import Path
@@ -43,13 +41,6 @@ def test_a_folder_without_journal_is_refused_and_left_as_it_is(make, tmp_path):
     with pytest.raises(InputError):
         SessionStore(tmp_path / "gone", None, make.clock())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_is_given_back_from_any_thread(make, store, resume):
-    thread = threading.Thread(target=store.release)
-    thread.start()
-    thread.join()
-    assert resume(store).header == make.header
 
 
 def test_attempts_cells_and_results_are_kept_across_processes(make, store, resume):
@@ -89,20 +80,6 @@ def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, s
     assert second.state.done == {}
     make.perform(second, "H13-a05", patch=4)
     assert make.stroke_names(second.close()) == ["H13-a05"]
-
-
-def test_a_process_that_dies_before_closed_closes_again_with_one_copy_of_each(make, store, resume):
-    for key in ("a", "b", "c"):
-        make.perform(store, key)
-    store.close()
-    journal = store.folder / JOURNAL_NAME
-    lines = journal.read_text().splitlines(keepends=True)
-    assert json.loads(lines[-1])["event"] == "closed"
-    journal.write_text("".join(lines[:-1]))
-    with pytest.raises(InputError, match="still open"):
-        Recording(store.folder)
-    assert make.stroke_names(resume(store).close()) == ["a", "b", "c"]
-    assert len(make.events(store.folder, "closed")) == 1
 
 
 def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(make, store):
@@ -250,15 +227,6 @@ def test_a_read_only_folder_is_reported_in_one_line(make, store, read_only_disk)
     with pytest.raises(SessionError, match="Read-only file system"):
         SessionStore(store.folder, None, make.clock())
     assert verify_session(store.folder).sound, "looking needs no right to write"
-
-
-def test_a_folder_that_cannot_be_made_for_want_of_room_is_a_full_disk(make, tmp_path, monkeypatch):
-    def no_room(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "mkdir", no_room)
-    with pytest.raises(DiskFull):
-        make.store(tmp_path / "s")
 
 
 def test_a_clock_that_is_set_back_reorders_nothing(make, tmp_path):
