@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
 from brushloop.calibrate.compare.images import brush_of, loop_pixels, pack
-from brushloop.calibrate.validate.heldout import RefitJob, bezier_pixels, fitted_press, refit_job, stroke_of
+from brushloop.calibrate.validate.heldout import Refit, RefitJob, bezier_pixels, refit_job, stroke_of
 from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, score_job
 from brushloop.calibrate.validate.pool import Scheduler
 from brushloop.calibrate.validate.report.data import Step
@@ -46,11 +45,11 @@ def similarity_by_strokes(outcome: Outcome, scheduler: Scheduler, progress: Prog
         jobs[f"{job.key}:{len(jobs)}"] = (trial, job)
     waiting = ((name, job) for name, (_, job) in jobs.items() if name.partition(":")[0] not in outcome.store)
     for done, (name, found) in enumerate(scheduler.run(refit_job, waiting), 1):
-        outcome.store.put(name.partition(":")[0], found)
+        outcome.store.put(name.partition(":")[0], asdict(found))
         progress("fits from few strokes", done, len(jobs))
     sums: dict[tuple[int, int, str], list[np.ndarray]] = {}
     for name, (trial, _) in jobs.items():
-        fit = outcome.store.get(name.partition(":")[0])
+        fit = Refit(**outcome.store.get(name.partition(":")[0]))
         for model, scores in _scored(outcome, trial, fit, scheduler):
             sums.setdefault((trial.session, trial.count, model), []).append(scores)
     steps: list[Step] = []
@@ -81,19 +80,17 @@ def _trials(outcome: Outcome) -> Iterator[Trial]:
                     yield Trial(session, count, tuple(order[:count]), tuple(sorted(left[::step])))
 
 
-def _scored(
-    outcome: Outcome, trial: Trial, fit: dict[str, Any], scheduler: Scheduler
-) -> Iterator[tuple[str, np.ndarray]]:
+def _scored(outcome: Outcome, trial: Trial, fit: Refit, scheduler: Scheduler) -> Iterator[tuple[str, np.ndarray]]:
     """Yield (model, (n, 2) CSIM and SSIM) in millimetres, binary."""
     brush, view = brush_of(outcome.sessions[trial.session].header), outcome.options.view
-    press = fitted_press(fit["fitted"], float(brush.radius_mm), float(brush.length_mm))
+    press = fit.press(float(brush.radius_mm), float(brush.length_mm))
     cells: dict[Condition, list[int]] = {}
     for k in trial.scored:
         cells.setdefault(outcome.rows[k].press.condition, []).append(k)
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell, group in cells.items():
-            bezier = ABSENT if fit["bezier"] is None else pack(bezier_pixels(fit["bezier"], cell, view))
+            bezier = ABSENT if fit.bezier is None else pack(bezier_pixels(fit.bezier, cell, view))
             predictions = (pack(loop_pixels(press.outline(cell.depth_mm, cell.tilt_deg), view)), bezier)
             for start in range(0, len(group), CHUNK):
                 chunk = group[start : start + CHUNK]
@@ -104,5 +101,5 @@ def _scored(
     found = dict(scheduler.run(score_job, jobs()))
     values = np.concatenate([found[name] for name in sorted(found, key=int)])[:, :, JUDGED]
     yield "CCD-BSM", values[:, 0]
-    if fit["bezier"] is not None:
+    if fit.bezier is not None:
         yield "Bézier", values[:, 1]

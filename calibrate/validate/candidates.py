@@ -10,11 +10,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
-from brushloop.calibrate.validate.heldout import bezier_pixels, fitted_press
+from brushloop.calibrate.validate.heldout import Refit, bezier_pixels
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.model.brush import Brush, DomainError
 from brushloop.model.fitted import NAME
@@ -96,16 +96,18 @@ def generators(session: LoadedSession, files: Sequence[Generator], view: Field) 
     return found
 
 
-def held_out(fits: dict[Condition, dict[str, Any]], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
+def held_out(fits: dict[Condition, Refit], brush: Brush, view: Field, *, fitted: bool) -> list[Candidate]:
     """Models fitted without the cell they predict; `fits` holds the result of a `refit_job` for each cell."""
 
     def predict_fitted(condition: Condition) -> Pixels:
-        found = _without(fits, condition, "fitted")
-        press = fitted_press(found, float(brush.radius_mm), float(brush.length_mm))
+        press = _without(fits, condition).press(float(brush.radius_mm), float(brush.length_mm))
         return loop_pixels(press.outline(condition.depth_mm, condition.tilt_deg), view)
 
     def predict_bezier(condition: Condition) -> Pixels:
-        return bezier_pixels(_without(fits, condition, "bezier"), condition, view)
+        bezier = _without(fits, condition).bezier
+        if bezier is None:
+            raise _undetermined(condition)
+        return bezier_pixels(bezier, condition, view)
 
     bezier = Candidate(
         BEZIER_REFITTED,
@@ -156,9 +158,13 @@ def _of_model(model: StrokeModel, basis: str, view: Field, name: str = "", label
     )
 
 
-def _without(fits: dict[Condition, dict[str, Any]], condition: Condition, what: str) -> Any:
-    found = fits.get(condition, {}).get(what)
-    if found is None:
-        why = "the other cells do not determine this press"
-        raise DomainError("depth_mm", condition.depth_mm, "other cells", why)
-    return found
+def _without(fits: dict[Condition, Refit], condition: Condition) -> Refit:
+    """What was fitted without a condition. Raises `DomainError` where the other conditions are too few."""
+    if condition not in fits:
+        raise _undetermined(condition)
+    return fits[condition]
+
+
+def _undetermined(condition: Condition) -> DomainError:
+    why = "the other cells do not determine this press"
+    return DomainError("depth_mm", condition.depth_mm, "other cells", why)

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -58,15 +57,32 @@ class RefitJob:
         return digest.hexdigest()
 
 
-def refit_job(job: RefitJob) -> dict[str, Any]:
-    """Fit `fitted` (values, edges) and `bezier` (coefficients), each None if there are too few strokes for it."""
+@dataclass(frozen=True, slots=True)
+class Refit:
+    """What was fitted to the strokes of a job; None where they are too few for it."""
+
+    fitted: dict[str, list[float]] | None
+    """Values, edges and ends of the brush."""
+    bezier: list[float] | None
+    """Coefficients."""
+
+    def press(self, radius_mm: float, length_mm: float) -> FittedPress:
+        """The fitted brush, of a job that fits one."""
+        assert self.fitted is not None
+        edges, ends = (np.array(self.fitted[name]) for name in ("edges", "ends"))
+        values = np.array(self.fitted["values"])
+        return FittedPress(radius_mm, length_mm, values, edges.reshape(2, MODES, TERMS), ends.reshape(2, TERMS))
+
+
+def refit_job(job: RefitJob) -> Refit:
+    """Fit the brush, where the job asks for it, and a Bezier."""
     grid = grid_of(job.view)
     strokes = [Pressed(h, a, unpack(pixels)[-1].astype(np.float64) / 255.0) for h, a, pixels in job.strokes]
     fitted = None
     if job.fitted:
         press = fit_held_out(strokes, grid, job.radius_mm, job.length_mm)
         fitted = {name: getattr(press, name).ravel().tolist() for name in ("values", "edges", "ends")}
-    return {"fitted": fitted, "bezier": bezier_body(strokes, grid)}
+    return Refit(fitted, bezier_body(strokes, grid))
 
 
 def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
@@ -76,12 +92,6 @@ def bezier_body(strokes: Sequence[Pressed], grid: Grid) -> list[float] | None:
     except ValueError:
         return None
     return [float(value) for value in coefficients.ravel()]
-
-
-def fitted_press(body: dict[str, Any], radius_mm: float, length_mm: float) -> FittedPress:
-    """The fitted brush in the result of a finished job."""
-    edges = np.array(body["edges"]).reshape(2, MODES, TERMS)
-    return FittedPress(radius_mm, length_mm, np.array(body["values"]), edges, np.array(body["ends"]).reshape(2, TERMS))
 
 
 def bezier_pixels(coefficients: Sequence[float], condition: Condition, view: Field) -> Pixels:
@@ -99,11 +109,11 @@ def refits_by_cell(
     store: Store,
     progress: Progress,
     most_folds: int = MAX_FOLDS,
-) -> dict[Condition, dict[str, Any]]:
+) -> dict[Condition, Refit]:
     """Refit for each cell of session `number` to uncut presses of its other cells; return the results by cell."""
     cells = {one: _first_uncut(rows, group) for session_of, one, group in rows.groups if session_of == number}
     brush, fitted = brush_of(session.header), session.fit is not None
-    fits: dict[Condition, dict[str, Any]] = {}
+    fits: dict[Condition, Refit] = {}
     jobs: list[tuple[str, RefitJob]] = []
     of_key: dict[str, list[Condition]] = {}
     for fold in folds(list(cells), most_folds):
@@ -117,11 +127,11 @@ def refits_by_cell(
             jobs.append((job.key, job))
     done = len(of_key) - len(jobs)
     for key, found in scheduler.run(refit_job, iter(jobs)):
-        store.put(key, found)
+        store.put(key, asdict(found))
         done += 1
         progress(f"{session.header.session_id}: cells left out in turn", done, len(of_key))
     for key, fold in of_key.items():
-        fits |= dict.fromkeys(fold, store.get(key))
+        fits |= dict.fromkeys(fold, Refit(**store.get(key)))
     return fits
 
 

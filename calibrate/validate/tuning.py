@@ -26,7 +26,7 @@ from brushloop.calibrate.report import source_label
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.calibrate.validate.candidates import Generator
-from brushloop.calibrate.validate.heldout import fitted_press
+from brushloop.calibrate.validate.heldout import Refit
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
 from brushloop.calibrate.validate.store import VERSION
 from brushloop.model.brush import DomainError
@@ -120,7 +120,7 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condi
 
 def tuned_by_cell(
     session: LoadedSession,
-    fits: dict[Condition, dict[str, Any]],
+    fits: dict[Condition, Refit],
     generator: Generator,
     steps: int,
     work: Path,
@@ -136,9 +136,9 @@ def tuned_by_cell(
     files: dict[Condition, Path] = {}
     aligned: AlignedStrokes | None = None
     for number, fold in enumerate(left_out):
-        fit = fits[fold[0]]["fitted"]
+        fit = fits[fold[0]]
         inputs = f"tune {VERSION} {session.sha256} {calibration} {generator.sha256} {steps} {LEARNING_RATE} {fold} "
-        inputs += f"{IMAGES} {fit}"
+        inputs += f"{IMAGES} {fit.fitted}"
         folder = work / "tuned" / hashlib.sha256(inputs.encode()).hexdigest()[:32]
         path = folder / "generator.safetensors"
         if not path.exists():
@@ -195,9 +195,7 @@ def _tune(
     run_training(checked("tune", fields), folder, progress, lambda: False, files)
 
 
-def _with_images(
-    aligned: AlignedStrokes, session: LoadedSession, fit: dict[str, Any] | None, generator: Generator
-) -> AlignedStrokes:
+def _with_images(aligned: AlignedStrokes, session: LoadedSession, fit: Refit, generator: Generator) -> AlignedStrokes:
     """Add images of the fitted brush, if the generator's inputs are depth and tilt alone."""
     import torch
 
@@ -208,9 +206,9 @@ def _with_images(
     brush = brush_of(session.header)
     target = load_generator(generator.path, brush).target
     ranges = {spec.name: (spec.low, spec.high) for spec in target.inputs}
-    if fit is None or set(ranges) != {"depth_mm", "tilt_deg"} or target.placement is Placement.BASE:
+    if fit.fitted is None or set(ranges) != {"depth_mm", "tilt_deg"} or target.placement is Placement.BASE:
         return aligned
-    fitted = fitted_model(fitted_press(fit, float(brush.radius_mm), float(brush.length_mm)))
+    fitted = fitted_model(fit.press(float(brush.radius_mm), float(brush.length_mm)))
     drawn = Target(fitted, ranges, {}, target.placement, target.px_mm, target.size_px)
     inputs = drawn.draw(IMAGES, torch.Generator().manual_seed(0))
     names = [spec.name for spec in drawn.inputs]
