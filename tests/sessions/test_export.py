@@ -194,11 +194,6 @@ def test_a_wait_belongs_to_the_take_that_the_photograph_shows(make, store):
     assert waits_of(store.state) == {3: 1.1, 6: 7.0}
 
 
-def test_the_first_press_of_a_session_that_looked_after_its_dip_is_named():
-    waits = {"first": 10.2, "second": 1.1, "third": 1.2, "fourth": 1.0}
-    assert unlike(waits) == {"first": "touched the paper 10.2 s after its dip, the others after 1.1 s"}
-
-
 @pytest.mark.parametrize(
     ("waits", "far"),
     [
@@ -251,11 +246,6 @@ def test_names_go_out_and_in_again_by_our_own_importer(make, tmp_path, photos, r
         cells = [row["stroke_id"] for row in csv.DictReader(file)]
     assert cells == ["'=1+1", "'@home", "'-2-3", "-5", "''=x", "a"]
     assert [as_text(cell) for cell in cells] == names
-
-
-@pytest.mark.parametrize(("text", "value"), [("10", 10.0), (" -.5 ", -0.5), ("+1.e3", 1000.0), ("2.5E-1", 0.25)])
-def test_a_number_is_read_as_it_is_written(text: str, value: float) -> None:
-    assert number(text) == value
 
 
 @pytest.mark.parametrize("text", ["1_0", "1e1_0", "nan", "-inf", "1e999", "", "0x10", "1,5", "1 0", "１０"])

@@ -210,11 +210,6 @@ def test_what_is_no_bare_name(name):
         bare_name(name)
 
 
-def test_a_bare_name():
-    assert bare_name("0001-press-1f3a9c02.mcap") == "0001-press-1f3a9c02.mcap"
-    assert bare_name("übung 10:30.mcap")
-
-
 HUGE = 40 * 2**30
 
 

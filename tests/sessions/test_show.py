@@ -9,7 +9,7 @@ from brushloop.sessions.cli import app
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import mark_bad_or_good
-from brushloop.sessions.show import GridCell, Summary, details, ranges, summaries
+from brushloop.sessions.show import GridCell, Summary, details, summaries
 from brushloop.sessions.terminal import lines_of
 
 PROTOCOL = '{"kind":"grid","depths_mm":[13.0,15.0],"tilts_deg":[5.0],"repeats":2}'
@@ -75,11 +75,6 @@ def test_a_closed_session_and_its_file_agree(collected):
     assert of_folder.grid == of_file.grid
     assert of_folder.messages == of_file.messages
     assert (of_file.state, of_file.strokes) == ("recording", 2)
-
-
-def test_cells_that_follow_each_other_are_put_together():
-    assert ranges([0, 1, 2, 5, 7, 8]) == "0-2, 5, 7-8"
-    assert ranges([]) == "none"
 
 
 def test_the_command_prints_it_and_json_holds_all_of_it(collected):

@@ -35,14 +35,6 @@ def test_an_existing_folder_is_refused_and_left_as_it_is(make, tmp_path):
     assert list((tmp_path / "s").iterdir()) == []
 
 
-def test_a_folder_without_journal_is_refused_and_left_as_it_is(make, tmp_path):
-    with pytest.raises(InputError, match="holds no journal"):
-        SessionStore(tmp_path, None, make.clock())
-    with pytest.raises(InputError):
-        SessionStore(tmp_path / "gone", None, make.clock())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_attempts_cells_and_results_are_kept_across_processes(make, store, resume):
     make.perform(store, "H13-a05", patch=0)
     store.void(store.begin("H15-a05", StepKind.PRESS, patch=1), "stopped by the operator")
@@ -62,14 +54,6 @@ def test_a_fresh_sheet_frees_its_cells_and_stays_fresh(make, store, resume):
     make.perform(store, "H15-a05", patch=0)
     state = resume(store).state
     assert (state.sheet, state.used_patches) == (1, {(0, 0), (1, 0)})
-
-
-def test_a_process_that_dies_after_begin_has_burnt_the_cell(make, store, resume):
-    store.begin("H13-a05", StepKind.PRESS, patch=3).writer.abandon()
-    second = resume(store)
-    assert second.state.used_patches == {(0, 3)}
-    make.perform(second, "H13-a05", patch=4)
-    assert make.stroke_names(second.close()) == ["H13-a05"]
 
 
 def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, store, resume):
