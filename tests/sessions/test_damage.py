@@ -306,6 +306,13 @@ def test_a_rebuilt_journal_is_the_one_that_was(make, opened, repair, resume):
     assert (store.header, store.state.used_patches) == (make.header, {(0, 0), (0, 1), (0, 2)})
 
 
+def test_a_stroke_that_stands_twice_in_a_lone_recording_comes_back_once(make, tmp_path, repair):
+    path = make.record(tmp_path / "a.mcap", *make.strokes(2), make.still(1), make.stroke(1))
+    path.write_bytes(path.read_bytes()[:-40])
+    repair(path)
+    assert tuple(make.stroke_names(path)) == BOTH
+
+
 def test_an_attempt_that_was_done_again_since_is_not_given_back_twice(make, opened, repair, resume):
     keep_lines(opened, lambda lines: lines[:-1])
     store = resume(opened)

@@ -22,17 +22,8 @@ from tests.command import brushloop
 
 BRUSHLOOP = get_command(app)
 SECRET = b"the key to the safe"
-WATCHED = {
-    "open",
-    "os.rename",
-    "os.link",
-    "os.symlink",
-    "os.remove",
-    "os.truncate",
-    "os.mkdir",
-    "os.rmdir",
-    "os.listdir",
-}
+CALLS = ("rename", "link", "symlink", "remove", "truncate", "mkdir", "rmdir", "listdir")
+WATCHED = ("open", *(f"os.{call}" for call in CALLS))
 COMMANDS = {
     "list": ["sessions", "list", "{root}"],
     "show": ["sessions", "show", "{session}"],
@@ -80,10 +71,7 @@ def place(make, tmp_path):
         "calibration/0123456789abcdef.json",
     ):
         (outside / name).write_bytes(SECRET)
-    store = make.store(tmp_path / "root" / make.header.session_id)
-    make.collect(store)
-    store.close()
-    store.release()
+    make.session(tmp_path / "root" / make.header.session_id, closed=True)
     make.record(outside / "whole.mcap", *make.strokes(2))
     return tmp_path
 

@@ -72,45 +72,24 @@ FOREIGN = encode_line(1, {"event": "sheet", "sheet": 7}, 7, "other")
 WRONG = "line 5 does not match its CRC"
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda a: [*a[:4], *a[5:]], ["line 5 is numbered 6"]),
-        (lambda a: [*a[:4], *a[7:]], ["line 5 is numbered 8"]),
-        (lambda a: a[1:], ["line 1 is numbered 2"]),
-        (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 stands twice"]),
-        (
-            lambda a: [*a[:4], a[5], a[4], *a[6:]],
-            ["line 5 is numbered 6", "line 6 is numbered 5", "line 7 is numbered 7"],
-        ),
-        (
-            lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
-            ["line 4 is numbered 10", "line 5 is numbered 5", "line 10 is numbered 4", "line 11 is numbered 11"],
-        ),
-        (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'"]),
-        (lambda a: [*a[:4], b"{oops\n", *a[5:]], [WRONG]),
-        (lambda a: [*a[:4], b"\xff\xfe\n", *a[5:]], [WRONG]),
-        (lambda a: [*a[:4], b"[" * 100_000 + b"\n", *a[5:]], [WRONG]),
-        (lambda a: [*a[:4], a[4].replace(b"sheet", b"sheer"), *a[5:]], [WRONG]),
-        (lambda a: [*a[:4], a[4][:-1] + b"\x0b", *a[5:]], [WRONG, "line 6 is numbered 7"]),
-        (lambda a: [*a[:-1], a[-1][:-9]], []),
-    ],
-    ids=[
-        "deleted",
-        "three",
-        "first",
-        "doubled",
-        "neighbours",
-        "exchanged",
-        "foreign",
-        "half",
-        "binary",
-        "deep",
-        "bit",
-        "end",
-        "torn",
-    ],
-)
+CHANGES = {
+    "deleted": (lambda a: [*a[:4], *a[5:]], ["line 5 is numbered 6"]),
+    "first": (lambda a: a[1:], ["line 1 is numbered 2"]),
+    "doubled": (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 stands twice"]),
+    "exchanged": (
+        lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
+        ["line 4 is numbered 10", "line 5 is numbered 5", "line 10 is numbered 4", "line 11 is numbered 11"],
+    ),
+    "foreign": (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'"]),
+    "binary": (lambda a: [*a[:4], b"\xff\xfe\n", *a[5:]], [WRONG]),
+    "deep": (lambda a: [*a[:4], b"[" * 100_000 + b"\n", *a[5:]], [WRONG]),
+    "bit": (lambda a: [*a[:4], a[4].replace(b"sheet", b"sheer"), *a[5:]], [WRONG]),
+    "end": (lambda a: [*a[:4], a[4][:-1] + b"\x0b", *a[5:]], [WRONG, "line 6 is numbered 7"]),
+    "torn": (lambda a: [*a[:-1], a[-1][:-9]], []),
+}
+
+
+@pytest.mark.parametrize(("change", "expected"), CHANGES.values(), ids=CHANGES)
 def test_what_happened_to_lines_is_named(path, change, expected):
     path.write_bytes(b"".join(change(LINES)))
     faults = read(path.read_bytes()).faults

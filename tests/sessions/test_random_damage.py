@@ -90,10 +90,8 @@ def whole(request, make, tmp_path_factory):
     store = SessionStore(twin if request.param == "open" else folder, None, make.clock())
     messages = make.messages(store.close())
     store.release()
-    other = make.store(tmp_path_factory.mktemp("other") / "2026-01-02-other-01", session_id="2026-01-02-other-01")
-    make.collect(other)
-    other.release()
-    foreign = (other.folder / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+    other = make.session(tmp_path_factory.mktemp("other") / "2026-01-02-other-01", session_id="2026-01-02-other-01")
+    foreign = (other / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
     if request.param == "lone":
         for path in folder.iterdir():
             if path.name != f"{folder.name}.mcap":
