@@ -165,7 +165,6 @@ class Progress:
                 messages_before=self._logged - len(self._messages),
                 sheet=None if store is None or self._layout is None else tally.sheet(self._layout),
                 last=self._last,
-                stroke="" if current is None else current.stroke_id,
                 folder="" if folder is None else str(folder),
             )
 

@@ -124,8 +124,6 @@ class Snapshot:
     sheet: SheetMap | None = None
     last: LastCapture | None = None
     """Newest capture of this process."""
-    stroke: str = ""
-    """Name of the stroke in progress."""
     requests: tuple[OperatorRequest, ...] = ()
     """Key requests that are still pending."""
     folder: str = ""
