@@ -29,7 +29,7 @@ from brushloop.calibrate.stroke.measure import measure
 from brushloop.model.brush import DomainError
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, Recording
-from brushloop.sessions.records import Header, Source
+from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def pair_up(
             found.refused.append((press.stroke_id, why))
             continue
         try:
-            images = simulated(model, press.depth_mm, press.tilt_deg, view)
+            images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg, view)
         except DomainError as error:
             found.refused.append((press.stroke_id, f"the model does not predict it: {error}"))
             continue
@@ -170,8 +170,8 @@ def _presses(
         except (CaptureRefused, SessionDamaged) as error:
             refused.append((stroke.stroke_id, error.what))
             continue
-        measured = measure(prepared.mask)
-        yield CapturedPress(stroke.stroke_id, stroke.depth_mm, stroke.tilt_deg, measured, images), stroke.again_of
+        condition = Condition(stroke.depth_mm, stroke.tilt_deg)
+        yield CapturedPress(stroke.stroke_id, condition, measure(prepared.mask), images), stroke.again_of
 
 
 def _opened(recording: Recording) -> ComparedSession:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -112,10 +113,10 @@ def loop_csv(scores: list[PairScore], source: str) -> str:
     """Return a CSV row for every comparison with every original."""
     head = ["original", "again", "depth_mm", "tilt_deg", "what", "alignment", "tone", "csim", "ssim", "source"]
     rows = (
-        (s.original, s.again, *s.cell, s.what, s.alignment, s.tone, f"{s.csim:.6f}", f"{s.ssim:.6f}", source)
+        (s.original, s.again, *astuple(s.condition)[:2], s.what, s.alignment, s.tone, f"{s.csim:.6f}", f"{s.ssim:.6f}")
         for s in scores
     )
-    return csv_text(head, rows)
+    return csv_text(head, ((*row, source) for row in rows))
 
 
 def record_of(loop: LoopComparison, command: str) -> LoopRecord:
@@ -151,8 +152,8 @@ def draw(loop: LoopComparison, path: Path) -> None:
         original, again = pair.original, pair.again
         score = scores[again.stroke_id]
         titles = (
-            f"{original.stroke_id}: H {original.depth_mm:g} mm, alpha {original.tilt_deg:g} deg",
-            f"recovered: H {again.depth_mm:.2f} mm, alpha {again.tilt_deg:.1f} deg",
+            f"{original.stroke_id}: H {original.condition.depth_mm:g} mm, alpha {original.condition.tilt_deg:g} deg",
+            f"recovered: H {again.condition.depth_mm:.2f} mm, alpha {again.condition.tilt_deg:.1f} deg",
             f"re-pressed: CSIM {score.csim:.3f}, SSIM {score.ssim:.3f}",
             "gray both, orange original only, blue again only",
         )
@@ -165,7 +166,7 @@ def draw(loop: LoopComparison, path: Path) -> None:
 
 def _in_picture(loop: LoopComparison) -> list[Pair]:
     """Choose at most `MAX_PICTURE_ROWS` pairs, evenly over depth and tilt, the worst included."""
-    pairs = sorted(loop.paired.pairs, key=lambda p: (*p.original.cell, p.again.stroke_id))
+    pairs = sorted(loop.paired.pairs, key=lambda p: (p.original.condition, p.again.stroke_id))
     if len(pairs) <= MAX_PICTURE_ROWS:
         return pairs
     worst = min((s for s in loop.scores if (s.what, s.alignment, s.tone) == (AGAIN, *GRAY)), key=lambda s: s.csim)
@@ -244,10 +245,10 @@ def _trust(loop: LoopComparison) -> Iterator[Point]:
 def _recovered(loop: LoopComparison, label: str) -> str:
     """Depth and tilt as recovered against as commanded, with the line where both are equal."""
     figure, axes = plot(1, 2, (10.0, 3.8))
-    pairs = loop.paired.pairs
+    pairs = [(pair.original.condition, pair.again.condition) for pair in loop.paired.pairs]
     values = (
-        ("depth H, mm", [(p.original.depth_mm, p.again.depth_mm) for p in pairs]),
-        ("tilt α, deg", [(p.original.tilt_deg, p.again.tilt_deg) for p in pairs]),
+        ("depth H, mm", [(one.depth_mm, other.depth_mm) for one, other in pairs]),
+        ("tilt α, deg", [(one.tilt_deg, other.tilt_deg) for one, other in pairs]),
     )
     for axis, (name, points) in zip(axes, values, strict=True):
         low, high = min(map(min, points)), max(map(max, points))

@@ -17,7 +17,7 @@ from brushloop.calibrate.compare.similarity import similarity
 from brushloop.calibrate.compare.stats import Summary, interval_over_groups, summarise
 from brushloop.calibrate.report import Sealed, load_sealed
 from brushloop.calibrate.stroke.measure import Measured
-from brushloop.sessions.records import Source
+from brushloop.sessions.records import Condition, Source
 
 FILE = "loop.json"
 FORMAT = "brushloop-loop-1"
@@ -30,19 +30,14 @@ GOAL_POINTS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class CapturedPress:
-    """A press that can be compared; depth and tilt as commanded."""
+    """A press that can be compared."""
 
     stroke_id: str
-    depth_mm: float
-    tilt_deg: float
+    condition: Condition
+    """As commanded."""
     measured: Measured
     images: dict[Key, Image]
     """(128, 128) each."""
-
-    @property
-    def cell(self) -> tuple[float, float]:
-        """H and alpha as commanded."""
-        return self.depth_mm, self.tilt_deg
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +56,8 @@ class PairScore:
 
     original: str
     again: str
-    cell: tuple[float, float]
-    """H and alpha as commanded for the original."""
+    condition: Condition
+    """As commanded for the original."""
     what: str
     alignment: Alignment
     tone: Tone
@@ -166,12 +161,12 @@ def read_loop(path: Path) -> LoopRecord:
 
 def score_pairs(pairs: Sequence[Pair], originals: Iterable[CapturedPress]) -> list[PairScore]:
     """Score repetition, simulation and other presses of the cell against each original that was pressed again."""
-    cells: dict[tuple[float, float], list[CapturedPress]] = {}
+    cells: dict[Condition, list[CapturedPress]] = {}
     for press in originals:
-        cells.setdefault(press.cell, []).append(press)
+        cells.setdefault(press.condition, []).append(press)
     scores: list[PairScore] = []
     for pair in pairs:
-        others = [one for one in cells[pair.original.cell] if one is not pair.original]
+        others = [one for one in cells[pair.original.condition] if one is not pair.original]
         for key in KEYS:
             against = {AGAIN: [pair.again.images[key]], SIMULATED: [pair.simulated[key]]}
             against[ANOTHER] = [one.images[key] for one in others]
@@ -184,7 +179,7 @@ def _score(pair: Pair, what: str, key: Key, images: list[Image]) -> PairScore:
     original = pair.original
     csim, ssim = np.mean([similarity(original.images[key], image, alignment) for image in images], axis=0)
     return PairScore(
-        original.stroke_id, pair.again.stroke_id, original.cell, what, alignment, tone, float(csim), float(ssim)
+        original.stroke_id, pair.again.stroke_id, original.condition, what, alignment, tone, float(csim), float(ssim)
     )
 
 
@@ -238,7 +233,7 @@ def _verdict(scores: Sequence[PairScore], key: Key, measure: str) -> Verdict | N
     both = [name for name in again if name in another]
     if not both:
         return None
-    cell_of = {s.again: s.cell for s in scores}
+    cell_of = {s.again: s.condition for s in scores}
     cells = sorted({cell_of[name] for name in both})
     differences = np.array([again[name] - another[name] for name in both])
     difference = float(differences.mean())

@@ -9,7 +9,7 @@ from brushloop.calibrate.compare.field import KEYS
 from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
 from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
-from brushloop.sessions.records import Source
+from brushloop.sessions.records import Condition, Source
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 
@@ -19,8 +19,8 @@ def pair_scores(step: float = 0.001) -> list[PairScore]:
     made: list[PairScore] = []
     for number, ((alignment, tone), what) in itertools.product(range(6), itertools.product(KEYS, LEVELS)):
         csim = LEVELS[what] + number * step
-        cell = (11.0 + number // 2, 0.0)
-        made.append(PairScore(f"{number:03d}", f"{number:03d}~1", cell, what, alignment, tone, csim, csim - 0.1))
+        condition = Condition(11.0 + number // 2, 0.0)
+        made.append(PairScore(f"{number:03d}", f"{number:03d}~1", condition, what, alignment, tone, csim, csim - 0.1))
     return made
 
 

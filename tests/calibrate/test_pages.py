@@ -31,7 +31,7 @@ from brushloop.calibrate.writing.plan_record import PlanRecord
 from brushloop.calibrate.writing.report import write_written
 from brushloop.calibrate.writing.scores import Character, score_character, table_3
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.sessions.records import Header, Source
+from brushloop.sessions.records import Condition, Header, Source
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import BY, CALIBRATION
 from tests.photographed import imported, photograph
@@ -103,7 +103,7 @@ def _loop(folder: Path) -> str:
     def press(name: str, depth_mm: float, end: int) -> CapturedPress:
         image = np.zeros((128, 128), np.float32)
         image[58:70, 40:end] = 1.0
-        return CapturedPress(name, depth_mm, 5.0, measured, dict.fromkeys(KEYS, image))
+        return CapturedPress(name, Condition(depth_mm, 5.0), measured, dict.fromkeys(KEYS, image))
 
     first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
     pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
