@@ -123,7 +123,7 @@ class Make:
             attempt.writer.write(message)
         store.done(attempt, result)
 
-    def session(self, folder: Path, strokes: int = 2, *, closed: bool = False, **fields: Any) -> Path:
+    def session(self, folder: Path, strokes: int = 2, /, *, closed: bool = False, **fields: Any) -> Path:
         """The folder of a session that was collected and that no process has."""
         store = self.store(folder, **fields)
         self.collect(store, strokes)
