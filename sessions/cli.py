@@ -41,19 +41,12 @@ def show(
     as_json: Annotated[bool, typer.Option("--json", help="Everything, as one JSON object.")] = False,
 ) -> None:
     """Show what is in a session: steps, strokes per cell of the grid, sheets, devices."""
-    import json
-    from dataclasses import asdict
+    from pydantic import TypeAdapter
 
-    from brushloop.sessions.show import details
+    from brushloop.sessions.show import Details, details, renderables
 
     found = details(session)
-    if as_json:
-        say(json.dumps(asdict(found), ensure_ascii=False))
-        return
-
-    from brushloop.sessions.show import renderables
-
-    say(*renderables(found))
+    say(*([TypeAdapter(Details).dump_json(found).decode()] if as_json else renderables(found)))
 
 
 @app.command()

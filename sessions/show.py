@@ -46,11 +46,8 @@ class Details:
     session_id: str
     state: str
     """`open`, `closed`, or `recording` for a file without a journal."""
-    source: str
-    devices: dict[str, str]
-    software: str
-    schema_version: int
-    finished: dict[str, int]
+    header: Header
+    finished: dict[str, int] = field(default_factory=dict[str, int])
     """Finished steps by kind."""
     void: list[str] = field(default_factory=list[str])
     """Attempts that were cut, and why."""
@@ -76,7 +73,7 @@ def details(path: Path) -> Details:
         check_path(path)
         return _of_journal(path.resolve())
     recording = Recording(path)
-    shown = _of_header(recording.header, "recording")
+    shown = Details(recording.header.session_id, "recording", recording.header)
     strokes = list(recording.stroke_records())
     shown.strokes = len(strokes)
     shown.grid = _grid(((stroke.depth_mm, stroke.tilt_deg) for stroke in strokes), _planned(recording.header))
@@ -85,17 +82,10 @@ def details(path: Path) -> Details:
     return shown
 
 
-def _of_header(header: Header, state: str) -> Details:
-    values = header.model_dump(mode="json")
-    devices = {name: str(values[name]) for name in DEVICES if values[name]}
-    return Details(header.session_id, state, header.source, devices, header.software, header.schema_version, {})
-
-
 def _of_journal(folder: Path) -> Details:
     state = replay(folder / JOURNAL_NAME)
     header = read_header(folder, state)
-    shown = _of_header(header, "open" if state.closed is None else "closed")
-    shown.session_id = folder.name
+    shown = Details(folder.name, "open" if state.closed is None else "closed", header)
     shown.processes = state.processes
     shown.finished = dict(Counter(str(step.kind) for step in state.files.values()))
     shown.void, shown.next = _cut(state)
@@ -198,7 +188,7 @@ def renderables(details: Details) -> Iterator[RenderableType]:
 
 def _facts(details: Details) -> Table:
     table = Table(show_header=False, box=None)
-    table.add_row("session", Text.assemble((details.session_id, "bold"), f", {details.state}, {details.source}"))
+    table.add_row("session", Text.assemble((details.session_id, "bold"), f", {details.state}, {details.header.source}"))
     of = f" of {details.planned} planned" if details.planned else ""
     bad = f", and {details.marked_bad} marked bad" if details.marked_bad else ""
     table.add_row("strokes", f"{details.strokes}{of}{bad}")
@@ -209,10 +199,11 @@ def _facts(details: Details) -> Table:
         table.add_row("next", f"{details.next} (under way when the last process ended)")
     for sheet, used_patches in details.sheets.items():
         table.add_row(f"sheet {sheet}", f"{len(used_patches)} patches used: {ranges(used_patches)}")
-    for name, value in details.devices.items():
-        table.add_row(name.replace("_", " "), value)
+    for name in DEVICES:
+        if value := getattr(details.header, name):
+            table.add_row(name.replace("_", " "), value)
     processes = f", {details.processes} processes" if details.processes else ""
-    table.add_row("recorded by", f"{details.software}, schema {details.schema_version}{processes}")
+    table.add_row("recorded by", f"{details.header.software}, schema {details.header.schema_version}{processes}")
     messages = ", ".join(f"{count} {topic}" for topic, count in sorted(details.messages.items()))
     table.add_row("messages", messages or "none")
     if details.file:

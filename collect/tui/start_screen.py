@@ -275,7 +275,7 @@ def _standing_content(details: Details) -> Content:
     planned = "" if details.planned is None else f" of {details.planned}"
     bad = f", {details.marked_bad} marked bad" if details.marked_bad else ""
     parts = [
-        Content.assemble((details.session_id, "bold"), f"  {details.state}\n{details.source}"),
+        Content.assemble((details.session_id, "bold"), f"  {details.state}\n{details.header.source}"),
         Content.assemble(("Finished  ", "dim"), (f"{details.strokes}{planned} strokes", "bold"), bad),
     ]
     if details.void:

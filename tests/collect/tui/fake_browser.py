@@ -14,7 +14,7 @@ from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCaptur
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.sessions.events import CaptureResult, Press, Remark
-from brushloop.sessions.records import Condition
+from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.show import Details, Summary
 from tests.collect.tui.fake import blot
 
@@ -64,9 +64,8 @@ class FakeBrowser(SessionBrowser):
         ]
 
     def standing(self, session_id: str) -> Details:
-        details = Details(
-            session_id, "open", "loopback rig", {}, "brushloop 0.1", 1, {"capture": 13}, strokes=13, planned=30
-        )
+        header = Header(session_id=session_id, source=Source.LOOPBACK, software="brushloop 0.1")
+        details = Details(session_id, "open", header, {"capture": 13}, strokes=13, planned=30)
         details.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
         details.next, details.sheets = "press H15-a5-r01", {1: [1, 2]}
         return details
