@@ -22,7 +22,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE, SeekingReader
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
@@ -146,9 +146,7 @@ class McapFile:
                     self._attached.append(offset)
             if not self.damage:
                 with self._noting("its data"):
-                    file.seek(0)
-                    for _ in StreamReader(file, False, True, True, MAX_RECORD_BYTES).records:
-                        pass  # also what no other CRC protects is checked against that of all data
+                    _check_data(file)
         if not self.damage and self.stated != dict(self.counts):
             self.damage.append(f"holds {dict(self.counts)}, but its index says {self.stated}")
 
@@ -276,13 +274,7 @@ def _summary(file: IO[bytes]) -> Summary:
 
     Its CRC is checked: otherwise one wrong bit in it could silently hide strokes.
     """
-    tail = FOOTER_SIZE + len(MCAP0_MAGIC)
-    footer_at = _size(file) - tail
-    file.seek(max(footer_at, 0))
-    footer = file.read(tail)
-    start, crc = struct.unpack_from("<9xQ8xI", footer)
-    if not footer.endswith(MCAP0_MAGIC) or not 0 < start <= footer_at:
-        raise McapError("has no index: it was not finished, or is cut short")
+    start, footer_at, crc = _footer(file)
     file.seek(start)
     if zlib.crc32(file.read(min(footer_at + FOOTER_SIZE - 4 - start, MAX_RECORD_BYTES))) != crc:
         raise McapError("the index does not match its CRC")
@@ -291,6 +283,33 @@ def _summary(file: IO[bytes]) -> Summary:
     if summary is None or summary.statistics is None:
         raise McapError("has no index: it was not finished")
     return summary
+
+
+def _footer(file: IO[bytes]) -> tuple[int, int, int]:
+    """Where the index and the footer begin, and the CRC of the index. Raises any of `UNREADABLE`."""
+    tail = FOOTER_SIZE + len(MCAP0_MAGIC)
+    footer_at = _size(file) - tail
+    file.seek(max(footer_at, 0))
+    footer = file.read(tail)
+    start, crc = struct.unpack_from("<9xQ8xI", footer)
+    if not footer.endswith(MCAP0_MAGIC) or not 0 < start <= footer_at:
+        raise McapError("has no index: it was not finished, or is cut short")
+    return start, footer_at, crc
+
+
+def _check_data(file: IO[bytes]) -> None:
+    """Check the CRC of everything before the index, also of what no other CRC protects.
+
+    The library's reader of whole files does so too, but believes the lengths that stand in the chunks.
+    """
+    end = _footer(file)[0] - RECORD_START.size - 4
+    expected = int.from_bytes(_record(file, end, Opcode.DATA_END), "little")
+    file.seek(0)
+    crc = 0
+    while data := file.read(min(end - file.tell(), 1 << 20)):
+        crc = zlib.crc32(data, crc)
+    if expected not in (0, crc):
+        raise McapError("what is before it does not match its CRC")
 
 
 def _size(file: IO[bytes]) -> int:

@@ -13,6 +13,7 @@ from mcap.writer import Writer
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_NOTE, note
+from brushloop.sessions.verify import verify_session
 
 
 @pytest.fixture
@@ -149,3 +150,12 @@ def test_a_chunk_that_states_a_terabyte_is_refused_before_it_is_unpacked(make, p
     path.write_bytes(with_chunk(whole, **changes))
     with pytest.raises(SessionDamaged, match=message):
         list(Recording(path).captures())
+
+
+def test_a_chunk_whose_data_claim_a_terabyte_is_damage(make, path):
+    whole = bytearray(make.record(path, *make.strokes(2)).read_bytes())
+    start = make_reader(io.BytesIO(whole)).get_summary().chunk_indexes[0].chunk_start_offset
+    place = start + 9 + 8 + 8 + 8 + 4 + 4 + len("zstd")  # behind the fields before: the length of the compressed data
+    whole[place + 5] ^= 1
+    path.write_bytes(whole)
+    assert not verify_session(path).sound
