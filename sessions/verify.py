@@ -112,14 +112,17 @@ def gather(folder: Path) -> Evidence:
     except SessionDamaged as error:
         unreadable = [error.what]
     reading = read(data)
-    # A damaged journal may have lost the name of the merged file.
-    final = merged_file(folder, None if unreadable or reading.faults else reading.state)
-    files = {path.name: scan(path) for path in [*_step_files(folder), *([final] if final.is_file() else [])]}
+    recordings = [path for path in sorted(folder.glob("*.mcap")) if not SEGMENT_NAME.fullmatch(path.name)]
+    files = {path.name: scan(path) for path in (*_step_files(folder), *recordings)}
     named = "" if reading.state.opened is None else reading.state.opened.header.session_id
     session = _session(folder.name, named, Counter(file.session for file in files.values() if file.session))
     if session not in ("", named):
         reading = read(data, session)
     reading.faults[:0] = unreadable
+    final = merged_file(folder, reading.state)
+    if not final.is_file():  # the folder was renamed, and the journal has lost the name of the merged file
+        final = next((path for path in recordings if files[path.name].session in ("", session)), final)
+    files = {name: file for name, file in files.items() if SEGMENT_NAME.fullmatch(name) or name == final.name}
     evidence = Evidence(folder, final, reading, files, session)
     _rebuild_steps(evidence)
     if reading.state.opened is None:

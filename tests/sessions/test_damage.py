@@ -112,6 +112,14 @@ def steps_and_merged(folder, _):
     final.write_bytes(final.read_bytes()[: chunks(final)[-2].chunk_start_offset])
 
 
+def last_step(folder, _):
+    """The journal ends before the last step, whose file is gone."""
+    path = file_of(folder, "H13-a05-r01 capture")
+    begins = next(n for n, line in enumerate(lines_of(folder)) if path.name.encode() in line)
+    keep_lines(folder, lambda lines: lines[:begins])
+    path.unlink()
+
+
 def merged_alone(folder, other):
     for path in folder.glob("0*.mcap"):
         path.unlink()
@@ -189,6 +197,9 @@ CASES = {
     "closed: a file of another that is not listed": Case(
         lambda f, other: shutil.copy(next(other.glob("*-capture-*.mcap")), f / "0099-capture-0123abcd.mcap"), FOREIGN
     ),
+    "closed: the last step in journal and files": Case(last_step, "is still open"),
+    "renamed: the last step in journal and files": Case(last_step, "is still open"),
+    "renamed: the journal of another and no steps": Case(merged_alone, FOREIGN),
     "renamed: a step": Case(lambda f, _: next(f.glob("*-capture-*.mcap")).unlink(), "is missing, though"),
     "renamed: the journal": Case(
         lambda f, _: keep_lines(f, lambda lines: [b"{oops\n", *lines[:-1]]), "line 1 does not match its CRC"
