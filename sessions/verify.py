@@ -174,12 +174,14 @@ def _rebuild_steps(evidence: Evidence) -> None:
             continue
         if foreign := evidence.foreign(file):
             evidence.strays |= {} if own in begun else {name: foreign[0]}
-        elif (begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own)) is not None:
+        elif begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own) or _begun_by(_noted(file, DONE_NOTE, Done)):
             steps.append((name, file, begin))
             if begin.file not in begun:
                 begun[begin.file] = begin
                 evidence.rebuilt.append(begin)
-        elif step_name[2] in MARKING and name not in doubted:
+        elif step_name[2] not in MARKING:
+            evidence.strays[name] = "does not say of which step it is"
+        elif name not in doubted:
             evidence.doubtful.append(name)
     for name, file, begin in steps:
         if name.removesuffix(".part") not in begun:
@@ -195,6 +197,31 @@ def _rebuild_steps(evidence: Evidence) -> None:
             evidence.rebuilt.append(done.model_copy(update={"file": begin.file, "sha256": sha256}))
         elif name == begin.file:
             evidence.strays[name] = "is finished, but the result of its step cannot be read"
+
+
+def _begun_by(done: Done | None) -> Begin | None:
+    """The `begin` of a step of which only the end is known; None where the patches that it marked are not known."""
+    if done is None:
+        return None
+    sheet, patches = 0, tuple[int, ...]()
+    if isinstance(done.result, events.SelfCheckResult):
+        sheet, patches = done.result.sheet, done.result.patches
+    elif done.press is not None and done.press.sheet is not None:
+        sheet = done.press.sheet
+        patches = () if done.press.patch is None or done.kind not in MARKING else (done.press.patch,)
+    if done.kind in MARKING and not patches:
+        return None
+    return Begin(
+        t_ns=done.t_ns,
+        key=done.key,
+        kind=done.kind,
+        attempt=done.attempt,
+        sheet=sheet,
+        patch=next(iter(patches), None),
+        more_patches=patches[1:],
+        press=done.press,
+        file=done.file,
+    )
 
 
 def _noted(file: McapFile, note: str, kind: type[_E]) -> _E | None:

@@ -112,6 +112,14 @@ def steps_and_merged(folder, _):
     final.write_bytes(final.read_bytes()[: chunks(final)[-2].chunk_start_offset])
 
 
+def start_of_capture(folder, _):
+    """Neither the journal nor the file tells the begin of the step."""
+    path = file_of(folder, "H13-a05-r01 capture")
+    begins = next(n for n, line in enumerate(lines_of(folder)) if path.name.encode() in line)
+    keep_lines(folder, lambda lines: lines[:begins])
+    flip(path, path.read_bytes().index(b"brushloop.begin") + 40)
+
+
 def last_step(folder, _):
     """The journal ends before the last step, whose file is gone."""
     path = file_of(folder, "H13-a05-r01 capture")
@@ -178,6 +186,7 @@ CASES = {
         "line 8 does not match its CRC",
     ),
     "open: the end of a capture": Case(end_of_step("capture"), "does not match its CRC"),
+    "open: the start of a capture": Case(start_of_capture, "'brushloop.begin' does not match its CRC"),
     "open: the end of a press": Case(
         end_of_step("press"),
         "is finished, but the result of its step cannot be read",
