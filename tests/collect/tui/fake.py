@@ -118,7 +118,6 @@ def full_picture(**changes: Any) -> Snapshot:
         "sheet": sheet_of(17),
         "last": capture(),
         "picture": camera_picture(),
-        "stroke": "H15-a5-r02",
         "folder": "",
     }
     return picture(**(values | changes))
