@@ -1,7 +1,7 @@
 """`python -m bench [NAME] [-n N] [--json] [--table]`: run one benchmark, or many, and print a line for each figure.
 
 Without NAME, those of speed and memory (about 12 minutes), or with --accuracy those that train, fit and press (hours).
-`growth` is run by name only. With --table, docs/bench.md gets the figures as well.
+With --table, docs/bench.md gets the figures as well.
 
 Exit codes: 0 measured, 1 a benchmark could not be measured, 2 unknown name.
 """
@@ -22,28 +22,15 @@ def benches() -> dict[str, Bench]:
     return {
         "analysis": _late("analysis"),
         "brushfit": _late("brushfit"),
-        "ceiling": _late("ceiling"),
-        "characters": _late("characters"),
-        "coverage": _late("coverage"),
-        "curves": _late("curves"),
-        "drawing": _late("generator", "run_drawing"),
-        "export": _late("export"),
-        "generator": _late("generator"),
-        "generator-qbc": _late("generator", "run_qbc"),
-        "growth": _late("growth"),
         "inversion": _late("inversion"),
         "loop": _late("loop"),
         "overhead": _late("overhead"),
         "paper-brush": _late("paper_brush"),
-        "preprocess": _late("preprocess"),
         "quality": _late("quality"),
         "raster": _late("raster"),
         "realink": _late("realink"),
         "recorder": _late("recorder"),
-        "rpc": _late("rpc"),
         "startup": _late("startup"),
-        "structure": _late("structure"),
-        "tables": _late("tables"),
         "tui": _late("tui"),
         "twin": _late("twin"),
         "validate": _late("validate"),
@@ -67,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--accuracy", action="store_true", help=f"without NAME: {', '.join(whole.ACCURACY)}; hours")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--table", action="store_true", help=f"renew the figures' rows in {table.OUT.name}")
-    parser.add_argument("-n", "--largest", type=int, dest="n", help="rounds, or strokes, or the largest of `growth`")
+    parser.add_argument("-n", "--largest", type=int, dest="n", help="rounds, or strokes")
     options = parser.parse_args(arguments)
     if options.name is not None and options.name not in known:
         print(f"unknown bench {options.name!r}; known: {', '.join(known)}", file=sys.stderr)

@@ -1,15 +1,9 @@
-"""The other ends that `bench rpc` measures against, each in a process of its own.
-
-`python -m bench.processes controller FILE RATE` serves the loopback rig and writes its rig.toml; each line on its
-input is answered with the presses that the sheet has seen. `python -m bench.processes echo` sends back what it gets.
-Both say on one line where they listen, and end when their input does.
-"""
+"""Processes beside a bench: commands as an operator runs them, and helpers that are asked line by line."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import subprocess
 import sys
 from collections.abc import Container, Iterator
@@ -18,7 +12,6 @@ from pathlib import Path
 from bench.harness import BenchError
 
 ROOT = Path(__file__).resolve().parent.parent
-HOST = "127.0.0.1"
 
 
 class Process:
@@ -82,38 +75,3 @@ def tell(line: str) -> None:
     """One line to whoever started this process."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
-
-
-async def _controller(path: Path, rate: float) -> None:
-    from brushloop.drivers.sim.config import SimConfig
-    from brushloop.drivers.sim.rig import LoopbackRig
-
-    async with LoopbackRig(SimConfig(rate=rate, force_sensor=False, ink_device="none")) as rig:
-        path.write_text(rig.toml(), encoding="utf-8")
-        questions = await lines_of_input()
-        tell("ready")
-        while await questions.readline():
-            tell(json.dumps([[press.depth_mm, press.ink_load] for press in rig.world.presses]))
-
-
-async def _echo() -> None:
-    async def back(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while data := await reader.read(65536):
-            writer.write(data)
-        writer.close()
-
-    server = await asyncio.start_server(back, HOST, 0)
-    async with server:
-        questions = await lines_of_input()
-        tell(str(server.sockets[0].getsockname()[1]))
-        await questions.read()
-
-
-if __name__ == "__main__":
-    match sys.argv[1:]:
-        case ["controller", path, rate]:
-            asyncio.run(_controller(Path(path), float(rate)))
-        case ["echo"]:
-            asyncio.run(_echo())
-        case other:
-            sys.exit(f"unknown arguments {other}")

@@ -1,4 +1,4 @@
-"""Dragged strokes of real ink predicted along the commanded path: bristle lag beside circle stamps and a network.
+"""Dragged strokes of real ink predicted along the commanded path: bristle lag beside circle stamps.
 
 Of the big brush, 40 strokes are fixed as a test before anything is fitted (`SPLIT_SEED`); the rest is for training.
 `bench.realink_sessions` predicts one session of the small brush from another. Scores are CSIM and IoU of ink as 0 or 1
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, machine
-from bench.realink_network import train_and_predict
 from bench.realink_sessions import SESSION_SPLITS, measure_sessions
 from bench.realink_strokes import PX_PER_MM, Strokes, load, region
 from brushloop.calibrate.compare.similarity import binary_scores
@@ -31,8 +30,7 @@ SIZES = (10, 20, 40, 80, 147)
 SUBSETS = 5
 GOALS = {20: (0.845, 0.735), 147: (0.86, 0.76)}
 SHIFT_PX = 6
-NETWORK_STEPS = 500
-QUICK_SIZES, QUICK_STEPS = (20,), 120
+QUICK_SIZES = (20,)
 Floats = NDArray[np.float64]
 
 
@@ -48,10 +46,10 @@ class Scores:
 
 
 def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Mean of `n` random subsets (default 5) for each size; the network is trained once a size, as it is slow, and
-    compared on that subset. Empty, with a line on stderr, where the strokes are not at hand.
+    """Mean of `n` random subsets (default 5) for each size. Empty, with a line on stderr, where the strokes are not at
+    hand.
 
-    ratio = ours over circle stamps, then over the network, then over the goal where there is one.
+    ratio = ours over circle stamps, then over the goal where there is one.
     """
     subsets = SUBSETS if n is None else n
     if subsets < 1:
@@ -65,15 +63,14 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     return [*within, *measure_sessions(SESSION_SPLITS if n is None else n, seed)]
 
 
-def measure(strokes: Strokes, size: int, subsets: int, seed: int, network_steps: int = NETWORK_STEPS) -> list[Result]:
+def measure(strokes: Strokes, size: int, subsets: int, seed: int) -> list[Result]:
     """The results of one number of training strokes."""
-    found = compare(strokes, size, 1 if size == max(SIZES) else subsets, seed, network_steps)
-    ours, circles, network, placed = (found[key] for key in ("lag", "circles", "network", "lag+page"))
+    found = compare(strokes, size, 1 if size == max(SIZES) else subsets, seed)
+    ours, circles, placed = (found[key] for key in ("lag", "circles", "lag+page"))
     where = (
         f"real ink, {TEST} test strokes, split seed {SPLIT_SEED}; ours {_words(ours)}, sd of CSIM "
-        f"{ours[:, 0].std():.3f}; circle stamps {_words(circles)}; FRIDA-shaped network, first subset only, "
-        f"{_words(network)}, at most {network_steps} steps; lag alone {_words(found['lag-only'])}; with the place on "
-        f"the page {_words(placed)}; fit and prediction {found['seconds'].mean():.1f} s; {machine()}"
+        f"{ours[:, 0].std():.3f}; circle stamps {_words(circles)}; lag alone {_words(found['lag-only'])}; with "
+        f"the place on the page {_words(placed)}; fit and prediction {found['seconds'].mean():.1f} s; {machine()}"
     )
     results: list[Result] = []
     for column, what in enumerate(("csim", "iou")):
@@ -84,8 +81,6 @@ def measure(strokes: Strokes, size: int, subsets: int, seed: int, network_steps:
             return Result(name + suffix, mean, "of 1", peer, mean / against, len(scores), seed, where)
 
         results.append(line("", ours, "circle stamps", float(circles[:, column].mean())))
-        same = ours[: len(network)]
-        results.append(line(".first", same, "a network of FRIDA's shape", float(network[:, column].mean())))
         if size in GOALS:
             goal = GOALS[size][column]
             results.append(line("", ours, f"goal {goal:g}", goal))
@@ -99,13 +94,11 @@ def split(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return order[TEST:], np.sort(order[:TEST])
 
 
-def compare(
-    strokes: Strokes, size: int, subsets: int, seed: int, network_steps: int = NETWORK_STEPS
-) -> dict[str, Floats]:
+def compare(strokes: Strokes, size: int, subsets: int, seed: int) -> dict[str, Floats]:
     """Scores of every contestant, (subsets, 4) each, and the seconds of our fits, (subsets,)."""
     train, test = split(len(strokes.paths))
     captured = captured_distance(strokes.ink, 1.0 / PX_PER_MM)
-    found: dict[str, list[Scores]] = {key: [] for key in ("lag", "lag-only", "lag+page", "circles", "network")}
+    found: dict[str, list[Scores]] = {key: [] for key in ("lag", "lag-only", "lag+page", "circles")}
     seconds: list[float] = []
     for k in range(subsets):
         chosen = train if size >= len(train) else np.random.default_rng([seed, size, k]).permutation(train)[:size]
@@ -117,14 +110,6 @@ def compare(
         _, placed, above = predict(strokes, captured, chosen, test, page=True)
         found["lag+page"].append(score(strokes, test, placed, above))
         found["circles"].append(circles(strokes, chosen, test))
-        if k == 0:
-            shown = region(strokes)
-            seen = train_and_predict(
-                strokes.commands[chosen], strokes.ink[chosen][shown], strokes.commands[test], seed, network_steps
-            )
-            whole = np.zeros((len(test), *strokes.ink.shape[1:]))
-            whole[shown] = seen
-            found["network"].append(score(strokes, test, whole))
     table = {key: np.array([[s.csim, s.iou, s.shifted, s.gray] for s in each]) for key, each in found.items()}
     return table | {"seconds": np.array(seconds)}
 
@@ -192,7 +177,7 @@ def main(arguments: Sequence[str]) -> None:
     numbers = [int(word) for word in arguments if not word.startswith("--")]
     if "--sessions" in arguments:
         splits = numbers[0] if numbers else SESSION_SPLITS
-        _print(measure_sessions(splits, 0, QUICK_STEPS if quick else NETWORK_STEPS))
+        _print(measure_sessions(splits, 0))
         return
     subsets = numbers[0] if numbers else 2 if quick else SUBSETS
     try:
@@ -201,7 +186,7 @@ def main(arguments: Sequence[str]) -> None:
         sys.stderr.write(f"realink: skipped: {error}\n")
         return
     for size in numbers[1:] or (QUICK_SIZES if quick else SIZES):
-        _print(measure(strokes, size, subsets, 0, QUICK_STEPS if quick else NETWORK_STEPS))
+        _print(measure(strokes, size, subsets, 0))
     if not numbers[1:] and not quick:
         _print(measure_sessions(SESSION_SPLITS, 0))
 

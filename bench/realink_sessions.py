@@ -1,7 +1,7 @@
 """One session of a small brush predicted from another: real ink, two sessions of different travel.
 
 In each split a quarter of the target session is scored. The fit within the session and the one of the other session
-have the same number of training strokes, and so has the network. Further contestants are the other session's brush with
+have the same number of training strokes. Further contestants are the other session's brush with
 place and width adapted to 5 or 10 strokes of the target session, chosen by their commands among those that are not
 scored (`brushloop fit --drags --prior --strokes`). Every setting was chosen on training strokes of the big brush, or by
 the fit itself on its own training strokes.
@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, machine
-from bench.realink_network import train_and_predict
-from bench.realink_strokes import SMALL_A, SMALL_B, Strokes, drawn, load, region
+from bench.realink_strokes import SMALL_A, SMALL_B, drawn, load
 from brushloop.calibrate.compare.similarity import binary_scores
 from brushloop.calibrate.drags.captures import Drawn
 from brushloop.calibrate.drags.fit import captured_distance, clipped
@@ -30,12 +29,11 @@ STROKES = 90
 SCORED = 0.25
 ADAPTED = (5, 10)
 """Strokes of the target session that a known brush is adapted to."""
-NETWORK_STEPS = 500
 SHORT = {SMALL_A: "a", SMALL_B: "b"}
 Floats = NDArray[np.float64]
 
 
-def measure_sessions(splits: int, seed: int, network_steps: int = NETWORK_STEPS) -> list[Result]:
+def measure_sessions(splits: int, seed: int) -> list[Result]:
     """Both directions; empty where the strokes are not beside the checkout. Raises ValueError for splits < 1."""
     if splits < 1:
         raise ValueError(f"splits = {splits}: at least one is needed")
@@ -46,21 +44,12 @@ def measure_sessions(splits: int, seed: int, network_steps: int = NETWORK_STEPS)
     read = {name: drawn(strokes[name], name) for name in strokes}
     results: list[Result] = []
     for source, target in ((SMALL_A, SMALL_B), (SMALL_B, SMALL_A)):
-        found = _compare(read[source], read[target], strokes, source, target, splits, seed, network_steps)
-        results += _results(found, f"{SHORT[source]}-to-{SHORT[target]}", splits, seed, network_steps)
+        found = _compare(read[source], read[target], splits, seed)
+        results += _results(found, f"{SHORT[source]}-to-{SHORT[target]}", splits, seed)
     return results
 
 
-def _compare(
-    source: Drawn,
-    target: Drawn,
-    strokes: dict[str, Strokes],
-    source_name: str,
-    target_name: str,
-    splits: int,
-    seed: int,
-    network_steps: int,
-) -> dict[str, Floats]:
+def _compare(source: Drawn, target: Drawn, splits: int, seed: int) -> dict[str, Floats]:
     """(splits, 2) mean CSIM and IoU of every contestant."""
     found: dict[str, list[Floats]] = {}
     for k in range(splits):
@@ -75,7 +64,6 @@ def _compare(
         seen = {
             "within": within.ink(target, test),
             "circles": across.stamps.ink(target, test),
-            "network": _network(strokes[source_name], other, strokes[target_name], test, seed + k, network_steps),
         }
         seen["zero-shot"], seen["lag, zero-shot"] = known.ink_both_ways(target, test)
         seen["whole correction, zero-shot"] = across.predictor.ink(target, test)
@@ -98,31 +86,19 @@ def _slope(known: Predictor, target: Drawn, images: NDArray[np.int64]) -> Floats
     return np.full(2, float((missed * correction).sum() / (correction**2).sum()))
 
 
-def _network(
-    source: Strokes, chosen: NDArray[np.int64], target: Strokes, test: NDArray[np.int64], seed: int, steps: int
-) -> NDArray[np.bool_]:
-    shown = region(target)
-    seen = train_and_predict(source.commands[chosen], source.ink[chosen][shown], target.commands[test], seed, steps)
-    whole = np.zeros((len(test), *target.ink.shape[1:]), np.bool_)
-    whole[shown] = seen > 0.42
-    return whole
-
-
-def _results(found: dict[str, Floats], way: str, splits: int, seed: int, steps: int) -> Sequence[Result]:
+def _results(found: dict[str, Floats], way: str, splits: int, seed: int) -> Sequence[Result]:
     words = "; ".join(
         f"{name} {each[:, 0].mean():.3f} / {each[:, 1].mean():.3f} (sd {each[:, 0].std():.3f})"
         for name, each in found.items()
     )
-    conditions = (
-        f"real ink, small brush, {way}, {STROKES} training strokes, {splits} splits; CSIM / IoU, means: {words}; "
-        f"network: at most {steps} steps; {machine()}"
-    )
+    where = f"real ink, small brush, {way}, {STROKES} training strokes, {splits} splits"
+    conditions = f"{where}; CSIM / IoU, means: {words}; {machine()}"
     results: list[Result] = []
     for name in ("zero-shot", *(f"adapted to {count}" for count in ADAPTED)):
         label = f"realink.{way}.{name.replace(' ', '-')}"
         for column, what in enumerate(("csim", "iou")):
             ours = float(found[name][:, column].mean())
-            for peer, against in (("a fit within the session", "within"), ("a network of FRIDA's shape", "network")):
-                ratio = ours / float(found[against][:, column].mean())
-                results.append(Result(f"{label}.{what}", ours, "of 1", peer, ratio, splits, seed, conditions))
+            ratio = ours / float(found["within"][:, column].mean())
+            peer = "a fit within the session"
+            results.append(Result(f"{label}.{what}", ours, "of 1", peer, ratio, splits, seed, conditions))
     return results

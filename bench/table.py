@@ -18,11 +18,9 @@ GOALS = {
     "recorder write rate per CPU second": 0.8,
 }
 """The ratio that was asked for, by figure."""
-TIME_GOAL = 0.9
-"""For `growth-...-time`: a further stroke may take a tenth longer at the largest sizes than at the smallest."""
 _HEAD = """# Figures of the benches
 Written by `make bench` (speed and memory, about 12 minutes), `python -m bench --accuracy --table` (hours),
-`python -m bench.growth` (75 minutes), or `python -m bench NAME --table`, which renews the rows of one bench.
+or `python -m bench NAME --table`, which renews the rows of one bench.
 
 A ratio compares with the peer or limit named beside it, in the same run; above 1 is better for us. Figures of strokes
 and photographs are of the loopback rig, which is simulated. Each row says when it was measured.
@@ -67,9 +65,7 @@ def row(result: Result) -> str:
 
 
 def _goal(result: Result) -> float | None:
-    """The ratio that was asked for; 1 where the peer is itself a goal or a limit of growth."""
+    """The ratio that was asked for; 1 where the peer is itself a goal or a limit."""
     if result.name in GOALS:
         return GOALS[result.name]
-    if result.name.startswith("growth-"):
-        return TIME_GOAL if result.name.endswith("-time") else 1.0
     return 1.0 if "goal" in result.peer or result.name.endswith("-memory") else None

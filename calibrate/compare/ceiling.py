@@ -4,8 +4,8 @@ Presses of a cell stray from each other. Two of them differ by the strays of bot
 those of one. Strays displace the edges of a mark, and what a score loses grows with the distance between two edges. If
 the strays are independent from press to press and about normal, their mean distance is sqrt 2 times that of one press
 from the best image. So the ceiling is 100 - (100 - pairs) / sqrt 2, where `pairs` is the mean score of two presses of a
-cell in percent: a U-statistic, which two presses of each cell suffice for. `python -m bench ceiling` measures its bias
-and the coverage of its interval. No template takes its place: one of a few presses has strays of its own.
+cell in percent: a U-statistic, which two presses of each cell suffice for. No template takes its place: one of a few
+presses has strays of its own.
 """
 
 from __future__ import annotations
