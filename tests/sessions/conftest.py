@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import errno
 import functools
 import itertools
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -241,16 +239,3 @@ def run(make: Make, photos: Path, out: Path) -> Callable[..., Path]:
         return import_photographs(photos, photos / "table.csv", out, options, "brushloop 0", make.clock())
 
     return run
-
-
-@pytest.fixture
-def read_only_disk(monkeypatch) -> Callable[[], None]:
-    """Called, it makes every opening for writing fail, until the test ends."""
-    open_ = os.open
-
-    def read_only(path, flags, *more, **options):
-        if flags & (os.O_WRONLY | os.O_RDWR):
-            raise OSError(errno.EROFS, "Read-only file system", str(path))
-        return open_(path, flags, *more, **options)
-
-    return lambda: monkeypatch.setattr(os, "open", read_only)

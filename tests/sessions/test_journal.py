@@ -69,6 +69,7 @@ def test_a_last_line_without_only_its_end_is_a_whole_line(path):
 
 LINES = [encode_line(1, {"event": "sheet", "sheet": n}, n, "s") for n in range(1, 13)]
 FOREIGN = encode_line(1, {"event": "sheet", "sheet": 7}, 7, "other")
+BARE = encode_line(1, {"event": "sheet"}, 5, "s")
 WRONG = "line 5 does not match its CRC"
 
 
@@ -85,6 +86,7 @@ CHANGES = {
     "deep": (lambda a: [*a[:4], b"[" * 100_000 + b"\n", *a[5:]], [WRONG]),
     "bit": (lambda a: [*a[:4], a[4].replace(b"sheet", b"sheer"), *a[5:]], [WRONG]),
     "end": (lambda a: [*a[:4], a[4][:-1] + b"\x0b", *a[5:]], [WRONG, "line 6 is numbered 7"]),
+    "field": (lambda a: [*a[:4], BARE, *a[5:]], ["line 5 makes no sense: 'sheet' of event 'sheet' is missing"]),
     "torn": (lambda a: [*a[:-1], a[-1][:-9]], []),
 }
 
@@ -145,20 +147,3 @@ def test_the_latest_remark_on_a_capture_holds_and_the_earlier_ones_stay(tmp_path
     assert remarks_of(tmp_path)[4] == Remark(t_ns=3, still=4, stroke_id="H13-a0-r01", bad=False, note="good after all")
     assert remarks_of(tmp_path)[7].note == "pale"
     assert "ran" in (tmp_path / REMARKS_NAME).read_text(encoding="utf-8")
-
-
-def test_a_line_that_a_crash_cut_off_is_set_aside(tmp_path: Path) -> None:
-    add_remark(tmp_path, Remark(t_ns=1, still=4, stroke_id="a", bad=True, note=""))
-    with (tmp_path / REMARKS_NAME).open("ab") as file:
-        file.write(b'{"t_ns":2,"event":"rem')
-    assert set(remarks_of(tmp_path)) == {4}
-    add_remark(tmp_path, Remark(t_ns=3, still=5, stroke_id="b", bad=True, note=""))
-    assert set(remarks_of(tmp_path)) == {4, 5}
-
-
-def test_damage_is_named(tmp_path: Path) -> None:
-    add_remark(tmp_path, Remark(t_ns=1, still=4, stroke_id="a", bad=True, note=""))
-    path = tmp_path / REMARKS_NAME
-    path.write_bytes(path.read_bytes().replace(b'"still":4', b'"still":5'))
-    with pytest.raises(SessionDamaged, match="does not match its CRC"):
-        remarks_of(tmp_path)

@@ -128,12 +128,6 @@ def test_a_damaged_session_hides_no_other(root):
     ]
 
 
-def test_a_session_that_crashed_before_closed_is_open_though_its_file_is_there(root):
-    journal = root / "2026-01-02-grid-01" / JOURNAL_NAME
-    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:-1]))
-    assert next(summaries(root)) == Summary("2026-01-02-grid-01", "open", "", 3, "")
-
-
 def test_the_command_lists_them(root):
     ran = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["list", str(root)])
     assert ran.exit_code == 0

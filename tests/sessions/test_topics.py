@@ -93,26 +93,6 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
     assert (decoded["/log"].message, decoded["/log"].level) == ("brush is dry", 3)
 
 
-def test_quality_passes_where_every_check_does():
-    good, bad = Check(name="a", passed=True), Check(name="b", passed=False, reason="too dark")
-    assert Quality(stroke_id="s", checks=(good,)).verdict == "passed"
-    assert Quality(stroke_id="s", checks=(good, bad)).verdict == f"failed: {bad.name}"
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        lambda: Wrench(fx_n=float("nan"), fy_n=0, fz_n=0, mx_nm=0, my_nm=0, mz_nm=0),
-        lambda: InkState(level=1.2),
-        lambda: Cadence(topic="/x", expected_hz=0, received=0, missed=0),
-        lambda: joints_message(0, JOINTS, [0.0] * 5),
-    ],
-)
-def test_what_cannot_be_is_not_recorded(wrong):
-    with pytest.raises(ValueError, match=r"validation error|shorter|3 x 3"):
-        wrong()
-
-
 LAYOUT = Path(__file__).parents[2] / "docs" / "foxglove-layout.json"
 
 
