@@ -35,7 +35,7 @@ def calibrate_session(session: Path, lens: Path | None = None, progress: Progres
     where = str(recording.path)
     spec, known = board_of(recording), known_lens(recording, lens)
     progress(STEPS, 0, 3)
-    stills = list(recording.stills_of("board"))
+    stills = [still for _, still in recording.stills_of("board")]
     progress(STEPS, 1, 3)
     if not stills:
         raise CalibrationError(where, NO_BOARD)

@@ -121,15 +121,15 @@ class Recording:
         latest = remarks_of(self.path.parent).values()
         return {one.still: f"was marked bad{f': {one.note}' if one.note else ''}" for one in latest if one.bad}
 
-    def stills_of(self, kind: str) -> Iterator[bytes]:
-        """Encoded stills taken in steps of this kind (`board`)."""
+    def stills_of(self, kind: str) -> Iterator[tuple[int, bytes]]:
+        """Time in ns and encoded still, in order, of those taken in steps of this kind (`board`)."""
         current = ""
         for _schema, channel, message in self.messages(Topic.STEP, Topic.STILL):
             if channel.topic == Topic.STEP:
                 event = _event(self.path, StepEvent, message.data)
                 current = event.kind if event.phase == "begin" else ""
             elif current == kind:
-                yield decode_still(message.data, self.path)
+                yield message.log_time, decode_still(message.data, self.path)
 
     def messages(self, *topics: Topic) -> Iterator[Record]:
         """Messages on these topics, in the order in which they were written. Raises `SessionDamaged`."""

@@ -185,7 +185,7 @@ class _FolderRepair:
         for pattern in ("*.mcap", "*.mcap.damaged-*") if steps else ():
             for path in sorted(self._folder.glob(pattern)):
                 file = scan(path)
-                if not self._evidence.foreign(file):
+                if file.session in ("", self._evidence.session):
                     yield from _in_steps(file, steps)
 
     def _write_again(self, step: Done, records: list[Record]) -> None:
@@ -254,7 +254,7 @@ class _FolderRepair:
     def _holds_more(self, final: McapFile) -> bool:
         """Whether more whole strokes can be read of the damaged merged file than the files of steps hold."""
         in_steps = self._state.counts().get(Topic.STROKE, 0)
-        if self._evidence.foreign(final) or final.counts[Topic.STROKE] <= in_steps:
+        if final.counts[Topic.STROKE] <= in_steps:
             return False
         strokes: dict[str, bool] = {}
         for _record in _whole(final, strokes):

@@ -50,7 +50,7 @@ class Evidence:
     """The merged file."""
     reading: Reading
     files: dict[str, McapFile]
-    """What the files of steps and the merged file hold, by name."""
+    """What the files of steps and the merged file hold, by name, but those of another session."""
     session: str
     """Id of the session: neither lines nor files of another one are evidence of anything."""
     rebuilt: list[Event] = field(default_factory=list[Event])
@@ -69,11 +69,6 @@ class Evidence:
         at_end = sum(_place(event) > last for event in self.rebuilt)
         between = self.reading.missing - (len(self.rebuilt) - at_end)
         return max(0, between) + max(0, self.reading.unread_at_end - at_end)
-
-    def foreign(self, file: McapFile) -> list[str]:
-        """What is wrong with a file of another session: nothing in it is evidence."""
-        session = file.session
-        return [] if session in ("", self.session) else [f"is of another session, {session[:100]!r}"]
 
     def events(self) -> list[Event]:
         """Events of the journal as it must have been, with the rebuilt ones in their places."""
@@ -123,6 +118,7 @@ def gather(folder: Path) -> Evidence:
     if not final.is_file():  # the folder was renamed, and the journal has lost the name of the merged file
         final = next((path for path in recordings if files[path.name].session in ("", session)), final)
     files = {name: file for name, file in files.items() if SEGMENT_NAME.fullmatch(name) or name == final.name}
+    foreign = {name: files.pop(name).session for name in list(files) if files[name].session not in ("", session)}
     evidence = Evidence(folder, final, reading, files, session)
     _rebuild_steps(evidence)
     if reading.state.opened is None:
@@ -134,7 +130,11 @@ def gather(folder: Path) -> Evidence:
             # Only a rebuilt event can raise this: the journal's own were applied before.
             evidence.rebuilt = [other for other in evidence.rebuilt if other is not event]
     merged, state = files.get(final.name), evidence.state
-    if state.closed is not None or merged is None or merged.damage or merged.session != session:
+    listed = {*state.files, "" if state.closed is None else state.closed.file}
+    evidence.strays |= {
+        name: f"is of another session, {other[:100]!r}" for name, other in foreign.items() if name not in listed
+    }
+    if state.closed is not None or merged is None or merged.damage:
         return evidence
     # It holds more than the steps where their files are lost with their lines: it is then the only copy.
     if merged.counts and merged.counts >= Counter(state.counts()):
@@ -172,9 +172,7 @@ def _rebuild_steps(evidence: Evidence) -> None:
         step_name, own = SEGMENT_NAME.fullmatch(name), name.removesuffix(".part")
         if step_name is None:
             continue
-        if foreign := evidence.foreign(file):
-            evidence.strays |= {} if own in begun else {name: foreign[0]}
-        elif begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own) or _begun_by(_noted(file, DONE_NOTE, Done)):
+        if begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own) or _begun_by(_noted(file, DONE_NOTE, Done)):
             steps.append((name, file, begin))
             if begin.file not in begun:
                 begun[begin.file] = begin
@@ -245,7 +243,7 @@ def _captured(file: McapFile, begin: Begin) -> Done | None:
 
 def _opened(evidence: Evidence) -> events.Open:
     """The `open` of a session, from its files. Raises `SessionDamaged`."""
-    ours = [file for file in evidence.files.values() if file.header is not None and not evidence.foreign(file)]
+    ours = [file for file in evidence.files.values() if file.header is not None]
     if not ours:
         raise SessionDamaged(evidence.folder / JOURNAL_NAME, "has no `open` event, and no file holds its header")
     header = parse_header(max(ours, key=lambda file: file.session == evidence.session))  # its CRC matches, if one does
@@ -381,7 +379,7 @@ def _judge_file(
     file, problems = evidence.files.get(name), list[str]()
     verdict.files += file is not None or listed is not None
     if file is not None:
-        problems = evidence.foreign(file) or list(file.damage)
+        problems = list(file.damage)
         # In a closed session the merged file holds the same messages, so they are decoded only there.
         if not problems and (evidence.state.closed is None or name == evidence.final.name):
             problems = _content_problems(file, progress)

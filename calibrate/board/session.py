@@ -19,9 +19,8 @@ from brushloop.calibrate.board.view import see_board_and_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.line import Line, fit_line
-from brushloop.sessions.messages import decode_gray, decode_still
+from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import StepEvent, Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 EFFECTIVE = "rig.effective.json"
@@ -72,13 +71,8 @@ def known_lens(recording: Recording, given: Path | None) -> LensUsed | None:
 
 def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
     """(t_ns, gray photograph) of every `board` step in order. Raises `SessionDamaged` for one that cannot be read."""
-    kind = ""
-    for _schema, channel, message in recording.messages(Topic.STEP, Topic.STILL):
-        if channel.topic == Topic.STEP:
-            event = StepEvent.model_validate_json(message.data)
-            kind = event.kind if event.phase == "begin" else ""
-        elif kind == "board":
-            yield message.log_time, decode_gray(decode_still(message.data, recording.path), str(recording.path))
+    for t_ns, still in recording.stills_of("board"):
+        yield t_ns, decode_gray(still, str(recording.path))
 
 
 def _rig(session: SessionSource) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def write_calibration_page(recording: Recording, path: Path) -> Path:
 
 
 def _photograph(recording: Recording, made: Calibration, where: str) -> Gray:
-    stills = list(recording.stills_of("board"))
+    stills = [still for _, still in recording.stills_of("board")]
     if not stills:
         raise CalibrationError(where, NO_BOARD)
     used = [still for still in stills if hashlib.sha256(still).hexdigest() == made.still_sha256]

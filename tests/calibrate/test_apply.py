@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from bench.preprocess_rigs import board_of
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
 from brushloop.calibrate.calibration import Calibration
@@ -24,6 +23,7 @@ from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.world import World
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
+from tests.calibrate.simulated_rigs import board_of
 
 if TYPE_CHECKING:
     from conftest import Photographed

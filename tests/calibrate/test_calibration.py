@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bench.preprocess_rigs import board_of
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.spec import BoardSpec
@@ -21,6 +20,7 @@ from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.world import World
+from tests.calibrate.simulated_rigs import board_of
 from tests.command import brushloop
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from bench.preprocess_rigs import Shot, sheet, true_mask
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.session import calibrate_session
 from brushloop.sessions.records import Stroke
+from tests.calibrate.simulated_rigs import Shot, sheet, true_mask
 
 if TYPE_CHECKING:
     from conftest import Photographed

@@ -198,11 +198,13 @@ CASES = {
     "closed: steps and merged file": Case(steps_and_merged, "its index", ["capture H13-a05-r01"], BOTH[:1]),
     "closed: no merged file": Case(lambda f, _: (f / f"{ID}.mcap").unlink(), "is missing, though the journal says"),
     "closed: the merged file of another": Case(
-        lambda f, other: shutil.copy(other / f"{OTHER}.mcap", f / f"{ID}.mcap"), FOREIGN
+        lambda f, other: shutil.copy(other / f"{OTHER}.mcap", f / f"{ID}.mcap"), "has changed since it was recorded"
     ),
     "closed: the journal of another": Case(lambda f, other: shutil.copy(other / JOURNAL_NAME, f), FOREIGN),
     "closed: the journal of another and no steps": Case(merged_alone, FOREIGN),
-    "closed: a step of another": Case(step_of_another, FOREIGN, ["capture H13-a05-r00"], BOTH[1:]),
+    "closed: a step of another": Case(
+        step_of_another, "has changed since it was recorded", ["capture H13-a05-r00"], BOTH[1:]
+    ),
     "closed: a file of another that is not listed": Case(
         lambda f, other: shutil.copy(next(other.glob("*-capture-*.mcap")), f / "0099-capture-0123abcd.mcap"), FOREIGN
     ),

@@ -57,7 +57,7 @@ def test_stills_are_found_by_the_kind_of_their_step(make, path):
     board = [make.step(1, "board", "begin"), make.still(1), make.step(1, "board", "end")]
     capture = [make.step(2, "capture", "begin"), make.still(2), make.step(2, "capture", "end")]
     make.record(path, *board, *capture)
-    assert list(Recording(path).stills_of("board")) == [make.png(1)]
+    assert list(Recording(path).stills_of("board")) == [(make.still(1).log_ns, make.png(1))]
     assert list(Recording(path).stills_of("dip")) == []
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bench.preprocess_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.artefact import LensFile, lens_file, read_lens
@@ -30,6 +29,7 @@ from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Stroke
+from tests.calibrate.simulated_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 
 if TYPE_CHECKING:
     from conftest import Photographed

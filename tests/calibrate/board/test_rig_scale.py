@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.preprocess_rigs import CAMERAS, board_of, boards, lens_views, true_scale
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.view import see_board_and_lens
 from brushloop.drivers.sim.camera.optics import Optics
 from brushloop.drivers.sim.config import Table
+from tests.calibrate.simulated_rigs import CAMERAS, board_of, boards, lens_views, true_scale
 
 WORST = 2e-4
 BOARD = board_of(Table())

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.preprocess_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.view import see_board_and_lens
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify_distorted
+from tests.calibrate.simulated_rigs import BRUSHES, Shot, heading_free_window, sheet, true_mask
 
 
 def overlaps(shot: Shot, plane: Plane) -> list[float]:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from typer.testing import CliRunner
 
-from bench.preprocess_rigs import sheet
 from brushloop.__main__ import app, main
 from brushloop.calibrate.session import calibrate_session
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.sources import open_session
 from brushloop.sessions.records import Stroke
+from tests.calibrate.simulated_rigs import sheet
 
 if TYPE_CHECKING:
     from conftest import Photographed
