@@ -1,4 +1,4 @@
-"""Hooks of mkdocs for `make docs`: reference pages from the code, pages from outside docs/, decisions in the menu."""
+"""Hooks of mkdocs for `make docs`: reference pages from the code and pages from outside docs/."""
 
 from __future__ import annotations
 
@@ -15,13 +15,6 @@ ROOT = Path(__file__).resolve().parent.parent
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "SECURITY.md": "security.md"}
 """Pages of the repository's root, and their names on the site."""
 LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]*)(#[^)\s]*)?\)")
-
-
-def on_config(config: Any) -> Any:
-    """Add the decisions to the menu, in their order."""
-    decisions = sorted(path.name for path in (ROOT / "docs" / "decisions").glob("*.md"))
-    config.nav.append({"Decisions": [f"decisions/{name}" for name in decisions]})
-    return config
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -47,8 +40,6 @@ def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str
         path = posixpath.normpath(posixpath.join(posixpath.dirname(origin), target))
         if not (ROOT / path).exists():
             return found[0]  # mkdocs reports it
-        if path == "docs/decisions":
-            path = "docs/README.md"
         name = OUTSIDE.get(path, path.removeprefix("docs/") if path.startswith("docs/") else "")
         if files.get_file_from_path(name) is None:
             return f"{text} (`{path}` in the repository)"

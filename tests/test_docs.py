@@ -39,8 +39,6 @@ def test_tests_that_a_document_names_are_there(document: Path, tests: str) -> No
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_and_folders_of_ours_that_a_document_names_are_there(document: Path) -> None:
-    if document.parent.name == "decisions":
-        return  # of their day
     named = re.findall(
         r"`((?:collect|calibrate|drivers|sessions|model|bench|tests|examples)/[\w/.-]*)`", document.read_text()
     )

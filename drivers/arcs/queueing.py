@@ -269,5 +269,5 @@ def _not_begun(why: str) -> MotionFailed:
         "sequence",
         f"{why}; the brush must not go down before its lift is queued",
         condition="A stop was sent to the arm.",
-        remedy="Close other clients of the controller. See docs/decisions/0014-the-controller-lifts.md.",
+        remedy="Close other clients of the controller. See docs/decisions.md.",
     )
