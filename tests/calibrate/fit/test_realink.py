@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from bench import realink, realink_sessions
 from bench.realink import circles, predict, score, split
 from bench.realink_strokes import BIG, DATA, PX_PER_MM, load
 from brushloop.calibrate.drags.captures import commanded_path
@@ -40,37 +37,8 @@ def test_lag_beats_circle_stamps_on_strokes_that_were_never_fitted() -> None:
     assert ours.csim > stamps.csim + 0.08
 
 
-def test_without_the_strokes_the_comparison_is_skipped_and_says_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    monkeypatch.setattr(realink, "load", lambda: load(BIG, tmp_path))
-    assert realink.run(n=1) == []
-    assert "skipped: the real strokes" in capsys.readouterr().err
-
-
 def test_the_test_strokes_are_fixed_and_never_trained_on() -> None:
     train, test = split(187)
     assert len(test) == 40
     assert not set(train.tolist()) & set(test.tolist())
     assert split(187)[1].tolist() == test.tolist()
-
-
-def test_each_way_between_two_sessions_is_compared_with_a_fit_of_its_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    each = {
-        "within": 0.8,
-        "zero-shot": 0.7,
-        "adapted to 5": 0.75,
-        "adapted to 10": 0.78,
-        "circles": 0.6,
-    }
-    found = {name: np.array([[csim - 0.01, 0.5], [csim + 0.01, 0.5]]) for name, csim in each.items()}
-    monkeypatch.setattr(realink_sessions, "load", lambda name: name)
-    monkeypatch.setattr(realink_sessions, "drawn", lambda strokes, name: strokes)
-    monkeypatch.setattr(realink_sessions, "_compare", lambda *_: found)
-    results = {(r.name, r.peer): r for r in realink_sessions.measure_sessions(2, seed=0)}
-    ours = results["realink.b-to-a.adapted-to-10.csim", "a fit within the session"]
-    assert (ours.value, ours.ratio, ours.n) == pytest.approx((0.78, 0.78 / 0.8, 2))
-    assert "within 0.800 / 0.500 (sd 0.010)" in ours.conditions
-    assert results["realink.a-to-b.zero-shot.csim", "a fit within the session"].ratio == pytest.approx(0.7 / 0.8)
