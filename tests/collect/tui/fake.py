@@ -130,21 +130,6 @@ SPLIT = Prompt(
     image=capture(kept=False).photo,
     number=3,
 )
-JOGGED = Prompt(
-    "Touch 1 of 3. Jog until the tip just touches the paper. It is +1.00 mm from the expected height.",
-    (
-        Choice("1", "down 1 mm"),
-        Choice("2", "down 0.1 mm"),
-        Choice("3", "down 0.02 mm"),
-        Choice("8", "up 0.02 mm"),
-        Choice("9", "up 0.1 mm"),
-        Choice("0", "up 1 mm"),
-        Choice("t", "the tip just touches"),
-        Choice("x", "give up: the height stays unchanged"),
-    ),
-    "x",
-    number=4,
-)
 TOUCHED = Prompt(
     "Zero touch and plane: not all is within limits.\n"
     "  method               force\n"
