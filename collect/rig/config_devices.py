@@ -109,7 +109,7 @@ InkDeviceConfig = Annotated[InkStationConfig | ModbusPumpConfig, Field(discrimin
 
 
 class ForceConfig(Config):
-    """A force sensor between flange and brush, on a CAN bus of its own (docs/force-sensor.md)."""
+    """A force sensor between flange and brush, on a CAN bus of its own (docs/zero-touch.md)."""
 
     kind: Literal["sri-m8123"]
     interface: str = Field("socketcan", min_length=1)
