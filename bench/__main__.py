@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--accuracy", action="store_true", help=f"without NAME: {', '.join(whole.ACCURACY)}; hours")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--table", action="store_true", help=f"renew the figures' rows in {table.OUT.name}")
-    parser.add_argument("-n", "--largest", type=int, dest="n", help="rounds, or strokes")
+    parser.add_argument("-n", type=int, help="rounds, or strokes")
     options = parser.parse_args(arguments)
     if options.name is not None and options.name not in known:
         print(f"unknown bench {options.name!r}; known: {', '.join(known)}", file=sys.stderr)

@@ -129,13 +129,22 @@ def set_aside(path: Path, tag: str) -> Path:
         for number in itertools.count(1):
             kept = path.with_name(f"{path.name}.{tag}-{number}")
             if not kept.exists():
-                os.link(path, kept)
+                _link(path, kept)
                 return kept
             if filecmp.cmp(path, kept, shallow=False):
                 return kept
     except OSError as error:
         raise disk_error(path, "cannot keep a copy", error) from error
     raise AssertionError
+
+
+def _link(path: Path, kept: Path) -> None:
+    try:
+        os.link(path, kept)
+    except OSError:  # exFAT, for one, has no links
+        with path.open("rb") as source, kept.open("xb") as target:
+            shutil.copyfileobj(source, target)
+            sync(target)
 
 
 def unwritable(folder: Path) -> tuple[Path, str] | None:

@@ -90,6 +90,10 @@ class McapFile:
         """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
         return str(self.notes.get(HEADER_NOTE, {}).get("session_id", ""))
 
+    def may_be_of(self, session: str) -> bool:
+        """Whether the file is of this session, as far as its header can be read."""
+        return self.session in ("", session)
+
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
         """Messages in the order in which they were written, all or those on some topics, every CRC checked.
 

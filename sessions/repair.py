@@ -120,7 +120,7 @@ class _FolderRepair:
                 report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")
                 if name in self._begins:
                     self._lost_steps.append(f"{step_words(self._begins[name])}, whose file {what}")
-            if state.closed is None and self._final_problems:
+            if state.closed is None and self._final_problems and self._final.exists():
                 kept = self._move_aside(self._final)
                 report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept}")
             elif state.closed is not None:
@@ -185,7 +185,7 @@ class _FolderRepair:
         for pattern in ("*.mcap", "*.mcap.damaged-*") if steps else ():
             for path in sorted(self._folder.glob(pattern)):
                 file = scan(path)
-                if file.session in ("", self._evidence.session):
+                if file.may_be_of(self._evidence.session):
                     yield from _in_steps(file, steps)
 
     def _write_again(self, step: Done, records: list[Record]) -> None:

@@ -116,9 +116,9 @@ def gather(folder: Path) -> Evidence:
     reading.faults[:0] = unreadable
     final = merged_file(folder, reading.state)
     if not final.is_file():  # the folder was renamed, and the journal has lost the name of the merged file
-        final = next((path for path in recordings if files[path.name].session in ("", session)), final)
+        final = next((path for path in recordings if files[path.name].may_be_of(session)), final)
     files = {name: file for name, file in files.items() if SEGMENT_NAME.fullmatch(name) or name == final.name}
-    foreign = {name: files.pop(name).session for name in list(files) if files[name].session not in ("", session)}
+    foreign = {name: files.pop(name).session for name in list(files) if not files[name].may_be_of(session)}
     evidence = Evidence(folder, final, reading, files, session)
     _rebuild_steps(evidence)
     if reading.state.opened is None:
@@ -130,10 +130,10 @@ def gather(folder: Path) -> Evidence:
             # Only a rebuilt event can raise this: the journal's own were applied before.
             evidence.rebuilt = [other for other in evidence.rebuilt if other is not event]
     merged, state = files.get(final.name), evidence.state
-    listed = {*state.files, "" if state.closed is None else state.closed.file}
-    evidence.strays |= {
-        name: f"is of another session, {other[:100]!r}" for name, other in foreign.items() if name not in listed
-    }
+    for name, other in foreign.items():
+        # What the journal lists is told as changed, and written again from its other copy.
+        if name not in state.files and (state.closed is None or name != state.closed.file):
+            evidence.strays[name] = f"is of another session, {other[:100]!r}"
     if state.closed is not None or merged is None or merged.damage:
         return evidence
     # It holds more than the steps where their files are lost with their lines: it is then the only copy.

@@ -7,22 +7,18 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
 from typer.testing import CliRunner
 
 from brushloop.sessions import mcap_writer
 from brushloop.sessions import repair as repairs
 from brushloop.sessions.cli import app
-from brushloop.sessions.errors import DiskFull, InputError, SessionDamaged, SessionError
+from brushloop.sessions.errors import DiskFull, SessionDamaged, SessionError
 from brushloop.sessions.events import StepKind
 from brushloop.sessions.export import export
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import HEADER_NOTE
-from brushloop.sessions.repair import repair_session
 from brushloop.sessions.show import Summary, details, summaries
 from brushloop.sessions.verify import verify_session
-from tests.command import brushloop
 from tests.journal_lines import read_lines
 
 ID, OTHER = "2026-01-02-grid-01", "2026-01-03-grid-01"
@@ -70,7 +66,7 @@ class Case:
 
     damage: object
     """Called with the folder and that of another session."""
-    told: str
+    finding: str
     lost: list = field(default_factory=list)
     strokes: tuple = BOTH
 
@@ -236,8 +232,8 @@ def damaged(request, make, tmp_path, monkeypatch):
 def test_damage_is_told_and_repaired(make, damaged, case, other, repair, resume):
     case.damage(damaged, other)
     before = make.tree(damaged.parent)
-    found = [f"{finding.file}: {finding.what}" for finding in verify_session(damaged).findings]
-    assert any(case.told in line for line in found), found
+    findings = [f"{finding.file}: {finding.what}" for finding in verify_session(damaged).findings]
+    assert any(case.finding in line for line in findings), findings
     assert make.tree(damaged.parent) == before, "verify changed something"
     report = repair(damaged)
     assert (report.lost, report.lossless) == (case.lost, not case.lost)
@@ -427,41 +423,11 @@ def test_an_open_session_may_be_renamed(opened, resume, tmp_path):
     assert verify_session(renamed).sound
 
 
-LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, lambda: 0)]
-
-
-@pytest.mark.parametrize("look", LOOKS)
-def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
-    store.begin("k", StepKind.PRESS, patch=0).writer.abandon()
-    (part,) = store.folder.glob("*.part")
-    (tmp_path / "empty").mkdir()
-    before = make.tree(tmp_path)
-    for path, message in (
-        (part, f"was never finished, .* Give the session's folder, {store.folder}"),
-        (tmp_path / "empty", r"it holds neither journal\.jsonl nor a recording empty\.mcap"),
-        (tmp_path, rf"is not a session but holds 1 of them: give one, such as {store.folder}"),
-        (tmp_path / "gone", "no such session"),
-    ):
-        with pytest.raises(InputError, match=message) as refused:
-            look(path)
-        assert refused.value.exit_code == 2
-    assert make.tree(tmp_path) == before
-
-
-@pytest.mark.parametrize("command", ["verify", "repair"])
-def test_a_recording_of_another_program_is_no_session_and_not_damaged(tmp_path, command):
-    path = tmp_path / "drive.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.LZ4)
-        writer.start("ros2", "another recorder")
-        schema = writer.register_schema("geometry_msgs/Pose", "ros2msg", b"float64 x")
-        channel = writer.register_channel("/stroke", "cdr", schema)
-        writer.add_message(channel, 1, b"\0\1\0\0", 1)
-        writer.add_metadata("trip", {"car": "blue"})
-        writer.finish()
-    before = path.read_bytes()
-    ran = brushloop("sessions", command, path)
-    assert (ran.returncode, ran.stdout) == (2, "")
-    what = f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}"
-    assert ran.stderr == f"brushloop: {path}: {what}\n"
-    assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])
+def test_a_merged_file_of_another_session_in_an_open_one_is_put_aside_once(make, opened, other, repair):
+    shutil.copy(other / f"{OTHER}.mcap", opened / f"{ID}.mcap")
+    [finding] = verify_session(opened).findings
+    assert (finding.file, finding.what) == (f"{ID}.mcap", FOREIGN)
+    report = repair(opened)
+    assert (len(report.did), report.lossless) == (1, True)
+    assert (opened / f"{ID}.mcap.damaged-1").read_bytes() == (other / f"{OTHER}.mcap").read_bytes()
+    assert verify_session(opened).sound

@@ -8,12 +8,16 @@ import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from brushloop.sessions.errors import InputError, SessionDamaged
+from brushloop.sessions.events import StepKind
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import HEADER_NOTE, note
+from brushloop.sessions.repair import repair_session
+from brushloop.sessions.show import details
 from brushloop.sessions.verify import verify_session
+from tests.command import brushloop
 
 
 @pytest.fixture
@@ -21,10 +25,10 @@ def path(tmp_path):
     return tmp_path / "a.mcap"
 
 
-def foreign(path, *, metadata=None, use_chunking=True, messages=()):
+def foreign(path, *, metadata=None, messages=(), **options):
     """An MCAP file written by somebody else: (topic, encoding, data) of its messages."""
     with path.open("wb") as file:
-        writer = Writer(file, use_chunking=use_chunking)
+        writer = Writer(file, **options)
         writer.start()
         for name, values in (metadata or {}).items():
             writer.add_metadata(name, values)
@@ -159,3 +163,38 @@ def test_a_chunk_whose_data_claim_a_terabyte_is_damage(make, path):
     whole[place + 5] ^= 1
     path.write_bytes(whole)
     assert not verify_session(path).sound
+
+
+LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, lambda: 0)]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
+    store.begin("k", StepKind.PRESS, patch=0).writer.abandon()
+    (part,) = store.folder.glob("*.part")
+    (tmp_path / "empty").mkdir()
+    before = make.tree(tmp_path)
+    for path, message in (
+        (part, f"was never finished, .* Give the session's folder, {store.folder}"),
+        (tmp_path / "empty", r"it holds neither journal\.jsonl nor a recording empty\.mcap"),
+        (tmp_path, rf"is not a session but holds 1 of them: give one, such as {store.folder}"),
+        (tmp_path / "gone", "no such session"),
+    ):
+        with pytest.raises(InputError, match=message) as refused:
+            look(path)
+        assert refused.value.exit_code == 2
+    assert make.tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["verify", "repair"])
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+def test_a_recording_of_another_program_is_no_session_and_not_damaged(tmp_path, command, compression):
+    path = tmp_path / "drive.mcap"
+    trip, stroke = {"trip": {"car": "blue"}}, ("/stroke", "cdr", b"\0\1\0\0")
+    foreign(path, metadata=trip, messages=[stroke], compression=compression)
+    before = path.read_bytes()
+    ran = brushloop("sessions", command, path)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    what = f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}"
+    assert ran.stderr == f"brushloop: {path}: {what}\n"
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])

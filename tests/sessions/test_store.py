@@ -254,3 +254,15 @@ def test_a_merged_file_from_a_close_that_was_cut_is_kept_beside_the_new_one(make
     make.perform(again, "b")
     assert make.stroke_names(again.close()) == ["a", "b"]
     assert (store.folder / f"{store.folder.name}.mcap.superseded-1").read_bytes() == first
+
+
+def test_where_the_file_system_has_no_links_a_copy_is_kept(tmp_path, monkeypatch):
+    def no_links(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    kept = disk.set_aside(path, "damaged")
+    path.write_bytes(b"other")
+    assert (kept.read_bytes(), disk.set_aside(path, "damaged").name) == (b"precious", "a.mcap.damaged-2")
