@@ -374,5 +374,8 @@ class SegmentWriter:
         writer.flush()
         self.counts = writer.counts
         if self._finished is not None:
-            writer.add_metadata(DONE_NOTE, note({**self._finished, "counts": dict(self.counts)}))
+            done = note({**self._finished, "counts": dict(self.counts)})
+            # All twice, so that one wrong bit takes nothing from a session that has lost its journal as well.
+            for name, values in ((BEGIN_NOTE, note(self._begun or {})), (DONE_NOTE, done), (DONE_NOTE, done)):
+                writer.add_metadata(name, values)
         writer.finish()

@@ -172,7 +172,7 @@ def _rebuild_steps(evidence: Evidence) -> None:
         step_name, own = SEGMENT_NAME.fullmatch(name), name.removesuffix(".part")
         if step_name is None:
             continue
-        if begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own) or _begun_by(_noted(file, DONE_NOTE, Done)):
+        if begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own):
             steps.append((name, file, begin))
             if begin.file not in begun:
                 begun[begin.file] = begin
@@ -187,7 +187,7 @@ def _rebuild_steps(evidence: Evidence) -> None:
         done_again = evidence.reading.state.attempts.get(begin.key, 0) > begin.attempt
         if name.endswith(".part") or done_again or over & {begin.file, (begin.key, begin.attempt)}:
             continue
-        if (done := _noted(file, DONE_NOTE, Done) or _captured(file, begin)) is not None:
+        if (done := _noted(file, DONE_NOTE, Done)) is not None:
             # An empty digest matches no file, so a damaged file is found and repaired like any other.
             whole = name == begin.file and not file.damage and dict(file.counts) == done.counts
             over.add(begin.file)
@@ -197,31 +197,6 @@ def _rebuild_steps(evidence: Evidence) -> None:
             evidence.strays[name] = "is finished, but the result of its step cannot be read"
 
 
-def _begun_by(done: Done | None) -> Begin | None:
-    """The `begin` of a step of which only the end is known; None where the patches that it marked are not known."""
-    if done is None:
-        return None
-    sheet, patches = 0, tuple[int, ...]()
-    if isinstance(done.result, events.SelfCheckResult):
-        sheet, patches = done.result.sheet, done.result.patches
-    elif done.press is not None and done.press.sheet is not None:
-        sheet = done.press.sheet
-        patches = () if done.press.patch is None or done.kind not in MARKING else (done.press.patch,)
-    if done.kind in MARKING and not patches:
-        return None
-    return Begin(
-        t_ns=done.t_ns,
-        key=done.key,
-        kind=done.kind,
-        attempt=done.attempt,
-        sheet=sheet,
-        patch=next(iter(patches), None),
-        more_patches=patches[1:],
-        press=done.press,
-        file=done.file,
-    )
-
-
 def _noted(file: McapFile, note: str, kind: type[_E]) -> _E | None:
     """The event that a file notes; None where it makes no sense."""
     try:
@@ -229,16 +204,6 @@ def _noted(file: McapFile, note: str, kind: type[_E]) -> _E | None:
     except ValueError:
         return None
     return event if isinstance(event, kind) else None
-
-
-def _captured(file: McapFile, begin: Begin) -> Done | None:
-    """The `done` of a capture whose note is lost, from its stroke."""
-    if begin.press is None or not file.counts[Topic.STROKE]:
-        return None
-    *_, (_schema, _channel, stroke) = file.messages((Topic.STROKE,))
-    result, counts = events.CaptureResult(press=begin.press, still=stroke.sequence), dict(file.counts)
-    key, attempt = begin.key, begin.attempt
-    return Done(t_ns=begin.t_ns, key=key, attempt=attempt, file=begin.file, sha256="", counts=counts, result=result)
 
 
 def _opened(evidence: Evidence) -> events.Open:

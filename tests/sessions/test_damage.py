@@ -1,6 +1,7 @@
 """Every damage by name: what verify tells, what repair gives back, and how the session goes on afterwards."""
 
 import errno
+import re
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -77,17 +78,14 @@ def photograph_bit(folder, _):
     flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
 
 
-def end_of_step(kind):
+def end_of_press(folder, _):
     """Neither the journal nor the file tells the end of the step."""
-
-    def damage(folder, _):
-        path = file_of(folder, f"H13-a05-r01 {kind}")
-        done = b'"done"', path.name.encode()
-        at = next(n for n, line in enumerate(lines_of(folder)) if all(word in line for word in done))
-        keep_lines(folder, lambda lines: lines[:at])
-        flip(path, path.read_bytes().index(b"brushloop.done") + 40)
-
-    return damage
+    path = file_of(folder, "H13-a05-r01 press")
+    done = b'"done"', path.name.encode()
+    at = next(n for n, line in enumerate(lines_of(folder)) if all(word in line for word in done))
+    keep_lines(folder, lambda lines: lines[:at])
+    for note in re.finditer(b"brushloop.done", path.read_bytes()[:-1000]):
+        flip(path, note.start() + 40)
 
 
 def configuration(folder, _):
@@ -108,12 +106,13 @@ def steps_and_merged(folder, _):
     final.write_bytes(final.read_bytes()[: chunks(final)[-2].chunk_start_offset])
 
 
-def start_of_capture(folder, _):
-    """Neither the journal nor the file tells the begin of the step."""
+def notes_of_capture(folder, _):
+    """The journal does not mention the step, and its file says only once how it began and ended."""
     path = file_of(folder, "H13-a05-r01 capture")
     begins = next(n for n, line in enumerate(lines_of(folder)) if path.name.encode() in line)
     keep_lines(folder, lambda lines: lines[:begins])
-    flip(path, path.read_bytes().index(b"brushloop.begin") + 40)
+    for note in (b"brushloop.begin", b"brushloop.done"):
+        flip(path, path.read_bytes().index(note) + 40)
 
 
 def last_step(folder, _):
@@ -181,10 +180,9 @@ CASES = {
         lambda f, _: flip(f / JOURNAL_NAME, (f / JOURNAL_NAME).read_bytes().index(b'"result":{"kind":"press"')),
         "line 8 does not match its CRC",
     ),
-    "open: the end of a capture": Case(end_of_step("capture"), "does not match its CRC"),
-    "open: the start of a capture": Case(start_of_capture, "'brushloop.begin' does not match its CRC"),
+    "open: the notes of a capture": Case(notes_of_capture, "'brushloop.begin' does not match its CRC"),
     "open: the end of a press": Case(
-        end_of_step("press"),
+        end_of_press,
         "is finished, but the result of its step cannot be read",
         ["press H13-a05-r01, whose file is finished, but the result of its step cannot be read"],
     ),
