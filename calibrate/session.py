@@ -1,10 +1,12 @@
-"""Calibrate a session, choose which calibration it uses, and find the one in use."""
+"""A session opened for calculations; how it is calibrated, and which calibration it uses."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from brushloop.calibrate.artefact import current, load_artefact, made_by, put_to_use
 from brushloop.calibrate.board.detect import find_board
@@ -13,14 +15,62 @@ from brushloop.calibrate.board.session import NO_BOARD, board_of, board_stills, 
 from brushloop.calibrate.board.view import calibration_plane, paper_mm
 from brushloop.calibrate.calibration import Calibration, Foreign
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.store import FOLDER as FINISHED
+from brushloop.calibrate.store import Store
 from brushloop.calibrate.stroke.params import Params
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Stroke
+from brushloop.sessions.records import Header, Stroke
 from brushloop.sessions.terminal import Progress, unseen
 
 FITTED = "k1 fitted on the board"
 STEPS = "steps done: read the session, fit the plane, check the file"
+
+
+Kind = Literal["press", "drag"]
+OTHER_KIND = {
+    "press": "holds drags, which `fit --drags` and `validate` take: this needs presses",
+    "drag": "holds presses, which `fit` takes without --drags: this needs drags",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class OpenSession:
+    """A recording with what its strokes are read with."""
+
+    recording: Recording
+    sha256: str
+    strokes: tuple[Stroke, ...]
+    """At least one."""
+    calibration: Calibration | None
+    """None for an import, which has its own scale."""
+    store: Store
+
+    @property
+    def header(self) -> Header:
+        """Where the strokes come from."""
+        return self.recording.header
+
+    @property
+    def calibration_digest(self) -> str:
+        """Digest of the calibration; empty for an import."""
+        return "" if self.calibration is None else self.calibration.digest
+
+
+def open_session(path: Path, calibration: Path | None = None, kind: Kind | None = None) -> OpenSession:
+    """Open a session by its folder or MCAP file, with the calibration given, else the one in use.
+
+    Raises `InputError`, and `CalibrationError` for a session without strokes or with some of another kind, and as
+    `calibration_of` does.
+    """
+    recording = Recording(path)
+    sha256, strokes = recording.sha256, tuple(recording.stroke_records())
+    if not strokes:
+        raise CalibrationError(str(recording.path), "holds no strokes")
+    if kind is not None and any(stroke.kind != kind for stroke in strokes):
+        raise CalibrationError(str(recording.path), OTHER_KIND[kind])
+    used = calibration_of(recording, strokes[0], sha256, calibration)
+    return OpenSession(recording, sha256, strokes, used, Store(recording.path.parent / FINISHED))
 
 
 def calibrate_session(session: Path, lens: Path | None = None, progress: Progress = unseen) -> Path:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate import presses
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import SIZE_PX, Field, covered
-from brushloop.calibrate.compare.images import brush_of, prepare_press
-from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.session import calibration_of
-from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Recording
+from brushloop.calibrate.compare.field import SIZE_PX, Field
+from brushloop.calibrate.compare.images import brush_of
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.presses import Refused, cut, uncommanded
+from brushloop.calibrate.session import open_session
 from brushloop.sessions.records import Header
-from brushloop.sessions.terminal import Progress, counted, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
 Cell = tuple[float, float]
@@ -87,38 +87,24 @@ def read_presses(
     session: Path, view: Field, calibration_path: Path | None = None, progress: Progress = unseen
 ) -> Captures:
     """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
-    recording = Recording(session)
-    digest = recording.sha256
-    strokes = list(recording.stroke_records())
-    if not strokes or {stroke.kind for stroke in strokes} != {"press"}:
-        raise CalibrationError(str(recording.path), "holds no presses, or holds drags, which --drags fits")
-    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
+    opened = open_session(session, calibration_path, "press")
     pressed: list[Pressed] = []
     names: list[str] = []
-    refused: list[tuple[str, str]] = []
-    for capture in counted(recording.captures(), "presses read", len(strokes), progress):
-        stroke = capture.stroke
-        try:
-            prepared = prepare_press(capture, calibration, view)
-        except (CaptureRefused, SessionDamaged) as error:
-            refused.append((stroke.stroke_id, error.what))
-            continue
-        if stroke.depth_mm is None or stroke.tilt_deg is None:
-            refused.append((stroke.stroke_id, "has no depth or tilt"))
-        elif prepared.cut:
-            refused.append((stroke.stroke_id, "is cut by the edge of its photograph or cell"))
-        else:
-            ink = np.asarray(covered(prepared), np.float64)
-            pressed.append(Pressed(stroke.depth_mm, stroke.tilt_deg, ink))
-            names.append(stroke.stroke_id)
+    refused: list[Refused] = []
+    for press in presses.read_presses(opened, view, refused, uncommanded, cut, progress=progress):
+        depth_mm, tilt_deg, _ = astuple(press.condition)
+        pressed.append(Pressed(depth_mm, tilt_deg, np.asarray(press.coverage, np.float64)))
+        names.append(press.stroke.stroke_id)
     if not pressed:
-        raise CalibrationError(str(recording.path), "holds no press that can be used for a fit")
-    brush = brush_of(recording.header)
+        raise CalibrationError(str(opened.recording.path), "holds no press that can be used for a fit")
+    brush = brush_of(opened.header)
     radius, length = float(brush.radius_mm), float(brush.length_mm)
     grid, rows = grid_of(view), inked_rows([one.ink for one in pressed], view.mm_per_px)
     grid = Grid(grid.x_mm, grid.y_mm[rows])
     pressed = [Pressed(one.depth_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
-    return Captures(recording.header, digest, calibration, radius, length, rows, grid, pressed, names, refused)
+    return Captures(
+        opened.header, opened.sha256, opened.calibration, radius, length, rows, grid, pressed, names, refused
+    )
 
 
 def inked_rows(images: Sequence[NDArray[np.floating]], px_mm: float) -> slice:

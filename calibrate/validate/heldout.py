@@ -24,7 +24,7 @@ from brushloop.calibrate.fit.heldout import (
     refit_bezier,
     without,
 )
-from brushloop.calibrate.validate.pool import Scheduler
+from brushloop.calibrate.pool import Scheduler
 from brushloop.calibrate.validate.rows import Numbers, Rows
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import VERSION, Store

@@ -25,7 +25,7 @@ from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
-    from brushloop.calibrate.validate.pool import Scheduler
+    from brushloop.calibrate.pool import Scheduler
     from brushloop.calibrate.validate.sources import LoadedSession
     from brushloop.sessions.terminal import Progress
 

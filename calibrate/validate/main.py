@@ -17,13 +17,13 @@ from brushloop.calibrate.drags.report import DragValidation, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
+from brushloop.calibrate.pool import cluster, threads
 from brushloop.calibrate.report import framed, write_files
 from brushloop.calibrate.stroke.params import Params
 from brushloop.calibrate.validate.ablation import similarity_by_strokes
 from brushloop.calibrate.validate.candidates import generator_file
 from brushloop.calibrate.validate.extras import Extras, ExtrasRequest, find_extras
 from brushloop.calibrate.validate.gates import check_gates, parse_gate
-from brushloop.calibrate.validate.pool import cluster, threads
 from brushloop.calibrate.validate.report.data import Report
 from brushloop.calibrate.validate.report.figures import read_curve
 from brushloop.calibrate.validate.report.outputs import summary, summary_csv, table_3_csv, write_csv, write_parquet

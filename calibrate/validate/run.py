@@ -18,12 +18,12 @@ from brushloop.calibrate.compare.field import KEYS, Field
 from brushloop.calibrate.compare.images import brush_of, pack
 from brushloop.calibrate.compare.paper import ROBOT_WRITING
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.pool import Scheduler
 from brushloop.calibrate.scores import Score, Scores
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.candidates import Candidate, Generator
 from brushloop.calibrate.validate.heldout import refits_by_cell
 from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, prepared, score_job
-from brushloop.calibrate.validate.pool import Scheduler
 from brushloop.calibrate.validate.rows import Numbers, Row, Rows
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import Store

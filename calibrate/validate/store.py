@@ -17,8 +17,8 @@ from typing import Any
 
 import cbor2
 
-VERSION = "4"
-"""Version of the jobs. Increase it when a job's result for the same input changes, so that work is repeated."""
+from brushloop.calibrate.store import VERSION as VERSION
+
 TABLE = "CREATE TABLE IF NOT EXISTS work (number INTEGER PRIMARY KEY, key TEXT UNIQUE, crc INTEGER, body BLOB)"
 DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 Body = dict[str, Any]

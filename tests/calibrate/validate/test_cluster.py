@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.validate import pool
-from brushloop.calibrate.validate.pool import ClusterError
+from brushloop.calibrate import pool
+from brushloop.calibrate.pool import ClusterError
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [
@@ -116,7 +116,7 @@ def two_workers_one_of_them_lost(cluster: Cluster, make_session: object, tmp_pat
 def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> None:
     environment = os.environ | {"DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "1s"}
     program = (
-        "import sys, brushloop.__main__, brushloop.calibrate.validate.pool as pool; pool.CONNECT_S = 1.0; "
+        "import sys, brushloop.__main__, brushloop.calibrate.pool as pool; pool.CONNECT_S = 1.0; "
         f"sys.argv = ['brushloop', 'validate', {str(session)!r}, '--out', {str(tmp_path / 'out')!r}, "
         "'--scheduler', 'tcp://127.0.0.1:9']; brushloop.__main__.main()"
     )
@@ -135,8 +135,8 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
 
 def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     program = (
-        "import brushloop.calibrate.validate.store as store; store.VERSION = 'of tomorrow'\n"
-        "from brushloop.calibrate.validate.pool import ClusterError, cluster\n"
+        "import brushloop.calibrate.store as store; store.VERSION = 'of tomorrow'\n"
+        "from brushloop.calibrate.pool import ClusterError, cluster\n"
         f"try:\n    with cluster({cluster.address!r}):\n        pass\nexcept ClusterError as error:\n    print(error)\n"
     )
     ran = subprocess.run(
@@ -152,7 +152,7 @@ import os, signal
 from pathlib import Path
 from brushloop.calibrate.compare.field import Field
 from brushloop.calibrate.validate.jobs import PrepareJob, prepare_job
-from brushloop.calibrate.validate.pool import cluster, threads
+from brushloop.calibrate.pool import cluster, threads
 from brushloop.sessions.recording import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
 jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]

@@ -9,9 +9,9 @@ import pytest
 
 from bench.validate import scoring
 from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.pool import threads
 from brushloop.calibrate.validate import jobs
 from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
-from brushloop.calibrate.validate.pool import threads
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Options, validate_presses
 from brushloop.calibrate.validate.sources import open_session
 from brushloop.sessions.recording import Recording

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from typing import Any, ClassVar, TypeVar
 
 from brushloop.calibrate.errors import one_line
-from brushloop.calibrate.validate import store
+from brushloop.calibrate.store import VERSION
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -117,7 +117,7 @@ def _workers(client: Any, address: str) -> int:
 
 def software() -> str:
     """Version of this software, which every worker must match."""
-    return f"brushloop {version('brushloop')} (work {store.VERSION})"
+    return f"brushloop {version('brushloop')} (work {VERSION})"
 
 
 def _cores() -> int:

@@ -1,0 +1,165 @@
+"""The presses of a session, each found in its photograph once and laid on the millimetre field.
+
+Fit, validation, inversion, loop and twin read them from the session's store of finished work; what is not there yet is
+prepared side by side and kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from contextlib import nullcontext
+from dataclasses import astuple, dataclass
+
+import numpy as np
+
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.field import (
+    KEYS,
+    Alignment,
+    Field,
+    Image,
+    Key,
+    captured_mm,
+    captured_normalised,
+    covered,
+)
+from brushloop.calibrate.compare.images import prepare_press, to_pixels
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.pool import Scheduler, threads
+from brushloop.calibrate.session import OpenSession
+from brushloop.calibrate.store import Arrays, key_of
+from brushloop.calibrate.stroke.measure import Measured, measure
+from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Condition, Stroke
+from brushloop.sessions.terminal import Progress, counted, unseen
+
+Refused = tuple[str, str]
+"""(stroke, reason) of a capture that cannot be used: it is listed, never dropped in silence."""
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """A captured press on the millimetre field."""
+
+    stroke: Stroke
+    images: dict[Key, Image]
+    """(128, 128) in every alignment and tone."""
+    coverage: Image
+    """(128, 128) share of each pixel of the millimetre field that is ink."""
+    anchor_mm: tuple[float, float]
+    """The zero-touch point, from the field's left and top edge."""
+    measured: Measured
+    cut: bool
+    """Whether the stroke reaches the edge of its photograph, cell or field."""
+    flags: tuple[str, ...]
+    """Defects of the capture, although a stroke was found."""
+
+    @property
+    def condition(self) -> Condition:
+        """What was commanded; 0 for what an import does not say (`uncommanded` refuses those)."""
+        return Condition(self.stroke.depth_mm or 0.0, self.stroke.tilt_deg or 0.0)
+
+
+Unless = Callable[[Press], str]
+"""The reason why a press cannot be used, empty if it can."""
+
+
+def uncommanded(press: Press) -> str:
+    """Refuse a press of unknown depth or tilt."""
+    return "has no depth or tilt" if press.stroke.depth_mm is None or press.stroke.tilt_deg is None else ""
+
+
+def cut(press: Press) -> str:
+    """Refuse a press of which a part is missing."""
+    return "is cut by the edge of its photograph, cell or field" if press.cut else ""
+
+
+def too_thin(press: Press) -> str:
+    """Refuse a press that leaves one of the images blank."""
+    thin = next((key for key, image in press.images.items() if not to_pixels(image).any()), None)
+    return "" if thin is None else f"is too thin to be seen at the scale of {thin[0]} ({thin[1]})"
+
+
+def read_presses(
+    session: OpenSession,
+    view: Field,
+    refused: list[Refused],
+    *unless: Unless,
+    chosen: Collection[str] | None = None,
+    scheduler: Scheduler | None = None,
+    progress: Progress = unseen,
+) -> Iterator[Press]:
+    """Yield the presses of a session in order of capture, all or those of some names; the others go to `refused`.
+
+    Raises `SessionDamaged` for a recording that cannot be read; a photograph that cannot is refused.
+    """
+    store, bad = session.store, session.recording.marked_bad()
+    wanted = [k for k, stroke in enumerate(session.strokes) if chosen is None or stroke.stroke_id in chosen]
+    keys = {k: key_of("press", session.sha256, session.calibration_digest, view, k) for k in wanted}
+
+    def prepare(numbers: Collection[int]) -> None:
+        jobs = (
+            (keys[k], PrepareJob(capture, session.calibration, view))
+            for k, capture in enumerate(session.recording.captures() if numbers else ())
+            if k in numbers
+        )
+        with nullcontext(scheduler) if scheduler else threads() as used:
+            finished = used.run(prepare_job, jobs)
+            for key, arrays in counted(finished, f"{session.header.session_id}: found", len(numbers), progress):
+                store.put(key, arrays)
+
+    prepare({k for k in wanted if keys[k] not in store})
+    for k in wanted:
+        stroke, arrays = session.strokes[k], store.get(keys[k])
+        if arrays is None:  # damaged
+            prepare({k})
+            arrays = store.get(keys[k])
+            assert arrays is not None, "it was prepared"
+        press = None if "refused" in arrays else _press_of(stroke, arrays)
+        reasons = (why(press) for why in unless) if press is not None else (str(arrays["refused"]),)
+        if reason := next(filter(None, (bad.get(stroke.still, ""), *reasons)), ""):
+            refused.append((stroke.stroke_id, reason))
+        elif press is not None:
+            yield press
+
+
+@dataclass(frozen=True, slots=True)
+class PrepareJob:
+    """Find the stroke in its photograph and resample it to the images that are compared."""
+
+    capture: Capture
+    calibration: Calibration | None
+    view: Field
+
+
+def prepare_job(job: PrepareJob) -> Arrays:
+    """The entry of a press in the store; `refused` alone says why there is none."""
+    try:
+        prepared = prepare_press(job.capture, job.calibration, job.view)
+    except (CaptureRefused, SessionDamaged) as error:
+        return {"refused": np.array(error.what)}
+    assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
+    captured = {Alignment.MM: captured_mm, Alignment.SIZE_NORMALISED: captured_normalised}
+    return {
+        "images": np.stack([captured[alignment](prepared, tone) for alignment, tone in KEYS]),
+        "coverage": covered(prepared),
+        "anchor_mm": np.array(prepared.anchor_px) / PX_PER_MM,
+        "measured": np.array(astuple(measure(prepared.mask))),
+        "cut": np.array(prepared.cut),
+        "flags": np.array(prepared.flags, np.str_),
+    }
+
+
+def _press_of(stroke: Stroke, arrays: Arrays) -> Press:
+    x_mm, y_mm = arrays["anchor_mm"].tolist()
+    return Press(
+        stroke,
+        dict(zip(KEYS, arrays["images"], strict=True)),
+        arrays["coverage"],
+        (x_mm, y_mm),
+        Measured(*arrays["measured"].tolist()),
+        bool(arrays["cut"]),
+        tuple(arrays["flags"].tolist()),
+    )
