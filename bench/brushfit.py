@@ -2,7 +2,7 @@
 
 Brushes: the five frozen ones of the loopback rig, and two of an independent bristle simulation. Scores are CSIM of ink
 as 0 or 1 at 0.3 mm a pixel over cells that no training stroke came from; the ceiling is that of
-`calibrate.compare.ceiling`. Nothing of a brush's own family is in the prior that it is fitted with.
+`calibrate.stats`. Nothing of a brush's own family is in the prior that it is fitted with.
 
 Cells: the first of the fixed design (`calibrate.spread`), or any. Each draw takes other presses of them.
 """

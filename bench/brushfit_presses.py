@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError
-from brushloop.calibrate.compare.ceiling import ceiling_values, pair_means
-from brushloop.calibrate.compare.field import Field
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
+from brushloop.calibrate.stats import ceiling_values, pair_means
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.paper import Footprint
 from brushloop.sessions.imports import ImportOptions, import_photographs

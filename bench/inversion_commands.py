@@ -19,7 +19,7 @@ from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, PX_MM, SIZE_PX, BrushPresses, bristles, simulated
 from bench.brushfit_prior import BRISTLE
 from bench.harness import BenchError, Result
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.invert.invert import USELESS, Row, with_model_error

@@ -15,8 +15,8 @@ from pathlib import Path
 from bench.harness import BenchError, Result
 from bench.press_sessions import CELLS, Presses, session
 from bench.processes import brushloop
-from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.compare.paper import TABLE_2
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.validate.report.data import Report, load_report
 from brushloop.calibrate.validate.run import ANOTHER
 from brushloop.drivers.sim.brush_file import PAPER, load_brush

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.imports import ImportOptions, import_photographs

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bench.harness import BenchError, Result, machine
 from bench.realink_sessions import SESSION_SPLITS, measure_sessions
 from bench.realink_strokes import PX_PER_MM, Strokes, load, region
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.fit import INK_ABOVE, SPREAD_MM, Residual, captured_distance, fit_drags, threshold
 from brushloop.calibrate.drags.predict import STAMP_ABOVE, STAMP_SPREAD_MM
 from brushloop.model.drag import ink as chance

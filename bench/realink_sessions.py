@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, machine
 from bench.realink_strokes import SMALL_A, SMALL_B, drawn, load
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.captures import Drawn
 from brushloop.calibrate.drags.fit import captured_distance, clipped
 from brushloop.calibrate.drags.predict import BETWEEN_SESSIONS, Predictor, learn

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from bench.brushfit_brushes import FROZEN
 from bench.brushfit_presses import BRISTLE_SETS, CELLS, BrushPresses, bristles, simulated
 from bench.harness import BenchError, Result
-from brushloop.calibrate.compare.ceiling import CEILING
 from brushloop.calibrate.fit.heldout import BEZIER
+from brushloop.calibrate.stats import CEILING
 from brushloop.sessions.terminal import shown
 from brushloop.twin.run import TWIN, fit_twin, workers
 

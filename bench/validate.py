@@ -29,9 +29,17 @@ from bench.harness import BenchError, Result, interleave, machine
 from bench.peak import measure
 from bench.press_sessions import STILL, Presses, pressed, session
 from brushloop.calibrate import pool as pools
-from brushloop.calibrate.compare.field import BEST_SHIFT_PX, KEYS, SIZE_PX, Alignment, Field
-from brushloop.calibrate.compare.images import Pixels, pack, simulated_pixels, unpack
-from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.compare.place import (
+    KEYS,
+    SIZE_PX,
+    Alignment,
+    Field,
+    Pixels,
+    pack,
+    simulated_pixels,
+    unpack,
+)
+from brushloop.calibrate.compare.score import BEST_SHIFT_PX, csim, ssim
 from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, ScoreJob, prepare_job, score_job
 from brushloop.model.brush import Brush as Bundle
 from brushloop.model.strokes import stroke_models

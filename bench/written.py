@@ -19,8 +19,8 @@ from pathlib import Path
 from bench.brushfit_brushes import FROZEN
 from bench.harness import BenchError, Result, machine
 from bench.processes import ROOT, Process, started
-from brushloop.calibrate.compare.field import Alignment, Tone
-from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.writing.report import TABLE
 from brushloop.calibrate.writing.scores import ANOTHER, HEADLINE, REFERENCE, SIMULATED, Table3Row, read_written
 from brushloop.drivers.sim.brush_file import PAPER

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import Field
-from brushloop.calibrate.compare.images import rectified
+from brushloop.calibrate.compare.place import Field, rectified
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.stroke.params import PX_PER_MM

@@ -19,9 +19,17 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import Alignment, Field, Tone, covered
-from brushloop.calibrate.compare.images import brush_of, prepare_press, rectified, simulated
-from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.compare.place import (
+    Alignment,
+    Field,
+    Tone,
+    brush_of,
+    covered,
+    prepare_press,
+    rectified,
+    simulated,
+)
+from brushloop.calibrate.compare.score import csim, ssim
 from brushloop.calibrate.crops import ink_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS

@@ -13,7 +13,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import (
+from brushloop.calibrate.compare.place import (
     KEYS,
     Alignment,
     Field,
@@ -22,8 +22,9 @@ from brushloop.calibrate.compare.field import (
     captured_mm,
     captured_normalised,
     covered,
+    prepare_press,
+    to_pixels,
 )
-from brushloop.calibrate.compare.images import prepare_press, to_pixels
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.pool import Scheduler, threads
 from brushloop.calibrate.session import OpenSession

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.field import KEYS, Alignment, Key, Tone
+from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Tone
 from brushloop.sessions.records import Condition
 
 Values = NDArray[np.float64]

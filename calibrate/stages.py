@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import Field, Tone, captured_mm, crop, crop_at_anchor
-from brushloop.calibrate.compare.images import rectified
+from brushloop.calibrate.compare.place import Field, Tone, captured_mm, crop, crop_at_anchor, rectified
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray, write_whole
 from brushloop.calibrate.report import picture_grid, printable, save_picture, show_picture

@@ -16,7 +16,7 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
-from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.report.tables import table_1
 from brushloop.sessions.journal import replay

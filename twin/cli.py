@@ -32,7 +32,7 @@ def twin(
     from importlib.metadata import version
     from shlex import quote
 
-    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.compare.place import Field
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target, write_whole
     from brushloop.calibrate.fit.captures import read_presses

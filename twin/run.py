@@ -14,7 +14,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from brushloop.calibrate.compare.ceiling import CEILING
 from brushloop.calibrate.fit.captures import Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import (
     BEZIER,
@@ -23,6 +22,7 @@ from brushloop.calibrate.fit.heldout import (
     image_of,
     refit_bezier,
 )
+from brushloop.calibrate.stats import CEILING
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.config import SoundHead
 from brushloop.sessions.terminal import Progress, unseen

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.fit.captures import Grid
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.twin.constants import SPREAD, Offset, Vector, with_values

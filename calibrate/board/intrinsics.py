@@ -14,7 +14,7 @@ from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.lens import Floats, Lens, unknown_lens
 from brushloop.calibrate.board.pix2len import homography
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.line import student_95
+from brushloop.calibrate.stats import student_95
 
 Ways = NDArray[np.int64]
 LEAST_VIEWS = 4

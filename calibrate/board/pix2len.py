@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.board.lens import Floats, Lens, rms
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.line import student_95
+from brushloop.calibrate.stats import student_95
 
 MOST_OUTLIERS = 0.1
 WORST_RMS_PX = 1.0

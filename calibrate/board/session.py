@@ -18,7 +18,7 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import see_board_and_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.line import Line, fit_line
+from brushloop.calibrate.stats import Line, fit_line
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, counted, unseen

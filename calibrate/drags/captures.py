@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.images import prepare_cell
+from brushloop.calibrate.compare.place import prepare_cell
 from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, LENGTH_NAME, depth_of, prepare_drag
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import calibration_of

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.model.damped import Damping, Equations, descend
 from brushloop.model.drag import DragModel, distances, ink, trails
 

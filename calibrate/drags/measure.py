@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.line import Line, fit_line
+from brushloop.calibrate.stats import Line, fit_line
 from brushloop.calibrate.stroke.measure import Measured, measure, outline
 from brushloop.calibrate.stroke.params import Gray, Mask, Params
 from brushloop.calibrate.stroke.preprocess import Prepared, components, fill_holes, preprocess, touches_edge

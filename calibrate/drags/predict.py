@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.artefact import DragArtefact, Kept, Stamps
 from brushloop.calibrate.drags.fit import (
     INK_ABOVE,

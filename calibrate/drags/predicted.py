@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.compare.ceiling import CEILING, ceiling_values, pair_means
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.artefact import DragArtefact
 from brushloop.calibrate.drags.captures import Drawn, read_drags
 from brushloop.calibrate.drags.predict import Predictor, predictors
+from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
 from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]

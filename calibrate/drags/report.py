@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from rich.table import Column, Table
 
-from brushloop.calibrate.compare.ceiling import CEILING
 from brushloop.calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
 from brushloop.calibrate.drags.predicted import OURS, Predictions
 from brushloop.calibrate.report import (
@@ -26,6 +25,7 @@ from brushloop.calibrate.report import (
     source_note,
     write_files,
 )
+from brushloop.calibrate.stats import CEILING
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Header
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import FittedValue, made_by
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.artefact import DragArtefact, DragScore
 from brushloop.calibrate.drags.captures import COMMANDS, Drawn
 from brushloop.calibrate.drags.fit import DragFit, bootstrap, determined, fit_drags

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate import presses
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import SIZE_PX, Field
-from brushloop.calibrate.compare.images import brush_of
+from brushloop.calibrate.compare.place import SIZE_PX, Field, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import Refused, cut, uncommanded
 from brushloop.calibrate.session import open_session

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from brushloop.calibrate.artefact import load_artefact, put_to_use
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
 from brushloop.calibrate.fit.captures import Captures, read_presses
 from brushloop.calibrate.fit.report import write_fit_page

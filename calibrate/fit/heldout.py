@@ -10,12 +10,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.ceiling import CEILING, Average, average, ceiling_values, pair_means
-from brushloop.calibrate.compare.field import SIZE_PX
-from brushloop.calibrate.compare.images import draw_loop, to_pixels
+from brushloop.calibrate.compare.place import SIZE_PX, Alignment, draw_loop, to_pixels
+from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Floats, Grid, Pressed, by_cell, inked_rows
 from brushloop.calibrate.fit.fit import fit_presses, zero_touches
 from brushloop.calibrate.fit.prior import Prior
+from brushloop.calibrate.stats import CEILING, Average, average, ceiling_values, pair_means
 from brushloop.model.brush import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.loops import BEZIER_PIECES, Loop, bezier_side, closed
@@ -198,8 +198,8 @@ def _levels(image: Images) -> NDArray[np.uint8]:
 
 def _scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
     """(n, 2) CSIM and SSIM; NaN where an image is blank."""
-    from brushloop.calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
-
-    out = np.empty((len(predicted), 2))
-    compare(captured, np.stack(predicted), 0, out)
-    return out
+    nothing = (np.nan, np.nan)
+    known = captured.any()
+    return np.array(
+        [similarity(captured / 255.0, p / 255.0, Alignment.MM) if known and p.any() else nothing for p in predicted]
+    )

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
-from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, predictor
@@ -27,6 +26,7 @@ from brushloop.calibrate.report import (
     source_note,
     source_point,
 )
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
 from brushloop.model.brush import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.loops import Loop

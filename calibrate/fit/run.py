@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from brushloop.calibrate.artefact import made_by
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.fit.captures import Captures, Floats, by_cell
 from brushloop.calibrate.fit.fit import fit_presses, zero_touches
 from brushloop.calibrate.fit.heldout import HeldOut, leave_cell_out
 from brushloop.calibrate.fit.sizes import FEWEST_CELLS, Estimate, Size, sizes_of
-from brushloop.calibrate.line import student_95
+from brushloop.calibrate.stats import student_95
 from brushloop.model.fitted import NAMES, FittedPress
 from brushloop.sessions.terminal import Progress, unseen
 

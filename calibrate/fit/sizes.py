@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brushloop.calibrate.fit.captures import Floats, Grid, Pressed, by_cell
-from brushloop.calibrate.line import student_95
+from brushloop.calibrate.stats import student_95
 from brushloop.model.plane import fit_plane
 
 SIZES = ("reach toward the tip", "reach toward the heel", "width")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.fit.artefact import BrushFit

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import Field, Image, covered
-from brushloop.calibrate.compare.images import brush_of, prepare_press
+from brushloop.calibrate.compare.place import Field, Image, brush_of, covered, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.line import student_95
 from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stats import student_95
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.model.brush import DomainError
 from brushloop.model.inversion.noise import Noise

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.loop.compare import compare_sessions
 from brushloop.calibrate.loop.report import PICTURE, summary, write_loop

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import Field
-from brushloop.calibrate.compare.images import brush_of, captured_images, prepare_press, simulated
+from brushloop.calibrate.compare.place import Field, brush_of, captured_images, prepare_press, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.loop.scores import (

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1
-from brushloop.calibrate.compare.similarity import SSIM_SETTINGS
+from brushloop.calibrate.compare.place import KEYS, Alignment, Tone
+from brushloop.calibrate.compare.score import SSIM_SETTINGS
 from brushloop.calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison
 from brushloop.calibrate.loop.scores import AGAIN, GOAL_POINTS, LoopRecord, Pair, PairScore, Table1Row
 from brushloop.calibrate.loop.scores import FILE as NUMBERS

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.field import KEYS, Alignment, Image, Key, Tone
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1, Triple
-from brushloop.calibrate.compare.similarity import similarity
-from brushloop.calibrate.compare.stats import Summary, interval_over_groups, summarise
+from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Key, Tone
+from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.report import Sealed, load_sealed
+from brushloop.calibrate.stats import Summary, interval_over_groups, summarise
 from brushloop.calibrate.stroke.measure import Measured
 from brushloop.sessions.records import Condition, Source
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import (

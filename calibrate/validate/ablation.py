@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
-from brushloop.calibrate.compare.images import brush_of, loop_pixels, pack
+from brushloop.calibrate.compare.place import KEYS, Alignment, Tone, brush_of, loop_pixels, pack
 from brushloop.calibrate.pool import Scheduler
 from brushloop.calibrate.validate.heldout import Refit, RefitJob, bezier_pixels, refit_job, stroke_of
 from brushloop.calibrate.validate.jobs import ABSENT, ScoreJob, score_job

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brushloop.calibrate.compare.field import Field
-from brushloop.calibrate.compare.images import Pixels, brush_of, loop_pixels, simulated_pixels
+from brushloop.calibrate.compare.place import Field, Pixels, brush_of, loop_pixels, simulated_pixels
 from brushloop.calibrate.validate.heldout import Refit, bezier_pixels
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.model.brush import Brush, DomainError

@@ -56,7 +56,7 @@ def validate(
     """Compare every model with every captured stroke; run the same command again to resume."""
     import sys
 
-    from brushloop.calibrate.compare.field import Field
+    from brushloop.calibrate.compare.place import Field
     from brushloop.calibrate.validate.extras import ExtrasRequest
     from brushloop.calibrate.validate.main import Request, check
     from brushloop.calibrate.validate.main import validate as run

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from brushloop.calibrate.compare.stats import Paired, holm, paired
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stats import Paired, holm, paired
 from brushloop.calibrate.validate.report.data import Report, load_report
 from brushloop.sessions.disk import as_text
 

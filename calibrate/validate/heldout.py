@@ -11,8 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import Field
-from brushloop.calibrate.compare.images import Pixels, brush_of, loop_pixels, unpack
+from brushloop.calibrate.compare.place import Field, Pixels, brush_of, loop_pixels, unpack
 from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
 from brushloop.calibrate.fit.heldout import (
     BEZIER_SIZES,

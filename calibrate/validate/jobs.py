@@ -14,8 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import BEST_SHIFT_PX, KEYS, Alignment, Field, covered
-from brushloop.calibrate.compare.images import captured_images, pack, prepare_press, to_pixels, unpack
+from brushloop.calibrate.compare.place import (
+    KEYS,
+    Field,
+    captured_images,
+    covered,
+    pack,
+    prepare_press,
+    to_pixels,
+    unpack,
+)
+from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.scores import Values
 from brushloop.calibrate.stroke.measure import Measured, measure
@@ -180,12 +189,10 @@ def scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) 
 
     In the size-normalised alignment each prediction first takes its best shift. NaN where an image is blank.
     """
-    from brushloop.calibrate.compare.compiled import compare  # numba takes a fifth of a second to import
-
-    out = np.empty((len(predicted), len(KEYS), 2))
+    out = np.full((len(predicted), len(KEYS), 2), np.nan)
     for k, (alignment, _tone) in enumerate(KEYS):
-        found = np.empty((len(predicted), 2))
-        reach = BEST_SHIFT_PX if alignment is Alignment.SIZE_NORMALISED else 0
-        compare(captured[k], np.stack([image[k] for image in predicted]), reach, found)
-        out[:, k] = found
+        image = captured[k] / 255.0
+        for m, other in enumerate(predicted):
+            if image.any() and other[k].any():
+                out[m, k] = similarity(image, other[k] / 255.0, alignment)
     return out

@@ -10,7 +10,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.drags.measure import validate_drags
 from brushloop.calibrate.drags.predicted import predict_session
 from brushloop.calibrate.drags.report import DragValidation, write_drags

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from brushloop.calibrate.compare.ceiling import others_of
-from brushloop.calibrate.compare.field import KEYS, Field
-from brushloop.calibrate.compare.images import brush_of, pack
 from brushloop.calibrate.compare.paper import ROBOT_WRITING
+from brushloop.calibrate.compare.place import KEYS, Field, brush_of, pack
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.pool import Scheduler
 from brushloop.calibrate.scores import Score, Scores
+from brushloop.calibrate.stats import others_of
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.candidates import Candidate, Generator
 from brushloop.calibrate.validate.heldout import refits_by_cell

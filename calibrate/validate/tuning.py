@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.field import FINE, Field, Image
-from brushloop.calibrate.compare.images import axis_mm, brush_of, prepare_press
+from brushloop.calibrate.compare.place import FINE, Field, Image, axis_mm, brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.fit.heldout import folds
 from brushloop.calibrate.report import source_label

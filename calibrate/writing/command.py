@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.compare.field import Image
+from brushloop.calibrate.compare.place import Image
 from brushloop.calibrate.drags.artefact import DragArtefact
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import SIZE_PX, Image, Tone
-from brushloop.calibrate.compare.images import prepare_cell
+from brushloop.calibrate.compare.place import SIZE_PX, Image, Tone, prepare_cell
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.session import calibration_of

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import SessionFit, load_artefact, put_to_use
-from brushloop.calibrate.compare.field import SIZE_PX
-from brushloop.calibrate.compare.similarity import binary_scores
+from brushloop.calibrate.compare.place import SIZE_PX
+from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.captures import read_drags
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.plan_files import figure_record, write_record

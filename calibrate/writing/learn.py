@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.field import Image, Tone
+from brushloop.calibrate.compare.place import Image, Tone
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.compare import WritingComparison, as_ink

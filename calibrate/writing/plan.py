@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.similarity import csim, ssim
+from brushloop.calibrate.compare.score import csim, ssim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.model.characters.brush import Reach

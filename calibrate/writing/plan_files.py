@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import Image
+from brushloop.calibrate.compare.place import Image
 from brushloop.calibrate.report import picture_grid, save_picture, write_files
 from brushloop.calibrate.writing.plan_record import FILE, PROTOCOL, FigureRecord, Floats, PlannedBy, PlanRecord, Points
 from brushloop.model.characters.phases import Phase, phases_of

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from brushloop.calibrate.compare.field import SIZE_PX, Image
+from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.sessions.errors import SessionDamaged

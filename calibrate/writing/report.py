@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from brushloop.calibrate.compare.field import Alignment, Image, Tone
-from brushloop.calibrate.compare.similarity import SSIM_SETTINGS, Polarity
+from brushloop.calibrate.compare.place import Alignment, Image, Tone
+from brushloop.calibrate.compare.score import SSIM_SETTINGS, Polarity
 from brushloop.calibrate.report import (
     ink_uri,
     overlay,

@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from brushloop.calibrate.compare.ceiling import others_of
-from brushloop.calibrate.compare.field import SIZE_PX, Alignment, Image, Tone, to_tone
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
-from brushloop.calibrate.compare.similarity import Polarity, similarity
-from brushloop.calibrate.compare.stats import Summary, summarise
+from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, to_tone
+from brushloop.calibrate.compare.score import Polarity, similarity
 from brushloop.calibrate.report import Sealed, load_sealed
+from brushloop.calibrate.stats import Summary, others_of, summarise
 from brushloop.sessions.records import Source
 
 FILE, PICTURE = "written.json", "figure-13.png"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import SIZE_PX, Field, Tone, captured_mm
-from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.compare.place import SIZE_PX, Field, Tone, captured_mm
+from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.line import student_95
+from brushloop.calibrate.stats import student_95
 
 Floats = NDArray[np.float64]
 GOOD_SHARE, GOOD_S = 0.1, 0.03

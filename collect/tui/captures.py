@@ -13,7 +13,7 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.session import board_of
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import see_board
-from brushloop.calibrate.compare.similarity import csim
+from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit

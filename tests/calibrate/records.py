@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-from brushloop.calibrate.compare.field import KEYS
+from brushloop.calibrate.compare.place import KEYS
 from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
 from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3

@@ -15,7 +15,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.session import calibrate_session
 from brushloop.sessions.records import Stroke
 from tests.calibrate.simulated_rigs import Shot, sheet, true_mask

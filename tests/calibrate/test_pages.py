@@ -18,7 +18,7 @@ from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import Gray, lens_of
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
-from brushloop.calibrate.compare.field import KEYS, Field, Tone
+from brushloop.calibrate.compare.place import KEYS, Field, Tone
 from brushloop.calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison, Pairs
 from brushloop.calibrate.loop.report import write_loop
 from brushloop.calibrate.loop.scores import CapturedPress, Pair, score_pairs, table_1, verdicts

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate import presses, store
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
 from brushloop.calibrate.session import open_session
 from brushloop.sessions.recording import mark_bad_or_good

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from bench.press_sessions import Presses, session
 from brushloop.calibrate.cli import app
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stages import trace_scaled
 from brushloop.calibrate.stroke.params import Params

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.loop.scores import LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.writing.scores import WrittenRecord

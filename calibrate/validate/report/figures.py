@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import KEYS, Alignment, Tone
-from brushloop.calibrate.compare.images import Pixels, unpack
+from brushloop.calibrate.compare.place import KEYS, Alignment, Pixels, Tone, unpack
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import BLUE, ORANGE, ink_uri, overlay_uri, plot, plot_uri

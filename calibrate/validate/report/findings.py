@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-from brushloop.calibrate.compare.ceiling import CEILING, NEAR_POINTS, is_near
-from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.compare.paper import ORDER
-from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, LoopRecord
 from brushloop.calibrate.report import Point, source_point
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.report.data import Report, Session, Stat
 from brushloop.calibrate.validate.run import ANOTHER as ANOTHER_PRESS

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.table import Column, Table
 
-from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import replacing, write_whole
 from brushloop.calibrate.loop.scores import AGAIN

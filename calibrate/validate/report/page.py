@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from brushloop.calibrate.artefact import FOLDER
-from brushloop.calibrate.compare.ceiling import CEILING
-from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.compare.paper import TABLE_3
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.report import render, source_note
+from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.report import figures, findings, tables
 from brushloop.calibrate.validate.report.data import Extreme, Report, Session

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.ceiling import CEILING, average, ceiling_values
-from brushloop.calibrate.compare.field import KEYS, Alignment, Key, Tone
-from brushloop.calibrate.compare.images import brush_of
-from brushloop.calibrate.compare.similarity import SSIM_SETTINGS
-from brushloop.calibrate.compare.stats import Summary, summarise
+from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Tone, brush_of
+from brushloop.calibrate.compare.score import SSIM_SETTINGS
+from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, summarise
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.extras import Extras
 from brushloop.calibrate.validate.jobs import Press

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from brushloop.calibrate.compare.ceiling import CEILING
-from brushloop.calibrate.compare.field import Alignment, Tone
 from brushloop.calibrate.compare.paper import TABLE_1, TABLE_2, Printed
-from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.loop.scores import AGAIN, LoopRecord
+from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import candidates as who
 from brushloop.calibrate.validate.report.data import CandidateInfo, Report, Stat
 from brushloop.calibrate.validate.run import ANOTHER as ANOTHER_PRESS

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from brushloop.calibrate.line import student_95
+from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import CannotTeach
 from brushloop.drivers.samples import Pose
 

@@ -21,8 +21,7 @@ from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import LensUsed
 from brushloop.calibrate.board.view import see_board
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.field import Field, Tone, captured_mm
-from brushloop.calibrate.compare.images import prepare_press
+from brushloop.calibrate.compare.place import Field, Tone, captured_mm, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import FITTED, calibrate_session
 from brushloop.calibrate.stroke.params import PX_PER_MM

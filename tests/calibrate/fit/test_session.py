@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.compare.field import Alignment, Field, Tone
+from brushloop.calibrate.compare.place import Alignment, Field, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
 from brushloop.calibrate.fit.captures import read_presses

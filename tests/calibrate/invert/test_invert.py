@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.invert.command import PROTOCOL, write_inversion
 from brushloop.calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread

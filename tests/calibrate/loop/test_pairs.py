@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.field import Alignment, Field, Tone
-from brushloop.calibrate.compare.stats import interval_over_groups
+from brushloop.calibrate.compare.place import Alignment, Field, Tone
 from brushloop.calibrate.loop.compare import Pairs, pair_up
 from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
+from brushloop.calibrate.stats import interval_over_groups
 from brushloop.model.brush import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model

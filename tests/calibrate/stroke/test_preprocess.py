@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.line import fit_line
+from brushloop.calibrate.stats import fit_line
 from brushloop.calibrate.stroke.measure import measure
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare

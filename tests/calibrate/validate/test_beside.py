@@ -17,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop.scores import LoopRecord
 from brushloop.calibrate.validate.report import tables

@@ -150,7 +150,7 @@ def test_jobs_come_back_whole_and_alike_though_a_worker_dies(cluster: Cluster, s
     program = f"""
 import os, signal
 from pathlib import Path
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.validate.jobs import PrepareJob, prepare_job
 from brushloop.calibrate.pool import cluster, threads
 from brushloop.sessions.recording import Recording

@@ -12,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.field import Alignment, Tone
+from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.validate.report.data import load_report
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.tuning import align_captures

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.compare.ceiling import CEILING
-from brushloop.calibrate.compare.field import Alignment, Field, Tone
+from brushloop.calibrate.compare.place import Alignment, Field, Tone
 from brushloop.calibrate.fit.captures import read_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.fit.run import fit_session
+from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.main import Request, validate
 from brushloop.sessions.terminal import unseen

@@ -9,8 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.field import KEYS, Alignment, Field, Tone, best_shift
-from brushloop.calibrate.compare.images import pack, simulated, simulated_pixels
+from brushloop.calibrate.compare.place import (
+    KEYS,
+    Alignment,
+    Field,
+    Tone,
+    pack,
+    simulated,
+    simulated_pixels,
+)
+from brushloop.calibrate.compare.score import best_shift
 from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
 from brushloop.model.brush import Brush
 from brushloop.model.raster.exact import coverage_at

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.validate import scoring
-from brushloop.calibrate.compare.field import Field
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.pool import threads
 from brushloop.calibrate.validate import jobs
 from brushloop.calibrate.validate.jobs import PrepareJob, Press, prepare_job
@@ -43,12 +42,6 @@ def test_the_repetition_is_scored_against_its_original_only(
         # Two presses of one command by one brush: about as alike as the originals among themselves.
         another = outcome.scores.of(ANOTHER)[:10, :, 0]
         assert np.nanmean(found) == pytest.approx(np.nanmean(another), abs=0.05)
-
-
-def test_the_bench_holds_its_scores_to_scikit_image() -> None:
-    [result] = scoring(3, repeats=3, rounds=1)
-    assert result.ratio > 1.0
-    assert "worst difference" in result.conditions
 
 
 def test_a_capture_keeps_its_place(session: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brushloop.calibrate.compare.field import KEYS
+from brushloop.calibrate.compare.place import KEYS
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.validate.jobs import Press
 from brushloop.calibrate.validate.rows import Row, Rows

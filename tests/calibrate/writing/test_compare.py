@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.board.lens import LensUsed
-from brushloop.calibrate.compare.field import Alignment, Tone
-from brushloop.calibrate.compare.similarity import Polarity
+from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stroke.rectify import rectify_by
 from brushloop.calibrate.writing.compare import as_ink, captured, read_reference

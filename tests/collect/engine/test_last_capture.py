@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.field import Alignment, Field, Tone
-from brushloop.calibrate.compare.images import simulated
+from brushloop.calibrate.compare.place import Alignment, Field, Tone, simulated
 from brushloop.collect.engine.last_capture import LastCapture, mark_of
 from brushloop.model.fitted import FittedPress
 from brushloop.model.strokes import stroke_model

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.stats import holm, paired, summarise
+from brushloop.calibrate.stats import holm, paired, summarise
 
 
 def strata(*sizes: int) -> np.ndarray:
