@@ -40,7 +40,7 @@ lint: $(STAMP)-dev
 types: $(STAMP)-dev
 	$(BIN)/pyright
 
-bench: $(STAMP)-dev  ## speed and memory beside named peers, some 12 minutes, kept as a table in docs/bench.md
+bench: $(STAMP)-dev  ## speed and memory beside named peers, some 25 minutes, kept in docs/results.md
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m bench --table
 
 docs: $(STAMP)-dev  ## the documentation as a site, in build/site/index.html; warnings are errors

@@ -1,4 +1,4 @@
-"""How much the software adds to the arm's own motion: a session at the rig's real speed, taken apart.
+"""`bench overhead`: what a stroke takes, a session at the rig's real speed, taken apart.
 
 The controller, in a process of its own, tells when the arm really moved. What else a stroke takes is waiting for a
 device (the controller calls the arm steady some time after it has come to rest, the camera has an exposure to make) or
@@ -21,12 +21,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from bench.harness import BenchError, Result, machine
-from bench.processes import Process, lines_of_input, started, tell
+from bench.brushes import DEPTHS_MM
+from bench.harness import BenchError, Process, Result, at_most, lines_of_input, machine, rounds_of, started, tell
 
-HEIGHTS_MM = [11.0, 13.0, 15.0, 17.0, 20.0]
 DWELL_S = 0.2
-GOAL_PERCENT = 2.0
+GOAL_PERCENT, MOTION_GOAL_S = 2.0, 15.0
+STEPS = ("dip", "press", "capture")
+"""The steps of a stroke."""
 SILENCE = "stale_ms = 100.0\n"
 STEADY, FRAME, INK = "the controller calls the arm steady", "a fresh frame", "the ink station"
 WAITS = (STEADY, FRAME, INK)
@@ -53,15 +54,12 @@ class Watch:
 
 
 def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
-    """Software time of `n` strokes (4) as a share of the arm's motion, in all and by what it is.
+    """The motion of a stroke, by step; software time of `n` strokes (4) as a share of it, in all and by what it is.
 
-    CPU time is that of the thread that does the part; OpenCV's own threads are not in it.
-
-    Takes about half a minute a stroke. Raises BenchError where the session fails, ValueError for n < 1.
+    The conditions of a step's motion list its moves. CPU time is that of the thread that does the part; OpenCV's own
+    threads are not in it. Takes about half a minute a stroke. Raises BenchError where the session fails.
     """
-    strokes = 4 if n is None else n
-    if strokes < 1:
-        raise ValueError(f"n = {strokes}: at least one stroke is needed")
+    strokes = rounds_of(n, 4)
     watch = Watch()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -85,26 +83,44 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
     once_s = took.pop(BLANK)
     waits_s = sum(took[part] for part in WAITS) / strokes
     all_s = sum(took.values()) / strokes
-    conditions = f"loopback rig at its real speed, {motion_s:.1f} s of motion a stroke, dwell left out; {machine()}"
+    where = f"loopback rig at its real speed, {motion_s:.1f} s of motion a stroke, dwell left out; {machine()}"
 
-    def result(name: str, value: float, unit: str, peer: str, ratio: float) -> Result:
-        return Result(f"overhead: {name}", value, unit, peer, ratio, strokes, seed, conditions)
+    def percent(name: str, seconds: float) -> Result:
+        value = 100.0 * seconds / motion_s
+        return at_most(f"overhead: {name}", value, "% of motion", GOAL_PERCENT, strokes, seed, where)
 
-    results: list[Result] = []
-    for name, seconds in (("software", all_s - waits_s), ("software and waits for devices", all_s)):
-        percent = 100.0 * seconds / motion_s
-        results.append(result(name, percent, "% of motion", f"the goal ({GOAL_PERCENT:g} %)", GOAL_PERCENT / percent))
+    def part(name: str, seconds: float, unit: str) -> Result:
+        peer = "the motion of one stroke"
+        return Result(f"overhead: {name}", 1e3 * seconds, unit, peer, motion_s / seconds, strokes, seed, where)
+
+    results = [
+        at_most("overhead: motion", motion_s, "s a stroke", MOTION_GOAL_S, strokes, seed, where),
+        *(_motion_of(spans, step, motion_s, strokes, seed) for step in STEPS),
+        percent("software", all_s - waits_s),
+        percent("software and waits for devices", all_s),
+    ]
     for name, seconds in sorted(took.items(), key=lambda item: -item[1]):
-        each_ms = 1e3 * seconds / strokes
-        if each_ms < LEAST_MS:
-            continue
         unit = "ms a stroke, waited" if name in WAITS else "ms a stroke"
         if name in watch.cpu_s:
             unit = f"ms a stroke ({1e3 * watch.cpu_s[name] / strokes:.0f} ms of CPU)"
-        results.append(result(name, each_ms, unit, "the motion", 1e3 * motion_s / each_ms))
+        if 1e3 * seconds / strokes >= LEAST_MS:
+            results.append(part(name, seconds / strokes, unit))
     if 1e3 * once_s >= LEAST_MS:
-        results.append(result(BLANK, 1e3 * once_s, "ms a sheet", "the motion of one stroke", motion_s / once_s))
+        results.append(part(BLANK, once_s, "ms a sheet"))
     return results
+
+
+def _motion_of(spans: Spans, step: str, motion_s: float, strokes: int, seed: int) -> Result:
+    """Seconds of motion of one kind of step a stroke; the conditions name what each of its moves takes."""
+    moves: dict[int, list[float]] = defaultdict(list)
+    for begin_s, end_s in spans[step]:
+        inside = [(a, b) for a, b in spans["motion"] if begin_s <= a < end_s]
+        for number, (a, b) in enumerate(inside, 1):
+            moves[number].append(b - a)
+    each = ", ".join(f"move {number} {sum(taken) / strokes:.2f} s" for number, taken in sorted(moves.items()))
+    seconds = sum(itertools.chain.from_iterable(moves.values())) / strokes
+    peer, where = "the motion of one stroke", f"{each}; {machine()}"
+    return Result(f"overhead: motion of {step}", seconds, "s a stroke", peer, motion_s / seconds, strokes, seed, where)
 
 
 def share_out(spans: Spans, begin_s: float, end_s: float) -> dict[str, float]:
@@ -202,11 +218,11 @@ def _watching(watch: Watch) -> Iterator[None]:
 
 
 def _write_protocol(path: Path, strokes: int, seed: int) -> None:
-    heights = HEIGHTS_MM[:strokes]
-    repeats = -(-strokes // len(heights))
-    if repeats * len(heights) != strokes:
-        raise ValueError(f"n = {strokes}: up to {len(HEIGHTS_MM)}, or a multiple of it")
-    text = f'kind = "grid"\ndepths_mm = {heights}\ntilts_deg = [5.0]\nrepeats = {repeats}\n'
+    depths_mm = list(DEPTHS_MM[:strokes])
+    repeats = -(-strokes // len(depths_mm))
+    if repeats * len(depths_mm) != strokes:
+        raise ValueError(f"n = {strokes}: up to {len(DEPTHS_MM)}, or a multiple of it")
+    text = f'kind = "grid"\ndepths_mm = {depths_mm}\ntilts_deg = [5.0]\nrepeats = {repeats}\n'
     path.write_text(f"{text}dwell_s = {DWELL_S}\nseed = {seed}\n", encoding="utf-8")
 
 

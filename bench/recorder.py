@@ -19,7 +19,7 @@ from statistics import median
 import numpy as np
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from bench.harness import BenchError, Result
+from bench.harness import BenchError, Result, rounds_of
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter, encoded
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Event, Header, Source, Topic, Wrench
@@ -42,29 +42,23 @@ def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
     Rounds take turns. The plain file takes the same bytes, encoded in the same way, and knows no index, no CRC and no
     compression. Raises BenchError without foxglove-sdk (`pip install foxglove-sdk`), ValueError for n < 1.
     """
-    rounds = 3 if n is None else n
-    if rounds < 1:
-        raise ValueError(f"n = {rounds}: at least one round is needed")
+    rounds = rounds_of(n, 3)
     load = list(_load(seed, LOAD_S))
     megabytes = sum(len(encoded(outgoing.message)) for outgoing in load) / 1e6
     paced = list(_load(seed, PACED_S))
     contestants = (_ours, _foxglove, _plain)
     rates: dict[str, list[float]] = {c.__name__: [] for c in contestants}
-    cpu_rates: dict[str, list[float]] = {c.__name__: [] for c in contestants}
     shares: dict[str, list[float]] = {c.__name__: [] for c in (_ours, _foxglove)}
     worst: dict[str, list[float]] = {c.__name__: [] for c in (_ours, _foxglove)}
     with tempfile.TemporaryDirectory() as scratch:
         for _ in range(rounds):
             for contestant in contestants * FLAT_RUNS:
-                wall_s, cpu_s = _flat_out(contestant, Path(scratch), load)
-                rates[contestant.__name__].append(megabytes / wall_s)
-                cpu_rates[contestant.__name__].append(megabytes / cpu_s)
+                rates[contestant.__name__].append(megabytes / _flat_out(contestant, Path(scratch), load))
             for contestant in (_ours, _foxglove):
                 share, held_ms = _at_pace(contestant, Path(scratch), paced)
                 shares[contestant.__name__].append(share)
                 worst[contestant.__name__].append(held_ms)
     ours, foxglove, plain = (median(rates[c.__name__]) for c in contestants)
-    effort, effort_foxglove = (median(cpu_rates[c.__name__]) for c in (_ours, _foxglove))
     cpu, cpu_foxglove = (median(shares[c.__name__]) for c in (_ours, _foxglove))
     held, held_foxglove = (max(worst[c.__name__]) for c in (_ours, _foxglove))
     still_mb = len(encoded(paced[0].message)) / 1e6
@@ -78,13 +72,6 @@ def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
 
     return [
         result("write rate", ours, "MB/s", f"foxglove-sdk ({foxglove:.0f} MB/s)", ours / foxglove),
-        result(
-            "write rate per CPU second",
-            effort,
-            "MB/s",
-            f"foxglove-sdk ({effort_foxglove:.0f} MB/s)",
-            effort / effort_foxglove,
-        ),
         result("write rate, plain", ours, "MB/s", f"a plain file ({plain:.0f} MB/s)", ours / plain),
         result("CPU", 100 * cpu, "% of one core", f"foxglove-sdk ({100 * cpu_foxglove:.1f} %)", cpu_foxglove / cpu),
         result("worst hold-up", held, "ms", f"foxglove-sdk ({held_foxglove:.2f} ms)", held_foxglove / held),
@@ -107,16 +94,16 @@ def _load(seed: int, seconds: float) -> Iterator[Outgoing]:
         yield Outgoing(Topic.WRENCH, t_ns, t_ns, tick, Wrench(fx_n=fx, fy_n=fy, fz_n=fz, mx_nm=mx, my_nm=my, mz_nm=mz))
 
 
-def _flat_out(contestant: Contestant, folder: Path, load: list[Outgoing]) -> tuple[float, float]:
-    """Seconds from the first write until all is on disk, and of CPU meanwhile."""
+def _flat_out(contestant: Contestant, folder: Path, load: list[Outgoing]) -> float:
+    """Seconds from the first write until all is on disk."""
     gc.collect()
     place = folder / "flat"
     place.mkdir()
-    start, cpu = time.perf_counter(), time.process_time()
+    start = time.perf_counter()
     with contestant(place) as write:
         for outgoing in load:
             write(outgoing)
-    took = time.perf_counter() - start, time.process_time() - cpu
+    took = time.perf_counter() - start
     shutil.rmtree(place)
     return took
 

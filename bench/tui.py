@@ -1,11 +1,14 @@
-"""The operator's app under a rig's load, beside an idle app of textual, each in a terminal of its own.
+"""`bench tui`: the operator's app under a rig's load, in a terminal of its own.
 
-Force comes at 1 kHz, poses at 100 Hz, camera pictures at 5 Hz, on a terminal of 120 x 40.
+Force comes at 1 kHz, poses at 100 Hz, camera pictures at 5 Hz, on a terminal of 120 x 40. A thread of the same process
+makes them, as the drivers' threads do; `python -m bench.tui FILE` is that process, which writes what it measured.
 """
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
+import itertools
 import json
 import os
 import select
@@ -15,101 +18,72 @@ import subprocess
 import sys
 import tempfile
 import termios
+import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from bench.harness import BenchError, Result, machine, percentile
-from bench.processes import started
-from bench.tui_process import LOAD
+import numpy as np
 
-ROOT = Path(__file__).resolve().parent.parent
+from bench.harness import ROOT, BenchError, Result, at_most, machine, percentile, rounds_of
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.snapshot import CellCount, Picture, Snapshot
+from brushloop.collect.engine.telemetry import Telemetry
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.drivers.samples import ForceSample, Stamp
+from brushloop.sessions.records import Condition
+
 COLUMNS, ROWS = 120, 40
-SECONDS = 10.0
-UI_PERCENT = 8.0
-"""What the thread of the screen may take of a core under this load."""
-WAIT_S = 60.0
-READY = {"ours": b"RUNNING", "idle": b"brushloop"}
+SECONDS, TICK_S, STOPPING_S, PRESS_EVERY_S, WAIT_S = 10.0, 0.01, 0.15, 0.4, 60.0
+UI_PERCENT, STOP_MS, SCREEN_MS, LAG_MS, PAINT_S = 8.0, 5.0, 50.0, 20.0, 1.0
+"""The goals: share of a core, key to `engine.stop`, key to the screen, lag of the loop, and time to the first paint."""
 STOPPED = (b"STOP SENT", b"STOPPING")
 """Either shows the operator that the key was noticed."""
-PRESS_EVERY_S = 0.4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Measured:
-    """One app, run once."""
+    """One run of the app."""
 
     first_paint_s: float
-    seconds: dict[str, float]
-    """CPU of the process and of its screen's thread, and the wall's time, over the same span."""
-    times_ms: dict[str, list[float]]
-    """Lag of the loop, key to stop, key to screen."""
+    ui_percent: float
+    """CPU of the screen's thread, of a core."""
+    lag_ms: list[float]
+    to_stop_ms: list[float]
+    to_screen_ms: list[float]
 
 
-def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
-    """CPU share, lag of the loop, key to stop, key to screen, first paint: `n` runs (3) of each app in turns.
+def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
+    """CPU of the screen's thread, lag of its loop, key to stop, key to screen, first paint: `n` runs (3).
 
-    The seed changes nothing. Raises BenchError where an app does not come up, ValueError for n < 1.
+    The seed changes nothing. Raises BenchError where the app does not come up.
     """
-    rounds = 3 if n is None else n
-    if rounds < 1:
-        raise ValueError(f"n = {rounds}: at least one round is needed")
-    ours: list[Measured] = []
-    idle: list[Measured] = []
+    rounds = rounds_of(n, 3)
     with tempfile.TemporaryDirectory() as scratch:
-        for number in range(rounds):
-            ours.append(_measured("ours", Path(scratch) / f"ours-{number}"))
-            idle.append(_measured("idle", Path(scratch) / f"idle-{number}"))
-    conditions = f"{machine()}; {COLUMNS} x {ROWS}, force 1 kHz, poses 100 Hz, pictures 5 Hz"
+        runs = [_measured(Path(scratch) / str(number)) for number in range(rounds)]
+    where = f"{machine()}; {COLUMNS} x {ROWS}, force 1 kHz, poses 100 Hz, pictures 5 Hz"
 
-    def result(name: str, unit: str, value: float, peer: str, peer_value: float) -> Result:
-        ratio = peer_value / value if value > 0 else float("inf")
-        return Result(f"tui-{name}", value, unit, f"{peer} ({peer_value:.3g} {unit})", ratio, rounds, seed, conditions)
+    def p99(values: Callable[[Measured], list[float]]) -> float:
+        return percentile([value for one in runs for value in values(one)], 99)
 
-    def p(percent: float, runs: list[Measured], name: str) -> float:
-        return percentile([value for one in runs for value in one.times_ms[name]], percent)
-
-    idle_app = "an idle textual app"
-    return [
-        result("cpu", "% of a core", _share(ours, "process_s"), idle_app, _share(idle, "process_s")),
-        result("cpu-ui-thread", "% of a core", _share(ours, "ui_s"), idle_app, _share(idle, "ui_s")),
-        Result(
-            "tui-cpu-ui-thread-goal",
-            _share(ours, "ui_s"),
-            "% of a core",
-            f"goal {UI_PERCENT:g} % at most",
-            UI_PERCENT / _share(ours, "ui_s"),
-            rounds,
-            seed,
-            conditions,
-        ),
-        result("lag-p99", "ms", p(99, ours, "lag"), idle_app, p(99, idle, "lag")),
-        result("key-to-stop-p50", "ms", p(50, ours, "to stop"), idle_app, p(50, idle, "to stop")),
-        result("key-to-stop-p99", "ms", p(99, ours, "to stop"), idle_app, p(99, idle, "to stop")),
-        result("key-to-screen-p50", "ms", p(50, ours, "to screen"), idle_app, p(50, idle, "to screen")),
-        result("key-to-screen-p99", "ms", p(99, ours, "to screen"), idle_app, p(99, idle, "to screen")),
-        result(
-            "first-paint",
-            "s",
-            statistics.median(one.first_paint_s for one in ours),
-            "textual's own blank app",
-            statistics.median(one.first_paint_s for one in idle),
-        ),
-    ]
+    figures = (
+        ("tui-cpu-ui-thread", statistics.median(one.ui_percent for one in runs), "% of a core", UI_PERCENT),
+        ("tui-lag-p99", p99(lambda one: one.lag_ms), "ms", LAG_MS),
+        ("tui-key-to-stop-p99", p99(lambda one: one.to_stop_ms), "ms", STOP_MS),
+        ("tui-key-to-screen-p99", p99(lambda one: one.to_screen_ms), "ms", SCREEN_MS),
+        ("tui-first-paint", statistics.median(one.first_paint_s for one in runs), "s", PAINT_S),
+    )
+    return [at_most(name, value, unit, goal, rounds, seed, where) for name, value, unit, goal in figures]
 
 
-def _share(runs: list[Measured], name: str) -> float:
-    return statistics.median(100.0 * one.seconds[name] / one.seconds["wall_s"] for one in runs)
-
-
-def _measured(kind: str, file: Path) -> Measured:
-    feeding = started("bench.tui_process", "feed", str(file.with_suffix(LOAD))) if kind == "ours" else nullcontext()
-    with feeding, _terminal() as (ours, theirs):
+def _measured(file: Path) -> Measured:
+    with _terminal() as (ours, theirs):
         began = time.monotonic()
         process = subprocess.Popen(
-            [sys.executable, "-m", "bench.tui_process", kind, str(SECONDS), str(file)],
+            [sys.executable, "-m", "bench.tui", str(file)],
             cwd=ROOT,
             stdin=theirs,
             stdout=theirs,
@@ -118,25 +92,25 @@ def _measured(kind: str, file: Path) -> Measured:
             env={**os.environ, "TERM": "xterm-256color", "COLORTERM": "truecolor"},
         )
         try:
-            _read_until(ours, (READY[kind],), process)
-            painted = time.monotonic() - began
-            pressed_ns, to_screen = _press(ours, process)
+            _read_until(ours, (b"RUNNING",), process)
+            painted_s = time.monotonic() - began
+            pressed_ns, to_screen_ms = _press(ours, process)
             while process.poll() is None and time.monotonic() - began < WAIT_S:
                 _drain(ours, 0.05)
             if process.poll() != 0:
-                raise BenchError(f"the app `{kind}` ended with {process.poll()}")
+                raise BenchError(f"the app ended with {process.poll()}")
         finally:
             process.kill()
             process.wait()
     figures = json.loads(file.read_text(encoding="utf-8"))
-    seconds = {name: float(figures[name]) for name in ("wall_s", "process_s", "ui_s")}
-    to_stop = [(b - a) / 1e6 for a, b in zip(pressed_ns, figures["stops_ns"], strict=True)]
-    return Measured(painted, seconds, {"lag": figures["late_ms"], "to stop": to_stop, "to screen": to_screen})
+    to_stop_ms = [(b - a) / 1e6 for a, b in zip(pressed_ns, figures["stops_ns"], strict=True)]
+    return Measured(painted_s, figures["ui_percent"], figures["lag_ms"], to_stop_ms, to_screen_ms)
 
 
 def _press(terminal: int, process: subprocess.Popen[bytes]) -> tuple[list[int], list[float]]:
+    """When the stop key was pressed, and how long it took until the screen showed it, ms."""
     pressed_ns: list[int] = []
-    to_screen: list[float] = []
+    to_screen_ms: list[float] = []
     until = time.monotonic() + 0.8 * SECONDS
     _drain(terminal, 1.0)
     while time.monotonic() < until:
@@ -144,8 +118,8 @@ def _press(terminal: int, process: subprocess.Popen[bytes]) -> tuple[list[int], 
         pressed_ns.append(time.monotonic_ns())
         os.write(terminal, b"s")
         _read_until(terminal, STOPPED, process)
-        to_screen.append((time.monotonic_ns() - pressed_ns[-1]) / 1e6)
-    return pressed_ns, to_screen
+        to_screen_ms.append((time.monotonic_ns() - pressed_ns[-1]) / 1e6)
+    return pressed_ns, to_screen_ms
 
 
 def _read_until(terminal: int, words: tuple[bytes, ...], process: subprocess.Popen[bytes]) -> None:
@@ -174,3 +148,89 @@ def _terminal() -> Iterator[tuple[int, int]]:
     finally:
         os.close(ours)
         os.close(theirs)
+
+
+class BusyEngine:
+    """An engine without an arm, whose telemetry comes at a rig's rates until the process ends."""
+
+    def __init__(self) -> None:
+        self.stops_ns: list[int] = []
+        self._stopped_at = -1.0
+        self._began = time.monotonic()
+        self._telemetry = Telemetry()
+        rng = np.random.default_rng(0)
+        light = 120.0 + 80.0 * np.linspace(0.0, 1.0, 320)[None, :] * np.linspace(1.0, 0.7, 240)[:, None]
+        frames = [light + rng.normal(0.0, 4.0, (240, 320)) for _ in range(5)]
+        self._frames = [np.clip(frame, 0, 255).astype(np.uint8) for frame in frames]
+        threading.Thread(target=self._feed, name="telemetry", daemon=True).start()
+
+    def _feed(self) -> None:
+        due = time.monotonic()
+        for number in itertools.count():
+            force_n = 0.03 + 0.02 * (number // 100 % 7)
+            self._telemetry.force(ForceSample(Stamp(time.time_ns()), (0.0, 0.0, force_n), (0, 0, 0)))
+            due += 0.001
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def snapshot(self) -> Snapshot:
+        """The state of a run in its middle, the tip on its way."""
+        now = time.monotonic()
+        trace_n, picture = self._telemetry.trace_n(), int((now - self._began) / 0.2)
+        return Snapshot(
+            session_id="bench",
+            source="bench",
+            state=State.STOPPING if now - self._stopped_at < STOPPING_S else State.RUNNING,
+            step=f"press {int(now) % 30}",
+            strokes_done=13,
+            strokes_planned=150,
+            grid=tuple(
+                CellCount(Condition(float(h), float(a)), 3, 10) for h in (11, 13, 15, 17, 20) for a in (0, 5, 10)
+            ),
+            voids=0,
+            elapsed_s=now - self._began,
+            eta_s=100.0,
+            tip_mm=(400.0 + 10.0 * (now % 5.0), -45.0, 120.0 + 20.0 * (now % 3.0)),
+            messages=tuple(f"line {n}" for n in range(50)),
+            error="",
+            force_n=trace_n[-1] if trace_n else 0.0,
+            target_mm=(410.0, -45.0, 130.0),
+            trace_n=trace_n,
+            picture=Picture(picture, self._frames[picture % 5], 0.9),
+        )
+
+    def stop(self) -> None:
+        """Note the time."""
+        self.stops_ns.append(time.monotonic_ns())
+        self._stopped_at = time.monotonic()
+
+
+def main(file: Path) -> None:
+    """Run the app for `SECONDS` and write its figures."""
+    engine: Any = BusyEngine()
+    app = OperatorApp(engine)
+    lag_ms: list[float] = []
+    figures: dict[str, float] = {}
+
+    async def watch() -> None:
+        while True:
+            due = time.perf_counter() + TICK_S
+            await asyncio.sleep(TICK_S)
+            lag_ms.append(1e3 * (time.perf_counter() - due))
+
+    async def measure() -> None:
+        watching = asyncio.create_task(watch())
+        await asyncio.sleep(1.0)  # past its start
+        lag_ms.clear()
+        wall_s, thread_s = time.perf_counter(), time.thread_time()
+        await asyncio.sleep(SECONDS)
+        figures["ui_percent"] = 100.0 * (time.thread_time() - thread_s) / (time.perf_counter() - wall_s)
+        watching.cancel()
+        app.exit()
+
+    app.call_later(lambda: app.run_worker(measure()))
+    app.run()
+    file.write_text(json.dumps({**figures, "lag_ms": lag_ms, "stops_ns": engine.stops_ns}), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,7 +1,7 @@
 """Where jobs run: threads of this machine, or a Dask cluster. Both give the same results, in no fixed order.
 
 Threads, not processes: the work is OpenCV and compiled loops, which let other threads run, and a thread starts at once,
-while a process first spends seconds on imports (`bench validate` measures both).
+while a process first spends seconds on imports.
 """
 
 from __future__ import annotations

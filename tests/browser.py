@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
-from bench.report_picture import find_browser
+from bench.pictures import find_browser
 from tests.waiting import PATIENCE_S
 
 BROWSER = find_browser()

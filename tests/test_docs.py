@@ -13,7 +13,7 @@ import pytest
 import typer
 
 import brushloop.__main__
-from bench import moving
+from bench import pictures
 from brushloop.calibrate.path_or_command import PathOrCommand
 from tests.blocks import DOCUMENTS, ROOT, blocks_of
 
@@ -74,9 +74,9 @@ def test_commands_that_a_document_shows_exist_with_their_options(document: Path)
 
 
 def test_the_moving_picture_is_made_of_the_pictures_of_the_screens() -> None:
-    made = moving.session_picture(moving.FOLDER)
-    assert (moving.FOLDER / moving.NAME).read_text(encoding="utf-8") == made, "run `python -m bench.moving`"
-    assert made.count('<g class="frame"') == len(moving.SCREENS)
+    made = pictures.session_picture()
+    assert pictures.MOVING.read_text(encoding="utf-8") == made, "run `python -m bench.pictures screens`"
+    assert made.count('<g class="frame"') == len(pictures.SCREENS)
 
 
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:

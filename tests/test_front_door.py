@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import exit_codes
+from bench import pages
 from brushloop.__main__ import EXIT_CODES
 from tests.command import brushloop
 
@@ -129,5 +129,5 @@ def test_a_process_ends_with_that_line_and_that_code() -> None:
 
 
 def test_the_page_about_exit_codes_is_that_of_the_code() -> None:
-    assert exit_codes.PAGE.read_text(encoding="utf-8") == exit_codes.page(), "run `python -m bench.exit_codes`"
-    assert {code for code, _name, text in exit_codes.raised() if text} <= EXIT_CODES.keys()
+    assert pages.PAGE.read_text(encoding="utf-8") == pages.exit_codes(), "run `python -m bench.pages`"
+    assert {code for code, _name, text in pages.raised() if text} <= EXIT_CODES.keys()

@@ -48,7 +48,7 @@ MOST_SD = 0.7
 NORMAL_95 = 1.96
 WIDER = 3.5
 """Factor on the standard errors of mechanics and ink: constants that have nearly the same effect are known less well
-than the derivatives at one point say. It was chosen on two brushes of `DEVELOPMENT` in `bench/brushfit_brushes.py`."""
+than the derivatives at one point say. It was chosen on two brushes of `DEVELOPMENT` in `bench/brushes.py`."""
 Keep = Callable[[str, Found], None]
 """Called after each step with its name and the point that the search has reached."""
 PARTS = 3

@@ -31,7 +31,7 @@ Indices = NDArray[np.int64]
 
 BETWEEN_SESSIONS = 0.66
 """Share of a correction that is used in another session than the one it was learned in: the slope, through zero, of
-what the lag misses there on the correction. It is .75 and .57 for two sessions of one brush (`bench realink`)."""
+what the lag misses there on the correction. It is .75 and .57 for two sessions of one brush (`bench drags`)."""
 FIT_MM = 0.8
 """Scale of the images that the parameters are fitted to: finer ones do not change the fit."""
 STAMP_SPREAD_MM = 1.5

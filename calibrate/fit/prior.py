@@ -1,7 +1,7 @@
 """The prior knowledge of a brush: mean and covariance of the parameters over known brushes.
 
 `prior.json` holds the parameters of brushes of several families of shape, each fitted to many strokes
-(`python -m bench.brushfit_prior` makes it). Each family counts with the square root of its number of brushes, so that
+(`python -m bench.prior` makes it). Each family counts with the square root of its number of brushes, so that
 one large family does not make the others implausible. The covariance is shrunk toward its diagonal, because there are
 few brushes, and it has a floor, because the next brush may belong to none of the families.
 """

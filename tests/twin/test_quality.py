@@ -8,18 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.brushfit_presses import grid
+from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.fit.captures import grid_of
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush_file import PAPER, load_brush
 from brushloop.twin.run import LEAST_MISPLACED_MM, sound_head
 
+GRID = grid_of(Field())
 CELLS = [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
 
 
 def test_other_presses_of_a_brush_begin_where_its_twin_says() -> None:
     brush = Brush(load_brush(Path(PAPER)).spec)
-    head = sound_head(brush.spec, CELLS, grid())
+    head = sound_head(brush.spec, CELLS, GRID)
     assert head is not None
     for depth_mm, tilt_deg in CELLS:
         mark = brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=7)
@@ -29,12 +31,12 @@ def test_other_presses_of_a_brush_begin_where_its_twin_says() -> None:
 
 
 def test_the_default_brush_keeps_the_default_limit() -> None:
-    head = sound_head(BrushSpec(), CELLS, grid())
+    head = sound_head(BrushSpec(), CELLS, GRID)
     assert head is not None
     assert head.misplaced_mm == LEAST_MISPLACED_MM == QualityConfig().misplaced_mm
     assert head.head_mm == pytest.approx(QualityConfig().head_mm, abs=0.3)
 
 
 def test_without_ink_in_view_there_is_nothing_to_set() -> None:
-    elsewhere = replace(grid(), y_mm=grid().y_mm + 50.0)
+    elsewhere = replace(GRID, y_mm=GRID.y_mm + 50.0)
     assert sound_head(BrushSpec(), CELLS[:1], elsewhere) is None

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from bench.realink import circles, predict, score, split
-from bench.realink_strokes import BIG, DATA, PX_PER_MM, load
+from bench import accuracy
+from bench.brushes import DATA
 from brushloop.calibrate.drags.captures import commanded_path
-from brushloop.calibrate.drags.fit import captured_distance
-
-real = pytest.mark.skipif(not (DATA / BIG).is_dir(), reason="the folder of real strokes is not here")
 
 
 def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
@@ -21,24 +17,11 @@ def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
     assert path[:, 2].max() == pytest.approx(0.8 * 18.0)
 
 
-@real
+@pytest.mark.skipif(not (DATA / accuracy.BIG).is_dir(), reason="the folder of real strokes is not here")
 @pytest.mark.soak
+@pytest.mark.timeout(3000)
 def test_lag_beats_circle_stamps_on_strokes_that_were_never_fitted() -> None:
-    strokes = load()
-    assert len(strokes.paths) == 187
-    train, test = split(187)
-    chosen = np.random.default_rng(5).permutation(train)[:20]
-    captured = captured_distance(strokes.ink, 1.0 / PX_PER_MM)
-    _, corrected, above = predict(strokes, captured, chosen, test)
-    ours = score(strokes, test, corrected, above)
-    stamps = circles(strokes, chosen, test)
-    assert ours.csim > 0.82
-    assert ours.iou > 0.70
-    assert ours.csim > stamps.csim + 0.08
-
-
-def test_the_test_strokes_are_fixed_and_never_trained_on() -> None:
-    train, test = split(187)
-    assert len(test) == 40
-    assert not set(train.tolist()) & set(test.tolist())
-    assert split(187)[1].tolist() == test.tolist()
+    means = accuracy.drags_within(20, draw=0, seed=5)
+    assert means["predicted"]["csim"] > 0.82
+    assert means["predicted"]["iou"] > 0.70
+    assert means["predicted"]["csim"] > means["circle stamps"]["csim"] + 0.08

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bench.quality import Score, score
-from bench.quality_set import SPOTLESS_MM2, Bench, Blank, Sample
+from bench.quality import SPOTLESS_MM2, Bench, Blank, Sample, Score, score
 from brushloop.collect.quality.checks import check_capture, patch_is_blank
 from brushloop.collect.quality.verdict import Failure
 from brushloop.collect.rig.config_quality import QualityConfig

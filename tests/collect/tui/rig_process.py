@@ -10,7 +10,7 @@ import asyncio
 import sys
 from pathlib import Path
 
-from bench.processes import lines_of_input, tell
+from bench.harness import lines_of_input, tell
 from brushloop.drivers.arcs.codes import SafetyMode
 from brushloop.drivers.sim.brush.flaws import Flaw
 from brushloop.drivers.sim.config import SimConfig, View

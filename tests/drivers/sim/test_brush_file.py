@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
-from bench.brushfit_brushes import FROZEN
+from bench.brushes import FROZEN
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush_file import LOOPBACK, PAPER, load_brush

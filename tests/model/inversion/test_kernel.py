@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from bench.inversion_autograd import Rendered
 from brushloop.model.brush import Brush
 from brushloop.model.ccdbsm import ccdbsm
 from brushloop.model.inversion.forward import PARAMETERS, Outlines
@@ -17,6 +16,7 @@ from brushloop.model.outline import Outline
 from brushloop.model.protocol import Basis
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_models
+from tests.model.inversion.autograd import Rendered
 
 # torch's own forward mode compiles a part of itself with torch.jit, which it calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

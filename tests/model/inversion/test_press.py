@@ -11,7 +11,6 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bench.inversion_autograd import invert_rendered
 from brushloop.model.brush import Brush
 from brushloop.model.ccdbsm import ccdbsm
 from brushloop.model.inversion.noise import Noise
@@ -20,6 +19,7 @@ from brushloop.model.protocol import Basis
 from brushloop.model.raster.compiled import coverage_numpy
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_models
+from tests.model.inversion.autograd import invert_rendered
 
 # torch's own forward mode compiles a part of itself with torch.jit, which it calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

@@ -1,4 +1,7 @@
-"""Reference pages from the code: every command with its options, every field of `rig.toml` and `protocol.toml`."""
+"""Pages that are made from the code: hooks of mkdocs for `make docs`, and docs/exit-codes.md (`python -m bench.pages`).
+
+The reference pages show every command with its options, and every field of `rig.toml` and `protocol.toml`.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,58 @@ import ast
 import html
 import inspect
 import itertools
+import posixpath
+import re
 import textwrap
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, get_args
 
 import typer
+from mkdocs.structure.files import File, Files
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from brushloop.__main__ import EXIT_CODES
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "exit-codes.md"
+PACKAGES = ("calibrate", "collect", "drivers", "model", "sessions", "twin")
+OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "SECURITY.md": "security.md"}
+"""Pages of the repository's root, and their names on the site."""
+LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]*)(#[^)\s]*)?\)")
 NAMES = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that are made here."""
+    made = {
+        "reference/commands.md": commands(),
+        "reference/rig.md": rig(),
+        "reference/protocol.md": protocol(),
+        **{name: (ROOT / origin).read_text(encoding="utf-8") for origin, name in OUTSIDE.items()},
+    }
+    for name, content in made.items():
+        files.append(File.generated(config, name, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str:
+    """Point links to where pages lie on the site; what is only in the repository becomes its name."""
+    source = page.file.src_uri
+    origin = next((outside for outside, name in OUTSIDE.items() if name == source), f"docs/{source}")
+
+    def moved(found: re.Match[str]) -> str:
+        text, target, anchor = found[1], found[2], found[3] or ""
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(origin), target))
+        if not (ROOT / path).exists():
+            return found[0]  # mkdocs reports it
+        name = OUTSIDE.get(path, path.removeprefix("docs/") if path.startswith("docs/") else "")
+        if files.get_file_from_path(name) is None:
+            return f"{text} (`{path}` in the repository)"
+        return f"[{text}]({posixpath.relpath(name, posixpath.dirname(source) or '.')}{anchor})"
+
+    return LINK.sub(moved, markdown)
 
 
 def commands() -> str:
@@ -152,3 +198,51 @@ def _safe(text: str) -> str:
     """Text that Markdown shows as it is; code in backticks stays code."""
     parts = text.split("`")
     return "`".join(part if k % 2 else html.escape(part, quote=False) for k, part in enumerate(parts))
+
+
+def exit_codes() -> str:
+    """The page about exit codes, as Markdown."""
+    codes = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
+    errors = [f"| {code} | `{name}` | {text} |" for code, name, text in sorted(raised())]
+    return "\n".join(
+        [
+            "# Exit codes\n",
+            "Every command ends with one of these codes. An error is reported in one line that names the file, the "
+            "field and the allowed range.",
+            "This page is generated from the code by `python -m bench.pages`.\n",
+            "| code | meaning |",
+            "|---|---|",
+            *codes,
+            "\n## Errors in Python",
+            "Each error class has its code in `exit_code`; classes derived from these have the same one.\n",
+            "| code | class | meaning |",
+            "|---|---|---|",
+            *errors,
+            "",
+        ]
+    )
+
+
+def raised() -> Iterator[tuple[int, str, str]]:
+    """Code, full name and first line of the docstring of each class in the code that sets an exit code of its own."""
+    for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        if "exit_code" not in source:
+            continue
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ClassDef) and (code := _code(node)) is not None:
+                module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+                yield code, f"{module}.{node.name}", inspect.cleandoc(ast.get_docstring(node) or "").split("\n")[0]
+
+
+def _code(node: ast.ClassDef) -> int | None:
+    for line in node.body:
+        targets = [line.target] if isinstance(line, ast.AnnAssign) else getattr(line, "targets", [])
+        named = any(isinstance(target, ast.Name) and target.id == "exit_code" for target in targets)
+        if named and isinstance(value := getattr(line, "value", None), ast.Constant):
+            return int(str(value.value))
+    return None
+
+
+if __name__ == "__main__":
+    PAGE.write_text(exit_codes(), encoding="utf-8")

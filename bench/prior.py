@@ -1,21 +1,34 @@
-"""Families of made-up brushes for the prior of the brush fit: marks in closed form, unlike those of the loopback rig.
+"""`python -m bench.prior`: fit the brushes that the prior of the brush fit is made of, and write prior.json.
 
-`leaf`: two halves of superellipses. `spine`: discs along a line whose radius grows toward the heel. `bezier`: two cubic
-curves. Sizes, growth with depth and tilt, and place are drawn from ranges that were chosen before anything was fitted.
+Its families: the two bristle sets from an independent simulation, and three families of made-up marks in closed form:
+`leaf`, two halves of superellipses; `spine`, discs along a line whose radius grows toward the heel; `bezier`, two cubic
+curves. Their sizes, growth with depth and tilt, and place are drawn from ranges that were chosen before anything was
+fitted. Brushes of the loopback rig are not among them, so that scores on the rig are those of a brush that nobody knew.
+Each brush is fitted with a prior about the published model, so the file does not depend on its earlier contents.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.fit.captures import Grid, Pressed
-from brushloop.model.fitted import chance_within
+from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
+from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of, read_presses
+from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, about
+from brushloop.model.fitted import chance_within, published
 
+BRISTLE = "bristle simulation"
+ROWS = slice(28, 100)
+"""10.8 mm to either side: no press is thicker."""
 Floats = NDArray[np.float64]
 Shape = Callable[[Floats], Floats]
 """Half width over the greatest one, by place: -1 at the tip, 0 at the widest place, 1 at the heel."""
@@ -115,3 +128,37 @@ def _bezier(rng: np.random.Generator) -> Shape:
     place = 3.0 * (1.0 - t) * t * t * shoulder + t**3
     width = 0.15 * (1.0 - t) ** 2 * t + 3.0 * (1.0 - t) * t * t + t**3
     return lambda share: np.interp(1.0 - np.abs(share), place, width)
+
+
+def known() -> Iterator[KnownBrush]:
+    """Every brush of the prior, fitted. Raises BenchError where a bristle set is not at hand."""
+    for name in BRISTLE_SETS:
+        with tempfile.TemporaryDirectory() as folder:
+            captures = read_presses(bristle_session(Path(folder) / name, name), Field())
+        yield _fitted(name, BRISTLE, captures.strokes, captures.grid, captures.radius_mm, captures.length_mm)
+    whole = grid_of(Field())
+    grid = Grid(whole.x_mm, whole.y_mm[ROWS])
+    for family in FAMILIES:
+        for number in range(BRUSHES):
+            brush = made_up(family, number)
+            strokes = [brush.press(*cell, grid) for cell in CELLS]
+            yield _fitted(f"{family} {number + 1}", family, strokes, grid, brush.radius_mm, brush.length_mm)
+
+
+def _fitted(
+    name: str, family: str, strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float
+) -> KnownBrush:
+    press = fit_presses(strokes, grid, radius_mm, length_mm, residual=False, prior=about(published()))
+    return KnownBrush(name=name, family=family, values=tuple(round(float(v), 5) for v in press.values))
+
+
+def main() -> None:
+    """Write the file."""
+    brushes = KnownBrushes(brushes=tuple(known()))
+    rows = ",\n  ".join(brush.model_dump_json() for brush in brushes.brushes)
+    FILE.write_text(f'{{"brushes": [\n  {rows}\n]}}\n', encoding="utf-8")
+    sys.stdout.write(f"{len(brushes.brushes)} brushes: {FILE}\n")
+
+
+if __name__ == "__main__":
+    main()

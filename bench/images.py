@@ -1,0 +1,164 @@
+"""How fast marks become images, and presses are recovered from them: `bench raster` and `bench inversion`."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bench.harness import Result, at_most, interleave, machine, rounds_of
+from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.inversion.press import Inverter
+from brushloop.model.press_images import press_images
+from brushloop.model.protocol import Basis
+from brushloop.model.raster.frame import PX_MM, SIZE_PX
+
+BATCH = 64
+BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a training set
+SCALE = 4
+POINTS = 64  # along each side of an outline
+SHIFT = 4  # fractional bits of fillPoly's fixed-point corners
+DRAWS, SENSOR = 200, 0.05
+"""Presses to recover, and the standard deviation of the sensor's noise, of full ink."""
+INVERTED_PX_MM = 0.25  # so that an anchored press fits into 128 pixels
+INVERTED_MS, WORST_MM, WORST_DEG, BINARY_MM = 20.0, 0.001, 0.05, 0.02
+Floats = NDArray[np.float64]
+
+
+def raster(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
+    """Images per second of exact CCD-BSM coverage, 128 x 128, beside cv2.fillPoly at 4x with resize, and a memset.
+
+    Presses are drawn from H 11-20 mm, alpha 0-10 deg, heading 0, each in the middle of its image; both sides draw the
+    same ones. Ours counts everything from (H, alpha) to float32 images in memory that is used again; fillPoly gets its
+    outlines ready made and gives 8-bit images, is not exact (it paints its boundary pixels whole, so its marks come out
+    about 1 % too large, and at 4x it knows 17 levels of gray), and each of its images is a zeroed canvas, a fill and an
+    area mean. The memset clears the same images. 64 images a call on one thread, or, as `-bulk`, 1024 on as many
+    threads as there are cores, as do their peers.
+
+    ratio = our images/s over the peer's, in CPU seconds of all threads and means of the quickest tenth of the rounds:
+    other work on the machine only ever slows.
+    """
+    rounds, rng, cores, brush = rounds_of(n, 60), np.random.default_rng(seed), os.cpu_count() or 1, Brush()
+    depth_mm, tilt_deg = rng.uniform(11, 20, BULK), rng.uniform(0, 10, BULK)
+    images = np.empty((BULK, SIZE_PX, SIZE_PX), np.float32)
+    polygons = outlines(depth_mm[:BATCH], tilt_deg[:BATCH])
+
+    def few() -> None:
+        # BULK images in calls of BATCH; a single short call would mostly measure caches that the peer has emptied.
+        for _ in range(BULK // BATCH):
+            press_images(brush, depth_mm[:BATCH], tilt_deg[:BATCH], threads=1, out=images[:BATCH])
+
+    def many() -> None:
+        press_images(brush, depth_mm, tilt_deg, threads=cores, out=images)
+
+    def filled(which: NDArray[np.int32]) -> None:
+        for polygon in which:
+            fill(polygon)
+
+    with _one_thread(), ThreadPoolExecutor(cores) as pool:
+
+        def shared() -> None:
+            list(pool.map(filled, np.array_split(polygons, cores)))
+
+        contests: tuple[tuple[str, Callable[[], object], Callable[[], object], int, str], ...] = (
+            ("raster-press", few, lambda: filled(polygons), BATCH, "cv2.fillPoly at 4x"),
+            ("raster-press-memset", few, lambda: clear(images[:BATCH]), BATCH, "memset"),
+            ("raster-press-bulk", many, shared, BATCH, f"cv2.fillPoly at 4x on {cores} threads"),
+            (
+                "raster-press-bulk-memset",
+                many,
+                lambda: list(pool.map(clear, np.array_split(images, cores))),
+                BULK,
+                f"memset on {cores} threads",
+            ),
+        )
+        results: list[Result] = []
+        for name, ours, peer, peers, of in contests:
+            turns = interleave(ours, peer, rounds, time.process_time)
+            ours_s, peer_s = turns.quickest_s[0] / BULK, turns.quickest_s[1] / peers
+            ratios = turns.ratios(BULK / peers)
+            results.append(Result(name, 1 / ours_s, "images/s", of, peer_s / ours_s, rounds, seed, machine(), **ratios))
+        return results
+
+
+def clear(images: NDArray[np.float32]) -> None:
+    """memset of all the images."""
+    ctypes.memset(images.ctypes.data, 0, images.nbytes)
+
+
+def outlines(depth_mm: Floats, tilt_deg: Floats) -> NDArray[np.int32]:
+    """The marks of these presses as polygons in fillPoly's fixed-point pixels at 4x, (B, 2 POINTS, 2)."""
+    mark = ccdbsm(Brush(), torch.from_numpy(depth_mm), torch.from_numpy(tilt_deg))
+    # Points crowd at both ends, where the outline turns fastest.
+    share = 0.5 - 0.5 * torch.cos(torch.linspace(0, torch.pi, POINTS))
+    x = mark.x_min_mm[:, None] + share * mark.length_mm[:, None]
+    width = mark.half_width(x)
+    middle = 0.5 * (mark.x_min_mm + mark.x_max_mm)[:, None]
+    x, y = torch.cat((x, x.flip(1)), dim=1), torch.cat((width, -width.flip(1)), dim=1)
+    # fillPoly counts from pixel centres, images from pixel edges.
+    points = torch.stack((x - middle, -y), dim=-1) * SCALE / PX_MM + 0.5 * SCALE * SIZE_PX - 0.5
+    return (points * 2**SHIFT).round().to(torch.int32).numpy()
+
+
+def fill(polygon: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """One polygon filled at 4x and averaged down to 128 x 128, 0-255."""
+    canvas = np.zeros((SCALE * SIZE_PX, SCALE * SIZE_PX), np.uint8)
+    cv2.fillPoly(canvas, [polygon], 255, shift=SHIFT)
+    return cv2.resize(canvas, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
+    """Recover `n` drawn presses (200) whose zero-touch point is known: H 11-20 mm, alpha 0-10 deg, 0.25 mm/px.
+
+    Worst errors on images as they are drawn, mean error on binary ones, how often 95 % intervals hold the truth on
+    images with noise, and thread CPU time from images to intervals. For a few draws a share of intervals says nothing.
+    """
+    count, rng = rounds_of(n, DRAWS), np.random.default_rng(seed)
+    truth = {"depth_mm": rng.uniform(11, 20, count), "tilt_deg": rng.uniform(0, 10, count)}
+    anchor = np.array([0.8, 0.5]) * SIZE_PX * INVERTED_PX_MM + rng.uniform(-0.5, 0.5, (count, 2)) * INVERTED_PX_MM
+    origin = anchor + np.column_stack((truth["depth_mm"] * np.tan(np.radians(truth["tilt_deg"])), np.zeros(count)))
+    clean = press_images(Brush(), truth["depth_mm"], truth["tilt_deg"], origin_mm=origin, px_mm=INVERTED_PX_MM)
+    noisy = (clean + rng.normal(0, SENSOR, clean.shape)).astype(np.float32)
+    inverter = Inverter.of_brush(Basis(Brush()), px_mm=INVERTED_PX_MM)
+    with _one_thread():
+        inverter(clean[:2], anchor[:2])  # compiles
+        began = time.thread_time()
+        found = inverter(clean, anchor)
+        each_ms = 1e3 * (time.thread_time() - began) / count
+        binary, seen = inverter((clean > 0.5).astype(np.float32), anchor), inverter(noisy, anchor)
+    off = {name: np.abs(getattr(found, name) - true).max() for name, true in truth.items()}
+    binary_mm = float(np.abs(binary.depth_mm - truth["depth_mm"]).mean())
+    results = [
+        at_most("inversion.time", each_ms, "ms an image", INVERTED_MS, count, seed),
+        at_most("inversion.H worst", float(off["depth_mm"]), "mm", WORST_MM, count, seed),
+        at_most("inversion.alpha worst", float(off["tilt_deg"]), "deg", WORST_DEG, count, seed),
+        at_most("inversion.binary H mean", binary_mm, "mm", BINARY_MM, count, seed),
+    ]
+    for name, true in truth.items():
+        low, high = seen.interval(name)
+        share = 100.0 * float(((low <= true) & (true <= high)).mean())
+        label = f"inversion.noisy {'H' if name == 'depth_mm' else 'alpha'} in interval"
+        results.append(Result(label, share, "%", "the nominal 95 %", share / 95.0, count, seed, machine()))
+    return results
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Hold torch and OpenCV to one thread each, and restore what was set before."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])

@@ -1,0 +1,397 @@
+"""`python -m bench.pictures screens|first-day|report [REPORT.html]`: the pictures of the documentation.
+
+`screens` are those of a session that the loopback rig really runs, in the operator's app, and a moving picture made of
+them; `first-day` those of a first day in an unknown lab: the wizard is the real one, the person's hand is that of the
+simulated lab, and every answer is pressed as a key. Both are textual's own SVG export. `report` is the top of a report,
+drawn by headless Chromium: by default of the one that `make demo` ends with. All show the loopback rig, and say so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from textual.app import App
+from textual.pilot import Pilot
+
+from bench.harness import ROOT
+from brushloop.collect.engine.control import State
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.start import engine_for
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Target
+from brushloop.collect.teach.watch import watched
+from brushloop.collect.teach.wizard import Wizard
+from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.capture_screen import CaptureScreen
+from brushloop.collect.tui.end_screen import EndScreen
+from brushloop.collect.tui.finish_screen import FinishScreen
+from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.review_screen import ReviewScreen
+from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.collect.tui.teach_app import TeachApp
+from brushloop.collect.tui.teach_guide import Question, ScreenGuide
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.lab.lab import UnknownLab
+from brushloop.drivers.sim.rig import LoopbackRig
+
+FOLDER = ROOT / "docs" / "screens"
+REPORT = ROOT / "docs" / "report.png"
+DEMO_REPORT = ROOT / "demo-run" / "report" / "report.html"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+WINDOW_PX, MOST_S = (900, 1150), 120.0
+SIZE, SMALL = (120, 40), (80, 24)
+RATE, WAIT_S = 20.0, 120.0
+PROTOCOL = 'kind = "grid"\ndepths_mm = [11.0, 13.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\nseed = 1\n'
+DAY_SIZE, DAY_SEED, DAY_RATE = (120, 34), 3, 4.0
+DAY_WAIT_S = 1800.0
+"""Longest time between two questions: the runs of the proof ask nothing while the brush feels for the paper."""
+PICTURES = {
+    "address of the cabinet": "arm",
+    "hold the board": "camera",
+    "touch 3": "tip",
+    "upper right corner of the sheet": "sheet",
+    "middle of the well": "places",
+    "l: length": "brush",
+    "push the tip": "force",
+    "robot.limits.z_mm": "limits",
+    "dry run": "proof",
+}
+"""Words of a question, in small letters, and the picture that is taken of it."""
+SCREENS = ("start", "set-up-camera", "set-up-self-check", "ask", "run", "end")
+"""In the order of a session; all of them have one size."""
+SECONDS_EACH = 2.0
+MOVING = FOLDER / "session.svg"
+SVG = re.compile(r"<svg[^>]*viewBox=\"([^\"]+)\"[^>]*>(.*)</svg>\s*$", re.S)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m bench.pictures", description="Draw the pictures of docs/.")
+    parser.add_argument("what", choices=("screens", "first-day", "report"))
+    parser.add_argument("page", nargs="?", type=Path, default=DEMO_REPORT, help="report.html, for `report`")
+    options = parser.parse_args(arguments)
+    if options.what == "report":
+        try:
+            report_picture(options.page, REPORT)
+        except FileNotFoundError as error:
+            sys.exit(str(error))
+        return 0
+    # In a folder of its own, so that no picture names one of this machine's.
+    with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
+        if options.what == "screens":
+            _screens()
+        else:
+            lab = UnknownLab(DAY_SEED, rate=DAY_RATE)
+            with _serving(lab) as loop:
+                asyncio.run(_day(lab, loop))
+    return 0
+
+
+def _screens() -> None:
+    rig = LoopbackRig(SimConfig(rate=RATE, view=View(fps=3.0)))
+    with _serving(rig):
+        app = OperatorApp(browser=SessionBrowser(Paths(), engine_for))
+        try:
+            asyncio.run(_tour(app, rig))
+        finally:
+            if app.engine is not None:
+                app.engine.stop()
+                with contextlib.suppress(CollectAborted):
+                    app.engine.join()
+    MOVING.write_text(session_picture(), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _serving(rig: contextlib.AbstractAsyncContextManager[Any]) -> Iterator[asyncio.AbstractEventLoop]:
+    """The loop of a thread of its own that serves the rig until the block ends."""
+    ready: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def serve() -> None:
+        over = asyncio.Event()
+        async with rig:
+            ready.set_result((asyncio.get_running_loop(), over))
+            await over.wait()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig")
+    thread.start()
+    loop, over = ready.result(timeout=60)
+    try:
+        yield loop
+    finally:
+        loop.call_soon_threadsafe(over.set)
+        thread.join()
+
+
+def _save(app: App[None], name: str, title: str) -> None:
+    (FOLDER / f"{name}.svg").write_text(app.export_screenshot(title=title), encoding="utf-8")
+    sys.stdout.write(f"{name}.svg\n")
+
+
+class _Tour:
+    """Presses keys, waits for what is to be seen, and takes pictures."""
+
+    def __init__(self, app: OperatorApp, pilot: Pilot[None]) -> None:
+        self.app, self.pilot = app, pilot
+        self.asked_split = False
+
+    async def until(self, seen: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + WAIT_S
+        while not seen():
+            if time.monotonic() > deadline:
+                now = None if self.app.engine is None else self.app.engine.snapshot().prompt
+                raise TimeoutError(f"never seen; the screen is {self.app.screen}, the question {now}")
+            await self._answer()
+            await self.pilot.pause(0.05)
+        await self.pilot.pause(0.4)
+
+    async def _answer(self) -> None:
+        """Answer every question that no picture shows: a pale stroke is kept, a late frame taken again."""
+        asked = None if self.app.engine is None else self.app.engine.snapshot().prompt
+        if asked is None or not isinstance(self.app.screen, AskScreen):
+            return
+        if Flaw.SPLIT in asked.question and not self.asked_split:
+            return
+        for words, key in (("it counts", "g"), ("try again", "g")):
+            if words in str(asked.choices):
+                await self.pilot.press(key)
+                await self.pilot.pause(0.2)
+
+    async def take(self, name: str) -> None:
+        await self.pilot.pause(0.3)
+        _save(self.app, name, f"brushloop, loopback rig: {name}")
+
+    def asked(self, words: str) -> bool:
+        now = None if self.app.engine is None else self.app.engine.snapshot()
+        return now is not None and now.prompt is not None and words in now.prompt.question
+
+    def strokes(self) -> int:
+        return 0 if self.app.engine is None else self.app.engine.snapshot().strokes_done
+
+
+async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
+    rig_toml, protocol = Path("rig.toml"), Path("protocol.toml")
+    rig_toml.write_text(rig.toml() + "\n[quality]\nretakes = 0\n[self_check]\nenabled = true\n", encoding="utf-8")
+    protocol.write_text(PROTOCOL, encoding="utf-8")
+    async with app.run_test(size=SIZE) as pilot:
+        tour = _Tour(app, pilot)
+        await pilot.press("d")
+        await app.workers.wait_for_complete()
+        await tour.take("start")
+        await pilot.press("n")
+        await app.workers.wait_for_complete()
+        await pilot.press("y")
+        await tour.until(lambda: tour.asked("Camera"))
+        await tour.take("set-up-camera")
+        await pilot.press("g")
+        await tour.until(lambda: tour.asked("Zero touch"))
+        await pilot.press("b")
+        for touch in range(3):
+            await tour.until(lambda: tour.asked("+2.0"))
+            await pilot.press("1")
+            await tour.until(lambda: tour.asked("+1.0"))
+            if touch == 0:
+                await tour.take("set-up-jog")
+            await pilot.press("1")
+            await tour.until(lambda: tour.asked(" +0.0") or tour.asked(" -0.0"))
+            await pilot.press("t")
+        await tour.until(lambda: tour.asked("Zero touch and plane"))
+        await pilot.press("g")
+        await tour.until(lambda: tour.asked("Self-check: "))
+        await tour.take("set-up-self-check")
+        begun = len(rig.world.presses)
+        rig.world.flaws.update(dict.fromkeys(range(begun + 2, begun + 5), (Flaw.SPLIT, 1.0)))
+        await pilot.press("g")
+        await tour.until(lambda: tour.asked(Flaw.SPLIT))
+        await tour.take("ask")
+        tour.asked_split = True
+        await pilot.press("r")
+        before = tour.strokes()
+        await tour.until(lambda: tour.strokes() > before + 3)
+        await tour.take("run")
+        await pilot.resize_terminal(*SMALL)
+        await tour.take("run-80x24")
+        await pilot.press("tab")
+        await tour.take("capture-80x24")
+        await pilot.press("question_mark")
+        await tour.take("help-80x24")
+        await pilot.press("escape")
+        await pilot.resize_terminal(*SIZE)
+        await tour.until(lambda: app.engine is not None and app.engine.snapshot().state is State.DONE)
+        await tour.until(lambda: isinstance(app.screen, EndScreen))
+        await app.workers.wait_for_complete()
+        await tour.take("end")
+        await pilot.press("escape")
+        await tour.take("done")
+        await pilot.press("enter")
+        await tour.until(lambda: isinstance(app.screen, CaptureScreen))
+        await tour.take("capture")
+        await pilot.press("escape", "v")
+        await tour.until(lambda: isinstance(app.screen, ReviewScreen))
+        await pilot.press("down")
+        await pilot.pause(1.0)
+        await app.workers.wait_for_complete()
+        await tour.take("review")
+        await pilot.press("f")
+        await tour.until(lambda: isinstance(app.screen, FinishScreen))
+        await app.workers.wait_for_complete()
+        await tour.take("finish")
+        await pilot.press("escape", "escape", "q")
+        await tour.until(lambda: isinstance(app.screen, StartScreen))
+        await tour.take("start-after")
+        await pilot.press("q")
+
+
+class _Person:
+    """Reads each question, does by hand what it asks for, and presses keys."""
+
+    def __init__(self, app: TeachApp, pilot: Pilot[None], lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
+        self._app, self._pilot, self._lab, self._loop = app, pilot, lab, loop
+        self._number = 0
+        self._held = 0
+
+    async def question(self) -> Question | None:
+        """The next question; None once the day is over."""
+        deadline = time.monotonic() + DAY_WAIT_S
+        while time.monotonic() < deadline:
+            await self._pilot.pause(0.2)
+            if self._app.teaching.finished:
+                return None
+            question = self._app.teaching.guide.view.question
+            if question is not None and question.number > self._number and self._app.asking:
+                self._number = question.number
+                await self._pilot.pause(0.5)
+                return question
+        raise TimeoutError(f"no question in {DAY_WAIT_S:g} s")
+
+    async def answer(self, question: Question) -> None:
+        """Answer it as somebody would who reads it for the first time."""
+        if question.target is not None:
+            await self._bring(question.target)
+            await self._pilot.press("enter")
+        elif question.kind in ("text", "number"):
+            for letter in self._typed(question.text.lower()):
+                await self._pilot.press(letter)
+            await self._pilot.press("enter")
+        else:
+            await self._pilot.press(self._chosen(question))
+
+    async def _bring(self, target: Target) -> None:
+        index = self._held if target.kind == "hold-board" else target.index
+        self._held += target.kind == "hold-board"
+        act = self._lab.bring(target.kind, index, target.corner)
+        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(act, self._loop))
+
+    def _typed(self, words: str) -> str:
+        seen = self._lab.seen()
+        host, port, bus = seen.can
+        answers = {
+            "address of the cabinet": seen.host,
+            "stream": " ".join(seen.streams),
+            "longer side": str(seen.squares[0]),
+            "shorter side": str(seen.squares[1]),
+            "side of a square": f"{seen.square_mm:g}",
+            "side of a marker": f"{seen.marker_mm:g}",
+            "r: radius": f"{seen.radius_mm:g}",
+            "l: length": f"{seen.length_mm:g}",
+            "can bus": f"{host}:{port}/{bus}",
+            "serial line": "" if seen.ink is None else seen.ink[1],
+        }
+        return next((answer for part, answer in answers.items() if part in words), "")
+
+    def _chosen(self, question: Question) -> str:
+        """The key that lets the arm move, what fills the well, and yes to what is offered; otherwise no."""
+        if "moves by itself" in question.text:
+            return "a"
+        if "well filled" in question.text:
+            ink = self._lab.seen().ink
+            return "n" if ink is None else "i" if ink[0] == "ink-station" else "p"
+        return "enter" if question.default else "y" if "Agreed?" in question.text else "n"
+
+
+async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
+    rig = Path("rig.toml")
+
+    async def work(guide: ScreenGuide) -> Path | None:
+        day = Day(guide, rig, HostClock(), armed=True)
+        async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
+            return await Wizard(day).run()
+
+    app, taken = TeachApp(work, str(rig)), set[str]()
+    async with app.run_test(size=DAY_SIZE) as pilot:
+        person = _Person(app, pilot, lab, loop)
+        while (question := await person.question()) is not None:
+            if question.text.startswith("How to go on"):
+                raise RuntimeError("\n".join(app.teaching.guide.view.findings[-1].lines))
+            words = question.text.lower()
+            for name in (name for part, name in PICTURES.items() if part in words and name not in taken):
+                taken.add(name)
+                _save(app, f"first-day-{name}", f"brushloop rig new, loopback rig: {name}")
+            sys.stdout.write(f"{question.text}\n")
+            await person.answer(question)
+        await pilot.pause(0.5)
+        _save(app, "first-day-ready", "brushloop rig new, loopback rig: ready")
+        for shown in app.teaching.guide.view.findings[-8:]:
+            sys.stdout.write("\n".join(shown.lines) + "\n")
+    app.teaching.join()
+
+
+def session_picture() -> str:
+    """The pictures of `SCREENS`, which have one size and ids of their own, in a loop; the last stays twice as long.
+
+    Where the reader has asked for less motion, it is the last picture alone.
+    """
+    parts = [SVG.search((FOLDER / f"{name}.svg").read_text(encoding="utf-8")) for name in SCREENS]
+    turns, box, frames = len(SCREENS) + 1, "", list[str]()
+    for place, part in enumerate(parts):
+        assert part is not None, "each has a viewBox"
+        box = part[1]
+        frames.append(f'<g class="frame" style="animation-delay:{place * SECONDS_EACH:g}s">{part[2]}</g>')
+    lasts = (100.0 / turns, 200.0 / turns)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}"><style>'
+        f"@keyframes turn{{0%{{visibility:visible}}{lasts[0]:.3f}%{{visibility:hidden}}}}"
+        f"@keyframes last{{0%{{visibility:visible}}{lasts[1]:.3f}%{{visibility:hidden}}}}"
+        f".frame{{visibility:hidden;animation:turn {turns * SECONDS_EACH:g}s step-end infinite}}"
+        ".frame:last-child{animation-name:last}"
+        "@media (prefers-reduced-motion:reduce){.frame{animation:none}.frame:last-child{visibility:visible}}"
+        f"</style>{''.join(frames)}</svg>\n"
+    )
+
+
+def find_browser() -> str | None:
+    """Path of an installed Chromium; None without one."""
+    return next((found for name in BROWSERS if (found := shutil.which(name))), None)
+
+
+def report_picture(report: Path, out: Path) -> None:
+    """Draw the top of the page. Raises FileNotFoundError without a browser or page, subprocess errors if it fails."""
+    browser = find_browser()
+    if browser is None:
+        raise FileNotFoundError(f"none of {', '.join(BROWSERS)} is installed")
+    if not report.is_file():
+        raise FileNotFoundError(f"{report}: no such file")
+    with tempfile.TemporaryDirectory() as profile:
+        size = ",".join(map(str, WINDOW_PX))
+        options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--user-data-dir={profile}"]
+        drawn = [f"--window-size={size}", f"--screenshot={out.resolve()}", report.resolve().as_uri()]
+        subprocess.run([browser, *options, *drawn], check=True, capture_output=True, timeout=MOST_S)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
