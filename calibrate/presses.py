@@ -118,7 +118,7 @@ def read_presses(
             prepare({k})
             arrays = store.get(keys[k])
             assert arrays is not None, "it was prepared"
-        press = None if "refused" in arrays else _press_of(stroke, arrays)
+        press = None if "refused" in arrays else press_of(stroke, arrays)
         reasons = (why(press) for why in unless) if press is not None else (str(arrays["refused"]),)
         if reason := next(filter(None, (bad.get(stroke.still, ""), *reasons)), ""):
             refused.append((stroke.stroke_id, reason))
@@ -153,7 +153,8 @@ def prepare_job(job: PrepareJob) -> Arrays:
     }
 
 
-def _press_of(stroke: Stroke, arrays: Arrays) -> Press:
+def press_of(stroke: Stroke, arrays: Arrays) -> Press:
+    """The press of an entry that is not `refused`."""
     x_mm, y_mm = arrays["anchor_mm"].tolist()
     return Press(
         stroke,

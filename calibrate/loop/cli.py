@@ -22,8 +22,8 @@ def compare(
     """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
     import sys
 
-    from brushloop.calibrate.loop.command import CompareRequest
-    from brushloop.calibrate.loop.command import compare as run
+    from brushloop.calibrate.loop.report import CompareRequest
+    from brushloop.calibrate.loop.report import compare as run
     from brushloop.sessions.terminal import show_work
 
     show_work(run, CompareRequest(original, again, out, " ".join(["brushloop", *sys.argv[1:]]), fit, mm_per_px))

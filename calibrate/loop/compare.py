@@ -3,182 +3,104 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brushloop.calibrate.artefact import load_artefact, made_by
-from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.place import Field, brush_of, captured_images, prepare_press, simulated
-from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.compare.place import Field, brush_of, simulated
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import BrushFit
-from brushloop.calibrate.loop.scores import (
-    CapturedPress,
-    Pair,
-    PairScore,
-    Table1Row,
-    Verdict,
-    score_pairs,
-    table_1,
-    verdicts,
-)
-from brushloop.calibrate.session import calibration_of
-from brushloop.calibrate.stroke.measure import measure
+from brushloop.calibrate.loop.scores import Pair, PairScore, Verdict, score_pairs, verdicts
+from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
+from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.model.brush import DomainError
-from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture, Recording
-from brushloop.sessions.records import Condition, Header, Source
-from brushloop.sessions.terminal import Progress, counted, unseen
+from brushloop.sessions.records import Header, Source
+from brushloop.sessions.terminal import Progress, unseen
 
 if TYPE_CHECKING:
     from brushloop.model.protocol import StrokeModel
 
-
 NOT_AGAIN = "was not pressed again"
-
-
-@dataclass(frozen=True, slots=True)
-class Pairs:
-    """Every pair, every original, and what could not be used."""
-
-    pairs: list[Pair] = field(default_factory=list[Pair])
-    originals: dict[str, CapturedPress] = field(default_factory=dict[str, CapturedPress])
-    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """(stroke, reason), never dropped silently."""
-
-
-@dataclass(frozen=True, slots=True)
-class ComparedSession:
-    """One of the two sessions."""
-
-    header: Header
-    recording: Path
-    sha256: str
-    calibration: Calibration | None
 
 
 @dataclass(frozen=True, slots=True)
 class LoopComparison:
     """The result of pressing a session's strokes again."""
 
-    original: ComparedSession
-    again: ComparedSession
+    original: OpenSession
+    again: OpenSession
     model: str
     """The model that recovered, or is assumed to have recovered, depth and tilt, and drew the generated images."""
     in_sample: bool
     """Whether that model was fitted to the original presses themselves."""
     field: Field
-    paired: Pairs
+    pairs: list[Pair]
+    refused: list[Refused]
     scores: list[PairScore]
-    table: list[Table1Row]
     verdicts: list[Verdict]
-    software: str
 
 
 def compare_sessions(
     original: Path, again: Path, fit: Path | None, view: Field, progress: Progress = unseen
 ) -> LoopComparison:
     """Compare pair by pair. Raises `CalibrationError` where the two do not belong together."""
-    first, second = Recording(original), Recording(again)
-    loopback = [one.header.source == Source.LOOPBACK for one in (first, second)]
-    if loopback[0] != loopback[1]:
-        raise CalibrationError(str(second.path), f"is {second.header.source}, the original {first.header.source}")
+    first, second = open_session(original, kind="press"), open_session(again, kind="press")
+    where = str(second.recording.path)
+    if (first.header.source == Source.LOOPBACK) != (second.header.source == Source.LOOPBACK):
+        raise CalibrationError(where, f"is {second.header.source}, the original {first.header.source}")
     repeated = _replayed(second.header)
     if repeated != first.header.session_id:
         what = "is not a replay" if repeated is None else f"repeats {repeated}"
-        raise CalibrationError(str(second.path), f"{what}, not {first.header.session_id}")
+        raise CalibrationError(where, f"{what}, not {first.header.session_id}")
     model, fitted_to = _model(first.header, fit)
-    one, other = _opened(first), _opened(second)
-    captures, repeats = (
-        counted(recording.captures(), f"{recording.header.session_id}: found", recording.strokes(), progress)
-        for recording in (first, second)
+    refused: list[Refused] = []
+    every, repetitions = (
+        list(read_presses(session, view, refused, uncommanded, too_thin, progress=progress))
+        for session in (first, second)
     )
-    paired = pair_up(captures, one.calibration, repeats, other.calibration, model, view)
-    if not paired.pairs:
-        why = f": {paired.refused[0][0]}: {paired.refused[0][1]}" if paired.refused else ""
-        raise CalibrationError(str(second.path), f"not one pair can be compared{why}")
+    originals = by_name(every, refused)
+    pairs = pair_up(originals, repetitions, model, view, refused)
+    if not pairs:
+        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
+        raise CalibrationError(where, f"not one pair can be compared{why}")
     progress("compared", 0, 1)
-    scores = score_pairs(paired.pairs, paired.originals.values())
+    scores = score_pairs(pairs, originals.values())
     progress("compared", 1, 1)
-    table = table_1(
-        scores,
-        source=other.header.source,
-        original=one.header.session_id,
-        again=other.header.session_id,
-        model=model.label,
-    )
-    return LoopComparison(
-        one,
-        other,
-        model.label,
-        fitted_to == one.sha256,
-        view,
-        paired,
-        scores,
-        table,
-        verdicts(scores),
-        made_by(),
-    )
+    in_sample = fitted_to == first.sha256
+    return LoopComparison(first, second, model.label, in_sample, view, pairs, refused, scores, verdicts(scores))
+
+
+def by_name(originals: Iterable[Press], refused: list[Refused]) -> dict[str, Press]:
+    """The original presses by name; further ones of a name go to `refused`."""
+    presses: dict[str, Press] = {}
+    for press in originals:
+        if presses.setdefault(press.stroke.stroke_id, press) is not press:
+            refused.append((press.stroke.stroke_id, "two strokes have this name: the first is used"))
+    return presses
 
 
 def pair_up(
-    original: Iterator[Capture],
-    original_calibration: Calibration | None,
-    again: Iterator[Capture],
-    again_calibration: Calibration | None,
-    model: StrokeModel,
-    view: Field,
-) -> Pairs:
-    """Pair captures by `again_of`. Originals that were not pressed again are listed as refused."""
-    found = Pairs()
-    for press, _ in _presses(original, original_calibration, view, found.refused):
-        if press.stroke_id in found.originals:
-            found.refused.append((press.stroke_id, "two strokes have this name: the first is used"))
-        else:
-            found.originals[press.stroke_id] = press
-    repeated: set[str] = set()
-    for press, of in _presses(again, again_calibration, view, found.refused):
-        if of is None or of not in found.originals:
+    originals: dict[str, Press], repetitions: Iterable[Press], model: StrokeModel, view: Field, refused: list[Refused]
+) -> list[Pair]:
+    """Pair presses by `again_of`. Those without a partner, originals included, go to `refused`."""
+    pairs: list[Pair] = []
+    for press in repetitions:
+        name, of = press.stroke.stroke_id, press.stroke.again_of
+        if of is None or of not in originals:
             why = "repeats no stroke" if of is None else f"repeats {of}, which does not exist or cannot be used"
-            found.refused.append((press.stroke_id, why))
+            refused.append((name, why))
             continue
         try:
             images = simulated(model, press.condition.depth_mm, press.condition.tilt_deg, view)
         except DomainError as error:
-            found.refused.append((press.stroke_id, f"the model does not predict it: {error}"))
+            refused.append((name, f"the model does not predict it: {error}"))
             continue
-        repeated.add(of)
-        found.pairs.append(Pair(found.originals[of], press, images))
-    found.refused.extend((name, NOT_AGAIN) for name in found.originals if name not in repeated)
-    return found
-
-
-def _presses(
-    captures: Iterator[Capture], calibration: Calibration | None, view: Field, refused: list[tuple[str, str]]
-) -> Iterator[tuple[CapturedPress, str | None]]:
-    """(press, the stroke it repeats) of every capture that can be used; the others go to `refused`."""
-    for capture in captures:
-        stroke = capture.stroke
-        if stroke.depth_mm is None or stroke.tilt_deg is None:
-            refused.append((stroke.stroke_id, "has no depth or tilt"))
-            continue
-        try:
-            prepared = prepare_press(capture, calibration, view)
-            images = captured_images(stroke.stroke_id, prepared)
-        except (CaptureRefused, SessionDamaged) as error:
-            refused.append((stroke.stroke_id, error.what))
-            continue
-        condition = Condition(stroke.depth_mm, stroke.tilt_deg)
-        yield CapturedPress(stroke.stroke_id, condition, measure(prepared.mask), images), stroke.again_of
-
-
-def _opened(recording: Recording) -> ComparedSession:
-    strokes = list(recording.stroke_records())
-    if not strokes or any(stroke.kind != "press" for stroke in strokes):
-        raise CalibrationError(str(recording.path), "holds no presses, or drags too: only presses are compared")
-    calibration = calibration_of(recording, strokes[0], recording.sha256, None)
-    return ComparedSession(recording.header, recording.path, recording.sha256, calibration)
+        pairs.append(Pair(originals[of], press, images))
+    repeated = {pair.original.stroke.stroke_id for pair in pairs}
+    refused.extend((name, NOT_AGAIN) for name in originals if name not in repeated)
+    return pairs
 
 
 def _replayed(header: Header) -> str | None:

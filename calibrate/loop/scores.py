@@ -1,4 +1,4 @@
-"""Similarity of a press and its repetition, against that of two presses of one cell: data of Table 1's third row."""
+"""Similarity of a press and its repetition, against that of two presses of one condition: Table 1's third row."""
 
 from __future__ import annotations
 
@@ -8,44 +8,33 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1, Triple
 from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Key, Tone
 from brushloop.calibrate.compare.score import similarity
+from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Sealed, load_sealed
-from brushloop.calibrate.stats import Summary, interval_over_groups, summarise
-from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.stats import interval_over_groups
 from brushloop.sessions.records import Condition, Source
 
 FILE = "loop.json"
 FORMAT = "brushloop-loop-1"
 MAX_BYTES = 8 * 1024 * 1024
 AGAIN, SIMULATED, ANOTHER = "re-pressed", "recovered, simulated", "another press"
-"""What is compared with an original: its repetition, the model's image of it, other originals of the same cell."""
+"""What is compared with an original: its repetition, the model's image of it, other originals of its condition."""
 GOAL_POINTS = 1.0
 """Points by which re-pressed strokes may score below the originals' own repeatability."""
-
-
-@dataclass(frozen=True, slots=True)
-class CapturedPress:
-    """A press that can be compared."""
-
-    stroke_id: str
-    condition: Condition
-    """As commanded."""
-    measured: Measured
-    images: dict[Key, Image]
-    """(128, 128) each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
     """A stroke and its repetition. Depth and tilt of `original` are as commanded, those of `again` as recovered."""
 
-    original: CapturedPress
-    again: CapturedPress
+    original: Press
+    again: Press
     simulated: dict[Key, Image]
     """The model's press at the recovered depth and tilt, (128, 128) each."""
 
@@ -78,7 +67,7 @@ class Verdict:
     difference: float
     low: float | None
     high: float | None
-    """95 % interval over the commanded cells; None with fewer than three."""
+    """95 % interval over the commanded conditions; None with fewer than three."""
     n: int
     holds: bool
     """Whether the difference is at least minus `GOAL_POINTS`."""
@@ -148,10 +137,8 @@ class LoopRecord(Sealed):
 
     def row(self, what: str, alignment: Alignment, tone: Tone) -> Table1Row | None:
         """One row of the table, or None if nothing was compared in this way."""
-        for one in self.table_1:
-            if (one.what, one.alignment, one.tone) == (what, alignment, tone):
-                return one
-        return None
+        rows = (row for row in self.table_1 if (row.what, row.alignment, row.tone) == (what, alignment, tone))
+        return next(rows, None)
 
 
 def read_loop(path: Path) -> LoopRecord:
@@ -159,34 +146,30 @@ def read_loop(path: Path) -> LoopRecord:
     return load_sealed(path / FILE if path.is_dir() else path, LoopRecord, MAX_BYTES)
 
 
-def score_pairs(pairs: Sequence[Pair], originals: Iterable[CapturedPress]) -> list[PairScore]:
-    """Score repetition, simulation and other presses of the cell against each original that was pressed again."""
-    cells: dict[Condition, list[CapturedPress]] = {}
+def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press]) -> list[PairScore]:
+    """Score repetition, simulation and other presses of the condition against each original that was pressed again."""
+    alike: dict[Condition, list[Press]] = {}
     for press in originals:
-        cells.setdefault(press.condition, []).append(press)
+        alike.setdefault(press.condition, []).append(press)
     scores: list[PairScore] = []
     for pair in pairs:
-        others = [one for one in cells[pair.original.condition] if one is not pair.original]
+        original = pair.original
+        others = [press for press in alike[original.condition] if press is not original]
         for key in KEYS:
             against = {AGAIN: [pair.again.images[key]], SIMULATED: [pair.simulated[key]]}
-            against[ANOTHER] = [one.images[key] for one in others]
-            scores += [_score(pair, what, key, images) for what, images in against.items() if images]
+            against[ANOTHER] = [press.images[key] for press in others]
+            for what, images in against.items():
+                if images:
+                    of_each = [similarity(original.images[key], image, key[0]) for image in images]
+                    csim, ssim = np.mean(of_each, axis=0).tolist()
+                    names = original.stroke.stroke_id, pair.again.stroke.stroke_id
+                    scores.append(PairScore(*names, original.condition, what, *key, csim, ssim))
     return scores
 
 
-def _score(pair: Pair, what: str, key: Key, images: list[Image]) -> PairScore:
-    alignment, tone = key
-    original = pair.original
-    csim, ssim = np.mean([similarity(original.images[key], image, alignment) for image in images], axis=0)
-    return PairScore(
-        original.stroke_id, pair.again.stroke_id, original.condition, what, alignment, tone, float(csim), float(ssim)
-    )
-
-
-def summary_of(scores: Sequence[PairScore], what: str, key: Key, measure: str) -> Summary | None:
-    """Summarise `csim` or `ssim` in percent; None if there is no such score."""
-    found = [getattr(s, measure) for s in scores if (s.what, s.alignment, s.tone) == (what, *key)]
-    return summarise(100.0 * np.asarray(found))
+def scores_of(scores: Sequence[PairScore], what: str, key: Key) -> list[PairScore]:
+    """The scores of one kind of comparison, in one alignment and tone."""
+    return [score for score in scores if (score.what, score.alignment, score.tone) == (what, *key)]
 
 
 def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again: str, model: str) -> list[Table1Row]:
@@ -195,9 +178,10 @@ def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again
     rows: list[Table1Row] = []
     for key in KEYS:
         for what in (AGAIN, ANOTHER, SIMULATED):
-            csim, ssim = (summary_of(scores, what, key, measure) for measure in ("csim", "ssim"))
-            if csim is None or ssim is None:
+            percent = 100.0 * np.array([(score.csim, score.ssim) for score in scores_of(scores, what, key)])
+            if not len(percent):
                 continue
+            csim, ssim = percent.T
             rows.append(
                 Table1Row(
                     source=source,
@@ -207,11 +191,11 @@ def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again
                     what=what,
                     alignment=key[0],
                     tone=key[1],
-                    n=csim.n,
-                    csim=csim.range_and_avg,
-                    ssim=ssim.range_and_avg,
-                    csim_median=csim.median,
-                    ssim_median=ssim.median,
+                    n=len(percent),
+                    csim=_triple(csim),
+                    ssim=_triple(ssim),
+                    csim_median=float(np.median(csim)),
+                    ssim_median=float(np.median(ssim)),
                     paper_csim=paper.csim if what == AGAIN else None,
                     paper_ssim=paper.ssim if what == AGAIN else None,
                 )
@@ -219,24 +203,35 @@ def table_1(scores: Sequence[PairScore], *, source: Source, original: str, again
     return rows
 
 
+def _triple(values: NDArray[np.float64]) -> Triple:
+    """Max, min and average, in the order of the paper's tables."""
+    return float(values.max()), float(values.min()), float(values.mean())
+
+
 def verdicts(scores: Sequence[PairScore]) -> list[Verdict]:
-    """Verdicts for each alignment, tone and measure; empty if no cell was pressed twice."""
-    return [found for key in KEYS for of in ("csim", "ssim") if (found := _verdict(scores, key, of)) is not None]
+    """Verdicts for each alignment, tone and measure; empty if no condition was pressed twice."""
+    return [
+        verdict
+        for key in KEYS
+        for measure in ("csim", "ssim")
+        if (verdict := _verdict(scores, key, measure)) is not None
+    ]
 
 
 def _verdict(scores: Sequence[PairScore], key: Key, measure: str) -> Verdict | None:
-    def percent(what: str) -> dict[str, float]:
-        chosen = (s for s in scores if (s.what, s.alignment, s.tone) == (what, *key))
-        return {s.again: 100.0 * getattr(s, measure) for s in chosen}
-
-    again, another = percent(AGAIN), percent(ANOTHER)
+    again, another = (
+        {score.again: 100.0 * getattr(score, measure) for score in scores_of(scores, what, key)}
+        for what in (AGAIN, ANOTHER)
+    )
     both = [name for name in again if name in another]
     if not both:
         return None
-    cell_of = {s.again: s.condition for s in scores}
-    cells = sorted({cell_of[name] for name in both})
+    condition = {score.again: score.condition for score in scores}
+    conditions = sorted({condition[name] for name in both})
     differences = np.array([again[name] - another[name] for name in both])
+    group = np.array([conditions.index(condition[name]) for name in both])
+    low, high = interval_over_groups(differences, group) or (None, None)
+    of_again, of_another = (float(np.mean([values[name] for name in both])) for values in (again, another))
     difference = float(differences.mean())
-    low, high = interval_over_groups(differences, np.array([cells.index(cell_of[n]) for n in both])) or (None, None)
-    ours, theirs = (float(np.mean([values[name] for name in both])) for values in (again, another))
-    return Verdict(*key, measure, ours, theirs, difference, low, high, len(both), difference >= -GOAL_POINTS)
+    holds = difference >= -GOAL_POINTS
+    return Verdict(*key, measure, of_again, of_another, difference, low, high, len(both), holds)

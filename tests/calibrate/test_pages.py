@@ -19,10 +19,11 @@ from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import Gray, lens_of
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Field, Tone
-from brushloop.calibrate.loop.compare import NOT_AGAIN, ComparedSession, LoopComparison, Pairs
-from brushloop.calibrate.loop.report import write_loop
-from brushloop.calibrate.loop.scores import CapturedPress, Pair, score_pairs, table_1, verdicts
+from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison
+from brushloop.calibrate.loop.report import record_of, write_loop
+from brushloop.calibrate.loop.scores import Pair, score_pairs, verdicts
 from brushloop.calibrate.pages.lens import thumbnail, write_lens_page
+from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.validate.report.page import pages_beside
 from brushloop.calibrate.writing.compare import WritingComparison
@@ -31,7 +32,7 @@ from brushloop.calibrate.writing.plan_record import PlanRecord
 from brushloop.calibrate.writing.report import write_written
 from brushloop.calibrate.writing.scores import Character, score_character, table_3
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.sessions.records import Condition, Header, Source
+from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import BY, CALIBRATION
 from tests.photographed import imported, photograph
@@ -100,33 +101,27 @@ def _loop(folder: Path) -> str:
     """The page of two presses of one cell, of which one was pressed again, a little shorter."""
     measured = Measured(length_mm=15.0, width_mm=4.0, mid_width_mm=4.0, breadth_mm=4.0, area_mm2=60.0)
 
-    def press(name: str, depth_mm: float, end: int) -> CapturedPress:
+    def press(name: str, depth_mm: float, end: int) -> Press:
         image = np.zeros((128, 128), np.float32)
         image[58:70, 40:end] = 1.0
-        return CapturedPress(name, Condition(depth_mm, 5.0), measured, dict.fromkeys(KEYS, image))
+        stroke = Stroke(stroke_id=name, kind="press", still=0, depth_mm=depth_mm, tilt_deg=5.0)
+        return Press(stroke, dict.fromkeys(KEYS, image), image, (29.0, 19.0), measured, False, ())
 
     first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
     pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
     scores = score_pairs(pairs, [first, second])
-    sessions = [
-        ComparedSession(
-            Header(session_id=name, source=Source.LOOPBACK, software="test", brush=TWIN), folder, "ab", None
+    original, again = (
+        SimpleNamespace(
+            header=Header(session_id=name, source=Source.LOOPBACK, software="test", brush=TWIN),
+            recording=SimpleNamespace(path=folder),
+            sha256="ab",
+            calibration=None,
         )
         for name in ("grid", "replay")
-    ]
-    made = LoopComparison(
-        original=sessions[0],
-        again=sessions[1],
-        model="CCD-BSM",
-        in_sample=True,
-        field=Field(),
-        paired=Pairs(pairs, {"a-r01": first, "a-r02": second}, [("a-r02", NOT_AGAIN), ("x<u>", "is blank")]),
-        scores=scores,
-        table=table_1(scores, source=Source.LOOPBACK, original="grid", again="replay", model="CCD-BSM"),
-        verdicts=verdicts(scores),
-        software="test",
     )
-    return write_loop(made, folder / "loop", "brushloop loop").read_text(encoding="utf-8")
+    refused = [("a-r02", NOT_AGAIN), ("x<u>", "is blank")]
+    made = LoopComparison(original, again, "CCD-BSM", True, Field(), pairs, refused, scores, verdicts(scores))
+    return write_loop(made, record_of(made, "brushloop loop"), folder / "loop").read_text(encoding="utf-8")
 
 
 def _written(folder: Path) -> str:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.compare.place import Alignment, Field, Tone
-from brushloop.calibrate.loop.compare import Pairs, pair_up
-from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, PairScore, score_pairs, summary_of, verdicts
+from brushloop.calibrate.loop.compare import by_name, pair_up
+from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, Pair, PairScore, score_pairs, scores_of, verdicts
+from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
 from brushloop.calibrate.stats import interval_over_groups
 from brushloop.model.brush import Brush
 from brushloop.model.raster.exact import coverage_at
@@ -32,7 +33,7 @@ def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
     return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
 
 
-def capture(name: str, shown: tuple[float, float], asked: tuple[float, float], of: str | None = None) -> Capture:
+def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of: str | None = None) -> Press:
     stroke = Stroke(
         stroke_id=name,
         kind="press",
@@ -43,45 +44,41 @@ def capture(name: str, shown: tuple[float, float], asked: tuple[float, float], o
         anchor_mm=ANCHOR,
         again_of=of,
     )
-    return Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
+    capture = Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
+    return press_of(stroke, prepare_job(PrepareJob(capture, CALIBRATION, Field())))
 
 
-def paired(originals: Iterable[Capture], again: Iterable[Capture]) -> Pairs:
-    return pair_up(iter(originals), CALIBRATION, iter(again), CALIBRATION, MODEL, Field())
+def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
+    """Pairs, and why presses are in none."""
+    refused: list[tuple[str, str]] = []
+    return pair_up(by_name(originals, refused), again, MODEL, Field(), refused), dict(refused)
 
 
-def scored(found: Pairs) -> list[PairScore]:
-    return score_pairs(found.pairs, found.originals.values())
+def percent(scores: list[PairScore], what: str) -> list[float]:
+    """CSIM in the strict comparison."""
+    return [100.0 * score.csim for score in scores_of(scores, what, STRICT)]
 
 
 ORIGINALS = [
-    capture("a-r01", (14.6, 5.0), (15.0, 5.0)),
-    capture("a-r02", (15.4, 5.0), (15.0, 5.0)),
-    capture("b-r01", (19.0, 0.0), (19.0, 0.0)),
+    press("a-r01", (14.6, 5.0), (15.0, 5.0)),
+    press("a-r02", (15.4, 5.0), (15.0, 5.0)),
+    press("b-r01", (19.0, 0.0), (19.0, 0.0)),
 ]
 
 
 def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> None:
     again = [
-        capture("a-r01~1", (14.6, 5.0), (14.6, 5.0), "a-r01"),
-        capture("a-r02~1", (15.4, 5.0), (15.4, 5.0), "a-r02"),
+        press("a-r01~1", (14.6, 5.0), (14.6, 5.0), "a-r01"),
+        press("a-r02~1", (15.4, 5.0), (15.4, 5.0), "a-r02"),
     ]
-    made = paired(ORIGINALS, again)
-    assert [(pair.original.stroke_id, pair.again.stroke_id) for pair in made.pairs] == [
-        ("a-r01", "a-r01~1"),
-        ("a-r02", "a-r02~1"),
-    ]
-    assert made.refused == [("b-r01", "was not pressed again")]
-    scores = scored(made)
-    same = summary_of(scores, AGAIN, STRICT, "csim")
-    other = summary_of(scores, ANOTHER, STRICT, "csim")
-    simulated = summary_of(scores, SIMULATED, STRICT, "csim")
-    assert same is not None
-    assert other is not None
-    assert simulated is not None
-    assert same.min == pytest.approx(100.0)
-    assert other.max < 98.0
-    assert simulated.avg > 99.0
+    pairs, refused = paired(ORIGINALS, again)
+    names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
+    assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
+    assert refused == {"b-r01": "was not pressed again"}
+    scores = score_pairs(pairs, ORIGINALS)
+    assert min(percent(scores, AGAIN)) == pytest.approx(100.0)
+    assert max(percent(scores, ANOTHER)) < 98.0
+    assert np.mean(percent(scores, SIMULATED)) > 99.0
     found = verdicts(scores)
     assert len(found) == 8
     assert all(verdict.holds and verdict.n == 2 for verdict in found)
@@ -91,23 +88,22 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
 
 
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
-    again = [capture("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
-    [strict] = [
-        v for v in verdicts(scored(paired(ORIGINALS, again))) if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")
-    ]
+    again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    [strict] = [v for v in verdicts(scores) if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")]
     assert strict.difference < -2.0
     assert not strict.holds
 
 
 def test_what_repeats_nothing_is_named() -> None:
     again = [
-        capture("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
-        capture("y", (15.0, 5.0), (15.0, 5.0)),
-        capture("a-r01~1", (15.0, 5.0), (15.0, 5.0), "a-r01"),
+        press("x~1", (15.0, 5.0), (15.0, 5.0), "x"),
+        press("y", (15.0, 5.0), (15.0, 5.0)),
+        press("a-r01~1", (15.0, 5.0), (15.0, 5.0), "a-r01"),
     ]
-    made = paired([*ORIGINALS, ORIGINALS[0]], again)
-    assert len(made.pairs) == 1
-    assert dict(made.refused) == {
+    pairs, refused = paired([*ORIGINALS, press("a-r01", (15.0, 5.0), (15.0, 5.0))], again)
+    assert len(pairs) == 1
+    assert refused == {
         "a-r01": "two strokes have this name: the first is used",
         "x~1": "repeats x, which does not exist or cannot be used",
         "y": "repeats no stroke",
@@ -117,9 +113,9 @@ def test_what_repeats_nothing_is_named() -> None:
 
 
 def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
-    again = [capture("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
-    scores: list[PairScore] = scored(paired(ORIGINALS, again))
-    assert summary_of(scores, ANOTHER, STRICT, "ssim") is None
+    again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    assert scores_of(scores, ANOTHER, STRICT) == []
     assert verdicts(scores) == []
 
 
