@@ -6,29 +6,36 @@ Importing this module loads torch.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare.place import Field, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.invert.invert import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
-    Inversion,
+    DepthTilt,
     Row,
-    Settings,
-    invert_recording,
+    invert_presses,
     off_command,
+    with_model_error,
 )
+from brushloop.calibrate.presses import Refused, cut, read_presses
+from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.model.brush import Brush, DomainError
 from brushloop.model.fitted import NAMES
 from brushloop.model.fitted_shape import fitted_model
-from brushloop.model.inversion.press import Range
+from brushloop.model.inversion.noise import Noise
+from brushloop.model.inversion.press import Inverter, Range
+from brushloop.model.protocol import Basis
+from brushloop.model.strokes import UnknownModelError, stroke_model
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, unseen
 
@@ -71,21 +78,32 @@ class RecoverRequest:
 class Recovered:
     """The recovered presses and the files that hold them."""
 
-    inversion: Inversion
+    session: OpenSession
+    model: str
+    rows: list[Row]
+    """One for each recovered press."""
+    refused: list[Refused]
+    """(stroke, reason) of each press that was not recovered."""
     out: Path
-    protocol: Path
 
     @property
-    def rows(self) -> list[Row]:
-        """One row for each recovered press."""
-        return self.inversion.rows
+    def protocol(self) -> Path:
+        """The protocol that presses them again, beside the CSV."""
+        return self.out.parent / PROTOCOL
+
+    def csv_rows(self) -> Iterator[list[str]]:
+        """One row per stroke; depths and tilts to three decimals, deviations to three figures."""
+        for row in self.rows:
+            asked = ["" if v is None else f"{v:g}" for v in (row.commanded_depth_mm, row.commanded_tilt_deg)]
+            numbers = [f"{row.depth_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.depth_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
+            source = str(self.session.header.source)
+            yield [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, source]
 
     def lines(self) -> Iterator[str]:
         """What the command prints."""
-        found = self.inversion
-        many, source = len(found.rows), found.header.source
-        yield f"{found.header.session_id}: {many} presses recovered by {found.settings.model} ({source})"
-        for name, mean, sd, inside, n in off_command(found.rows):
+        many, header = len(self.rows), self.session.header
+        yield f"{header.session_id}: {many} presses recovered by {self.model} ({header.source})"
+        for name, mean, sd, inside, n in off_command(self.rows):
             unit = "mm" if name == "H" else "deg"
             scatter = "" if sd is None else f", sd {sd:.3f}"
             yield f"{name}: recovered - commanded {mean:+.3f} {unit}{scatter}; {inside:.0%} of {n} in the interval"
@@ -103,7 +121,7 @@ class Recovered:
             yield f"warning: {bound} at a bound: the model does not fit this brush; do not press these again"
         elif bound:
             yield f"warning: {bound} at a bound of the range: their intervals are valid on one side at most"
-        for stroke_id, why in found.refused:
+        for stroke_id, why in self.refused:
             yield f"not used: {stroke_id}: {why}"
         yield str(self.out)
         yield str(self.protocol)
@@ -112,74 +130,86 @@ class Recovered:
         return sum(flag in row.flags for row in self.rows)
 
     def _repr_html_(self) -> str:
-        rows = (COLUMNS, *csv_rows(self.inversion))
+        rows = (COLUMNS, *self.csv_rows())
         cells = ("".join(f"<td>{escape(str(value))}</td>" for value in row) for row in rows)
         return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
 def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
-    """Recover every press of a session; write the CSV and the protocol. Raises `CalibrationError`."""
-    settings = _settings(request)
-    found = invert_recording(request.session, settings, request.calibration, request.presses, progress)
-    return Recovered(found, request.out, write_inversion(found, request.out, request.repeats, request.seed))
+    """Recover every press of a session, or some of them spread evenly over it; write the CSV and the protocol.
+
+    Raises `CalibrationError` and OSError.
+    """
+    out = request.out
+    if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
+        raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
+    session = open_session(request.session, request.calibration, "press")
+    inverter, model, fitted = _inverter(request, brush_of(session.header))
+    count, refused = len(session.strokes), list[Refused]()
+    most = min(count, request.presses or count)
+    chosen = {session.strokes[number * count // most].stroke_id for number in range(most)}
+    view = Field(mm_per_px=request.mm_per_px)
+    presses = read_presses(session, view, refused, cut, chosen=chosen, progress=progress)
+    rows = with_model_error(invert_presses(presses, inverter, refused), fitted)
+    recovered = Recovered(session, model, rows, refused, out)
+    _write(recovered, request.repeats, request.seed)
+    return recovered
 
 
-def _settings(request: RecoverRequest) -> Settings:
+def _inverter(request: RecoverRequest, brush: Brush) -> tuple[Inverter, str, Collection[DepthTilt]]:
+    """The inverter, its model's name, and the conditions that the model was fitted to, as far as they are known."""
     try:
         within = Range(request.depth_range_mm, request.tilt_range_deg)
         if within.tilt_deg[1] > 30:
             raise ValueError(f"tilt_deg = {within.tilt_deg}: expected 0 to 30")
     except ValueError as error:
         raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
-    view = Field(mm_per_px=request.mm_per_px)
-    if request.fit is None:
-        return Settings(request.model, None, frozenset(), request.lam, within, request.anchor_sd_mm, view)
-    artefact = load_artefact(request.fit, BrushFit)
-    press = artefact.press()
-    # A fitted brush marks nothing above its zero offset.
-    least = max(within.depth_mm[0], 0.5 - float(press.values[NAMES.index("h0_mm")]))
-    if least >= within.depth_mm[1]:
-        raise CalibrationError("--depth-range", f"ends before the fitted brush marks, at {least:.2f} mm")
-    within, model = Range((least, within.depth_mm[1]), within.tilt_deg), fitted_model(press)
-    return Settings(model.name, model, frozenset(artefact.cells), request.lam, within, request.anchor_sd_mm, view)
+    options: dict[str, Any] = {
+        "noise": Noise.BLOCKS, "px_mm": request.mm_per_px, "anchor_sigma_mm": request.anchor_sd_mm
+    }  # fmt: skip
+    basis = Basis(brush) if request.lam is None else Basis(brush, request.lam)
+    try:
+        if request.fit is not None:
+            artefact = load_artefact(request.fit, BrushFit)
+            press = artefact.press()
+            # A fitted brush marks nothing above its zero offset.
+            least = max(within.depth_mm[0], 0.5 - float(press.values[NAMES.index("h0_mm")]))
+            if least >= within.depth_mm[1]:
+                raise CalibrationError("--depth-range", f"ends before the fitted brush marks, at {least:.2f} mm")
+            model, within = fitted_model(press), Range((least, within.depth_mm[1]), within.tilt_deg)
+            return Inverter.of_model(model, within=within, **options), model.name, artefact.cells
+        if request.model == "ccd-bsm":
+            return Inverter.of_brush(basis, within=within, **options), request.model, ()
+        model = stroke_model(request.model, brush, basis.lam)
+        return Inverter.of_model(model, within=within, **options), request.model, ()
+    except UnknownModelError as error:
+        raise CalibrationError("--model", str(error)) from None
+    except DomainError as error:
+        raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
 
 
-def write_inversion(made: Inversion, out: Path, repeats: int = 1, seed: int = 1) -> Path:
-    """Write `out` and the protocol beside it, which presses each stroke `repeats` times in an order drawn with `seed`.
+def _write(recovered: Recovered, repeats: int, seed: int) -> None:
+    """Write the CSV and the protocol, which presses each stroke `repeats` times in an order drawn with `seed`.
 
-    Returns the protocol's path. Raises `CalibrationError` and OSError.
+    Raises `CalibrationError` and OSError.
     """
-    if not made.rows:
-        why = f": {made.refused[0][0]}: {made.refused[0][1]}" if made.refused else ""
-        raise CalibrationError(str(made.recording), f"no stroke could be recovered{why}")
-    if len(made.rows) * repeats > MAX_ROWS:
-        problem = f"{len(made.rows) * repeats} strokes with repeats, a protocol holds at most {MAX_ROWS}"
-        raise CalibrationError(str(made.recording), problem)
-    if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
-        raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(out, csv_text(COLUMNS, csv_rows(made)))
-    protocol = out.parent / PROTOCOL
-    write_whole(protocol, replay_toml(made, out.name, repeats, seed))
-    return protocol
-
-
-def csv_rows(made: Inversion) -> Iterator[list[str]]:
-    """One row per stroke; depths and tilts to three decimals, deviations to three figures."""
-    for row in made.rows:
-        asked = ["" if v is None else f"{v:g}" for v in (row.commanded_depth_mm, row.commanded_tilt_deg)]
-        numbers = [f"{row.depth_mm:.3f}", f"{row.tilt_deg:.3f}", f"{row.depth_sd_mm:.3g}", f"{row.tilt_sd_deg:.3g}"]
-        yield [row.stroke_id, *numbers, f"{row.rms:.4f}", " ".join(row.flags), *asked, str(made.header.source)]
-
-
-def replay_toml(made: Inversion, name: str, repeats: int = 1, seed: int = 1) -> str:
-    """The `replay` protocol for the CSV file `name`."""
-    return (
-        f"# Recovered by {made.settings.model} from {made.header.session_id} ({made.header.source}), "
-        f"recording sha256 {made.recording_sha256}.\n"
+    where, refused = str(recovered.session.recording.path), recovered.refused
+    if not recovered.rows:
+        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
+        raise CalibrationError(where, f"no stroke could be recovered{why}")
+    count = len(recovered.rows) * repeats
+    if count > MAX_ROWS:
+        raise CalibrationError(where, f"{count} strokes with repeats, a protocol holds at most {MAX_ROWS}")
+    recovered.out.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(recovered.out, csv_text(COLUMNS, recovered.csv_rows()))
+    header = recovered.session.header
+    write_whole(
+        recovered.protocol,
+        f"# Recovered by {recovered.model} from {header.session_id} ({header.source}), "
+        f"recording sha256 {recovered.session.sha256}.\n"
         'kind = "replay"\n'
-        f"of = {json.dumps(made.header.session_id, ensure_ascii=False)}\n"
-        f"file = {json.dumps(name, ensure_ascii=False)}\n"
+        f"of = {json.dumps(header.session_id, ensure_ascii=False)}\n"
+        f"file = {json.dumps(recovered.out.name, ensure_ascii=False)}\n"
         f"repeats = {repeats}\n"
-        f"seed = {seed}\n"
+        f"seed = {seed}\n",
     )

@@ -1,38 +1,23 @@
-"""Presses recovered from captures: each stroke on the millimetre field, inverted in batches, with its interval.
+"""Depth and tilt of presses, recovered from their coverage of the millimetre field, each with its interval.
 
-The fit is to the coverage of the stroke's mask: its share of each pixel of the 128 x 128 field. The recovered
-(H, alpha) is the press for which this model makes this mark. It measures the actual press only as well as the model
-describes the brush.
+The recovered (H, alpha) is the press for which this model makes this mark. It measures the actual press only as well as
+the model describes the brush: where commands are known, the model's error is told from them and added.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TypeVar
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.place import Field, Image, brush_of, covered, prepare_press
-from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.presses import Press, Refused
 from brushloop.calibrate.stats import student_95
-from brushloop.calibrate.stroke.params import PX_PER_MM
-from brushloop.model.brush import DomainError
-from brushloop.model.inversion.noise import Noise
-from brushloop.model.inversion.press import Flag, Inverter, Range
-from brushloop.model.protocol import Basis, StrokeModel
-from brushloop.model.strokes import UnknownModelError, stroke_model
-from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture, Recording
-from brushloop.sessions.records import Header, Stroke
-from brushloop.sessions.terminal import Progress, counted, unseen
+from brushloop.model.inversion.press import Flag, Inverter
 
-_T = TypeVar("_T")
 NO_MODEL_ERROR = "no_model_error"
 """Flag of a press whose standard deviations leave out the error of the model."""
 NOT_INFORMATIVE = {"H": "depth_not_informative", "alpha": "tilt_not_informative"}
@@ -43,29 +28,12 @@ BATCH = 64
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
 Floats = NDArray[np.float64]
-Cell = tuple[float, float]
+DepthTilt = tuple[float, float]
 """Depth in mm and tilt in deg."""
 LEAST_CELLS = 3
-"""With fewer other cells, the model error is unknown."""
+"""With fewer other conditions, the model error is unknown."""
 NORMAL_95 = 1.96
 ROUNDS = 100
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How captures are inverted."""
-
-    model: str = "ccd-bsm"
-    fitted: StrokeModel | None = None
-    """A calibrated brush, which replaces `model`."""
-    fitted_cells: frozenset[Cell] = frozenset()
-    """The cells that it was fitted to, where they are known."""
-    lam: float | None = None
-    """lambda of CCD-BSM; None is pi, the default of the paper."""
-    within: Range = field(default_factory=Range)
-    anchor_sigma_mm: float = 0.1
-    """Standard deviation of the zero-touch point; 0 if it is known exactly."""
-    view: Field = field(default_factory=Field)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,73 +51,39 @@ class Row:
     commanded_tilt_deg: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class Inversion:
-    """Presses recovered from a recording."""
-
-    header: Header
-    recording: Path
-    recording_sha256: str
-    settings: Settings
-    rows: list[Row]
-    refused: list[tuple[str, str]]
-    """(stroke, reason) of each stroke that was not recovered."""
-
-
-@dataclass(frozen=True, slots=True)
-class AlignedStroke:
-    """A stroke on its field: coverage, and the anchor in mm from the left and top edge."""
-
-    stroke: Stroke
-    image: Image
-    place_mm: tuple[float, float]
-
-
-def invert_recording(
-    session: Path,
-    settings: Settings,
-    calibration_path: Path | None,
-    presses: int | None = None,
-    progress: Progress = unseen,
-) -> Inversion:
-    """Recover every press of a session, or `presses` of them, spread evenly over the order in which they were made.
-
-    Raises `CalibrationError` if the session is not calibrated or holds no press.
-    """
-    recording = Recording(session)
-    digest = recording.sha256
-    strokes = list(recording.stroke_records())
-    if not strokes:
-        raise CalibrationError(str(recording.path), "holds no strokes")
-    if any(stroke.kind != "press" for stroke in strokes):
-        raise CalibrationError(str(recording.path), "holds drags: only presses are inverted")
-    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
-    made = Inversion(recording.header, recording.path, digest, settings, [], [])
-    inverter = _inverter(recording.header, settings)
-    waiting: list[AlignedStroke] = []
-    chosen = {stroke.stroke_id for stroke in spread(strokes, presses)}
-    for capture in counted(recording.captures(), "presses recovered", len(strokes), progress):
-        if capture.stroke.stroke_id not in chosen:
-            continue
-        try:
-            waiting.append(align(capture, calibration, settings.view))
-        except (CaptureRefused, SessionDamaged) as error:
-            made.refused.append((capture.stroke.stroke_id, error.what))
-            continue
-        if len(waiting) == BATCH:
-            _invert(made, inverter, waiting)
-            waiting = []
-    _invert(made, inverter, waiting)
-    order = {stroke.stroke_id: number for number, stroke in enumerate(strokes)}
-    made.rows.sort(key=lambda row: order[row.stroke_id])
-    made.rows[:] = with_model_error(made.rows, settings.fitted_cells)
-    return made
+def invert_presses(presses: Iterable[Press], inverter: Inverter, refused: list[Refused]) -> list[Row]:
+    """Recover presses in batches, by the image alone; those that cannot be recovered go to `refused`."""
+    rows: dict[str, Row] = {}
+    remaining = iter(presses)
+    while batch := list(islice(remaining, BATCH)):
+        images = np.stack([press.coverage for press in batch])
+        places = np.array([press.anchor_mm for press in batch])
+        recovered = inverter(images, places, np.array([press.stroke.heading_deg for press in batch]))
+        for k, press in enumerate(batch):
+            stroke, flags = press.stroke, recovered.flags[k]
+            useless = ", ".join(sorted(flags & USELESS))
+            if problem := useless or _unnameable(stroke.stroke_id, rows):
+                refused.append((stroke.stroke_id, problem))
+                continue
+            (depth_mm, tilt_deg), (depth_sd_mm, tilt_sd_deg) = recovered.values[k, :2], recovered.sigma[k, :2]
+            rows[stroke.stroke_id] = Row(
+                stroke.stroke_id,
+                float(depth_mm),
+                float(tilt_deg),
+                float(depth_sd_mm),
+                float(tilt_sd_deg),
+                float(recovered.rms[k]),
+                tuple(sorted(flags)),
+                stroke.depth_mm,
+                stroke.tilt_deg,
+            )
+    return list(rows.values())
 
 
-def with_model_error(rows: Sequence[Row], fitted: Collection[Cell] = ()) -> list[Row]:
+def with_model_error(rows: Sequence[Row], fitted: Collection[DepthTilt] = ()) -> list[Row]:
     """The rows with the model error added to their standard deviations, and flags for unknown or wide intervals.
 
-    `fitted` are the cells that the model was fitted to.
+    `fitted` are the conditions that the model was fitted to.
     """
     nan = float("nan")
     cells = [(row.commanded_depth_mm or 0.0, row.commanded_tilt_deg or 0.0) for row in rows]
@@ -191,70 +125,13 @@ def covers_most(value: float, sd: float, commanded: Sequence[float]) -> bool:
     return high > low and covered > MOST * (high - low)
 
 
-def spread(strokes: Sequence[_T], most: int | None) -> Sequence[_T]:
-    """At most `most` strokes at even distances; all of them if it is None."""
-    if most is None or most >= len(strokes):
-        return strokes
-    return [strokes[number * len(strokes) // most] for number in range(most)]
-
-
-def align(capture: Capture, calibration: Calibration | None, view: Field) -> AlignedStroke:
-    """Place a capture on the field, by the calibration or by the import's own scale. Raises `CaptureRefused`."""
-    stroke, prepared = capture.stroke, prepare_press(capture, calibration, view)
-    if prepared.cut:
-        raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph, cell or field")
-    assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
-    x_px, y_px = prepared.anchor_px
-    return AlignedStroke(stroke, covered(prepared), (x_px / PX_PER_MM, y_px / PX_PER_MM))
-
-
-def _invert(made: Inversion, inverter: Inverter, batch: list[AlignedStroke]) -> None:
-    """Invert a batch, and file each stroke as recovered or refused."""
-    if not batch:
-        return
-    images = np.stack([aligned.image for aligned in batch])
-    heading = np.array([aligned.stroke.heading_deg for aligned in batch])
-    found = inverter(images, np.array([aligned.place_mm for aligned in batch]), heading)
-    for k, aligned in enumerate(batch):
-        stroke, flags = aligned.stroke, found.flags[k]
-        ident = stroke.stroke_id
-        if useless := sorted(flags & USELESS):
-            made.refused.append((ident, ", ".join(useless)))
-            continue
-        if problem := _unnameable(ident, {row.stroke_id for row in made.rows}):
-            made.refused.append((ident, problem))
-            continue
-        made.rows.append(
-            Row(
-                ident, float(found.values[k, 0]), float(found.values[k, 1]), float(found.sigma[k, 0]),
-                float(found.sigma[k, 1]), float(found.rms[k]), tuple(sorted(flags)), stroke.depth_mm, stroke.tilt_deg,
-            )
-        )  # fmt: skip
-
-
-def _unnameable(ident: str, taken: set[str]) -> str:
+def _unnameable(ident: str, taken: Collection[str]) -> str:
     """Reason why a protocol cannot press a stroke of this name again; empty if it can."""
     if ident in taken:
         return "its name is that of another stroke too"
     if not 1 <= len(ident) <= 100 or not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident):
         return "its name cannot stand in a protocol"
     return "its name cannot stand in a protocol" if ident[0] in ".-~" else ""
-
-
-def _inverter(header: Header, settings: Settings) -> Inverter:
-    brush = brush_of(header)
-    basis = Basis(brush) if settings.lam is None else Basis(brush, settings.lam)
-    options = {"within": settings.within, "noise": Noise.BLOCKS, "px_mm": settings.view.mm_per_px}
-    options |= {"anchor_sigma_mm": settings.anchor_sigma_mm}
-    try:
-        if settings.fitted is None and settings.model == "ccd-bsm":
-            return Inverter.of_brush(basis, **options)
-        model = settings.fitted or stroke_model(settings.model, brush, basis.lam)
-        return Inverter.of_model(model, **options)
-    except UnknownModelError as error:
-        raise CalibrationError("--model", str(error)) from None
-    except DomainError as error:
-        raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
 
 
 def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, float, int]]:
@@ -266,8 +143,8 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, flo
         "H": [(r.depth_mm, r.depth_sd_mm, r.commanded_depth_mm) for r in rows],
         "alpha": [(r.tilt_deg, r.tilt_sd_deg, r.commanded_tilt_deg) for r in rows],
     }
-    for name, found in pairs.items():
-        known = [(value - asked, sd) for value, sd, asked in found if asked is not None]
+    for name, values in pairs.items():
+        known = [(value - asked, sd) for value, sd, asked in values if asked is not None]
         if known:
             off, sd = (np.array(part, np.float64) for part in zip(*known, strict=True))
             inside = np.abs(off) <= NORMAL_95 * sd
@@ -275,7 +152,7 @@ def off_command(rows: list[Row]) -> Iterator[tuple[str, float, float | None, flo
             yield name, float(off.mean()), scatter, float(inside.mean()), len(off)
 
 
-def model_sd(off: Floats, sd: Floats, cells: list[Cell], fitted: Collection[Cell] = ()) -> Floats:
+def model_sd(off: Floats, sd: Floats, cells: list[DepthTilt], fitted: Collection[DepthTilt] = ()) -> Floats:
     """Standard deviation of the model error of N presses, (N,); NaN where too few other cells are known.
 
     `off` (N,) is recovered - commanded, NaN where no command is known; `sd` (N,) is the standard deviation from the

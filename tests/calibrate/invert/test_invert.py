@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,13 +13,13 @@ import pytest
 
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.invert.command import PROTOCOL, write_inversion
-from brushloop.calibrate.invert.invert import Row, Settings, align, invert_recording, off_command, spread
+from brushloop.calibrate.invert.command import PROTOCOL, Recovered, RecoverRequest, recover
+from brushloop.calibrate.invert.invert import Row, off_command
+from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.presses import ReplayConfig
 from brushloop.model.brush import Brush
 from brushloop.model.ccdbsm import ccdbsm
-from brushloop.model.inversion.press import Range
 from brushloop.model.raster.exact import coverage_at
 from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.messages import encode_png
@@ -51,15 +52,19 @@ def session(folder: Path, *, kind: str = "press") -> Path:
     return out
 
 
+def recovered(session: Path, out: Path, **options: Any) -> Recovered:
+    return recover(RecoverRequest(session, out / "recovered.csv", **{"anchor_sd_mm": 0.05} | options))
+
+
 def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
-    made = invert_recording(session(tmp_path), Settings(anchor_sigma_mm=0.05), None)
+    made = recovered(session(tmp_path), tmp_path / "out")
     assert made.refused == []
     for row, (height, tilt) in zip(made.rows, PRESSES, strict=True):
         # The preprocessing's own threshold is what is left: .03 mm of depth.
         assert row.depth_mm == pytest.approx(height, abs=0.08)
         assert row.tilt_deg == pytest.approx(tilt, abs=0.6)
         assert 0 < row.depth_sd_mm < 0.2
-    protocol = load_protocol(write_inversion(made, tmp_path / "out" / "recovered.csv"))
+    protocol = load_protocol(made.protocol)
     assert isinstance(protocol, ReplayConfig)
     assert protocol.of == "shots"
     assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
@@ -72,17 +77,16 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
 
 
 def test_some_presses_are_chosen_evenly_and_the_others_left_alone(tmp_path: Path) -> None:
-    made = invert_recording(session(tmp_path), Settings(anchor_sigma_mm=0.05), None, presses=2)
+    made = recovered(session(tmp_path), tmp_path, presses=2)
     assert [row.stroke_id for row in made.rows] == ["p0", "p1"]
     assert made.refused == []
-    assert [list(spread([*range(9)], most)) for most in (3, 9, 20, None)] == [[0, 3, 6], *[[*range(9)]] * 3]
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_another_model_inverts_the_same_session(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="unknown stroke model 'x'"):
-        invert_recording(session(tmp_path), Settings(model="x"), None)
-    made = invert_recording(tmp_path / "sessions" / "shots", Settings(model="ellipse"), None)
+        recovered(session(tmp_path), tmp_path, model="x")
+    made = recovered(tmp_path / "sessions" / "shots", tmp_path, model="ellipse")
     # The ellipse is regressed on CCD-BSM's marks: it has their length, so their depth, nearly.
     for row, (height, _) in zip(made.rows, PRESSES, strict=True):
         assert row.depth_mm == pytest.approx(height, abs=3.0)
@@ -90,31 +94,26 @@ def test_another_model_inverts_the_same_session(tmp_path: Path) -> None:
 
 
 def test_drags_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="only presses are inverted"):
-        invert_recording(session(tmp_path, kind="drag"), Settings(), None)
+    with pytest.raises(CalibrationError, match="holds drags"):
+        recovered(session(tmp_path, kind="drag"), tmp_path)
 
 
-def test_a_stroke_that_cannot_be_used_is_named(tmp_path: Path) -> None:
-    settings = Settings(view=Field(mm_per_px=0.12))
-    made = invert_recording(session(tmp_path), settings, None)
-    assert made.rows == []
-    assert made.refused[0] == ("p0", "is cut by the edge of its photograph, cell or field")
-    with pytest.raises(CalibrationError, match="no stroke could be recovered: p0: is cut"):
-        write_inversion(made, tmp_path / "recovered.csv")
+def test_a_session_of_which_nothing_can_be_recovered_writes_nothing(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="no stroke could be recovered: p0: is cut by the edge of its photo"):
+        recovered(session(tmp_path), tmp_path, mm_per_px=0.12)
     assert not (tmp_path / "recovered.csv").exists()
 
 
 def test_a_capture_without_any_scale_is_refused() -> None:
     stroke = Stroke(stroke_id="s", kind="press", still=0, anchor_mm=(3.0, 4.0))
     capture = Capture(stroke, encode_png(photograph(12.0, 3.0)), "s")
-    with pytest.raises(CalibrationError, match="neither a calibration nor a scale"):
-        align(capture, None, Field())
+    [(name, why)] = prepare_job(PrepareJob(capture, None, Field())).items()
+    assert (name, str(why)) == ("refused", "has neither a calibration nor a scale of its own")
 
 
 def test_a_name_that_no_protocol_can_hold_is_not_written(tmp_path: Path) -> None:
-    made = invert_recording(session(tmp_path), Settings(within=Range((5.0, 25.0))), None, presses=1)
     with pytest.raises(CalibrationError, match="give a plain name"):
-        write_inversion(made, tmp_path / PROTOCOL)
+        recover(RecoverRequest(tmp_path, tmp_path / PROTOCOL))
 
 
 def test_the_summary_compares_with_what_was_commanded() -> None:
