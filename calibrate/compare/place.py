@@ -23,7 +23,7 @@ from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.preprocess import Prepared, Steps, prepare, preprocess
-from brushloop.calibrate.stroke.rectify import on_raster, on_window, rectify_by, rescale
+from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
 from brushloop.model.brush import Brush
 from brushloop.model.loops import Loop
 from brushloop.sessions.recording import Capture
@@ -158,9 +158,10 @@ def to_tone(coverage: Image, tone: Tone) -> Image:
 def rectified(capture: Capture, calibration: Calibration | None, view: Field) -> tuple[Gray, Steps]:
     """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
 
-    A press is cropped to the field around its zero-touch point, a stroke that travels to its paper cell; an imported
-    photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used, `SessionDamaged` for a
-    picture that cannot be read.
+    A press is cropped to the field around its zero-touch point, a stroke that travels to its paper cell. A press in an
+    imported photograph keeps the surroundings that the light is estimated from; without that point, or of a stroke that
+    travels, the photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used,
+    `SessionDamaged` for a picture that cannot be read.
     """
     stroke, image, params = capture.stroke, capture.image(), Params.of(calibration)
     if calibration is not None and stroke.anchor_mm is not None:
@@ -174,8 +175,14 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
         return raster, preprocess(raster, anchor, capture.where, params, cell_px)
     if stroke.px_per_mm is None:
         raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
+    anchor_px = stroke.anchor_px
+    if anchor_px is not None and stroke.kind == "press":
+        around, (left_mm, top_mm) = 0.5 * params.background_mm, view.anchor_mm
+        right_mm, bottom_mm = view.side_mm - left_mm, view.side_mm - top_mm
+        reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
+        image, anchor_px = cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
     raster = rescale(image, stroke.px_per_mm, capture.where)
-    anchor = None if stroke.anchor_px is None else on_raster(stroke.anchor_px, stroke.px_per_mm)
+    anchor = None if anchor_px is None else on_raster(anchor_px, stroke.px_per_mm)
     return raster, preprocess(raster, anchor, capture.where, params)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol, cast
 
 import cv2
@@ -47,6 +48,26 @@ def rescale(image: Gray, px_per_mm: tuple[float, float], where: str) -> Gray:
         raise CaptureRefused(where, f"is {size[0]} x {size[1]} px at 20 px/mm, allowed 8 to {MAX_RASTER_PX}")
     shrinks = size[0] < width
     return cast("Gray", cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
+
+
+def cut_out(
+    image: Gray,
+    point_px: tuple[float, float],
+    px_per_mm: tuple[float, float],
+    reach_mm: tuple[float, float, float, float],
+    where: str,
+) -> tuple[Gray, tuple[float, float]]:
+    """The part of a photograph that reaches so far from a point to the left, top, right and bottom; the point in it.
+
+    Raises `CaptureRefused` for a point so far outside that nothing is left.
+    """
+    (x, y), (left, top, right, bottom) = point_px, reach_mm
+    column, row = (max(0, math.floor(at - reach)) for at, reach in ((x, left * px_per_mm[0]), (y, top * px_per_mm[1])))
+    last = max(0, math.ceil(y + bottom * px_per_mm[1])), max(0, math.ceil(x + right * px_per_mm[0]))
+    part = image[row : last[0], column : last[1]]
+    if not part.size:
+        raise CaptureRefused(where, "anchor lies so far from the stroke that none of it is in the field")
+    return part, (x - column, y - row)
 
 
 def on_raster(point_px: tuple[float, float], px_per_mm: tuple[float, float]) -> tuple[float, float]:
