@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.place import Alignment
@@ -98,6 +97,8 @@ def best_shift(moving: Image, fixed: Image) -> Image:
 
     Overlaps are those of 256 levels, in whole numbers, so that ties are always broken in the same way.
     """
+    import scipy.fft  # slow to import, and a collecting rig compares nothing by shift
+
     reach, window = BEST_SHIFT_PX, _inked(moving, fixed, BEST_SHIFT_PX)
     a, b = (np.rint(255.0 * image[window]) for image in (fixed, moving))
     size = [scipy.fft.next_fast_len(side + reach, real=True) for side in a.shape]
