@@ -1,4 +1,4 @@
-"""The definition of position, heading and pixel that all code uses; illustrated in `docs/raster.md`.
+"""The definition of position, heading and pixel that all code uses; illustrated in `docs/models.md`.
 
 Stroke frame: x along the stroke axis, positive toward the belly, heel and ferrule; y to the left of +x; the origin
 is O3, where the brush axis meets the paper. Lengths are mm.
