@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
 from brushloop.calibrate.compare.place import Field
-from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of, read_presses
+from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, about
 from brushloop.model.fitted import chance_within, published
 
 BRISTLE = "bristle simulation"
+SIZE_PX, PX_MM, TOUCH_MM = 128, 0.3, (29.1, 19.2)
+"""The images of made-up marks, and where the tip touches on them, from the left and top edge."""
 ROWS = slice(28, 100)
 """10.8 mm to either side: no press is thicker."""
 Floats = NDArray[np.float64]
@@ -136,8 +138,8 @@ def known() -> Iterator[KnownBrush]:
         with tempfile.TemporaryDirectory() as folder:
             captures = read_presses(bristle_session(Path(folder) / name, name), Field())
         yield _fitted(name, BRISTLE, captures.strokes, captures.grid, captures.radius_mm, captures.length_mm)
-    whole = grid_of(Field())
-    grid = Grid(whole.x_mm, whole.y_mm[ROWS])
+    centres = np.asarray((np.arange(SIZE_PX) + 0.5) * PX_MM, np.float64)
+    grid = Grid(centres - TOUCH_MM[0], (TOUCH_MM[1] - centres)[ROWS])
     for family in FAMILIES:
         for number in range(BRUSHES):
             brush = made_up(family, number)
