@@ -243,6 +243,15 @@ class Done(_Event):
         return result.skipped if isinstance(result, DipResult) else None
 
 
+class StepEvent(Value):
+    """The begin or the end of a step, as it travels with the step's file: a lost journal is rebuilt from these.
+
+    A file cannot hold its own digest, which is empty.
+    """
+
+    step: Annotated[Begin | Done, Field(discriminator="event")]
+
+
 class Void(_Event):
     """An attempt was cut; its patches stay used."""
 

@@ -6,26 +6,21 @@ a time; the tables are held in memory. `header.json` says where everything comes
 
 `png`      images/, with a cropper masks/; strokes.csv, poses.csv, forces.csv
 `npz`      strokes.npz, which loads without pickle: an array per column of the table of strokes, (n,), NaN where a value
-           is missing; image_0000, ... (h, w) uint8 gray, also mask_0000; pose_<column> (m,),
-           pose_position_mm (m, 3), pose_quaternion (m, 4); with a force sensor force_<column> (k,), force_wrench (k, 6)
-`parquet`  what Hugging Face `datasets` loads: a data set card, and the tables strokes/, poses/, forces/ with columns
-           named as LeRobot names them; an image is a struct {bytes, path}. `timestamp` is the measured time in seconds
-           since the first sample of the stroke; there is no fixed frame rate, which a LeRobotDataset would require.
+           is missing; image_0000, ... (h, w) uint8 gray, also mask_0000; pose_<column> and force_<column>, (m,)
+`parquet`  strokes.parquet, with each picture as a struct {bytes, path}, as Hugging Face `datasets` stores images;
+           poses.parquet, forces.parquet
 
-`episode_index` joins the tables: a stroke is an episode.
+The tables have the same columns in every format, and `episode_index`, the number of the stroke, joins them.
 """
 
 from __future__ import annotations
 
-import html
 import importlib
 import json
 import math
-import re
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,33 +30,22 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import check_room, csv_text, staged_folder, sync, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
+from brushloop.sessions.events import Begin, StepEvent, StepKind
 from brushloop.sessions.messages import PNG_START, decode_gray
 from brushloop.sessions.recording import Capture, Recording, unlike
-from brushloop.sessions.records import Quality, StepEvent, Stroke, Topic, Wrench
-from brushloop.sessions.terminal import Progress, counted, plain, unseen
+from brushloop.sessions.records import Quality, Stroke, Topic, Wrench
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-ROWS_PER_GROUP = 32
-"""Photographs held in memory at a time; viewers want small groups for rows with images."""
-SAMPLES_PER_GROUP = 20_000
-FILE = "train-00000-of-00001.parquet"
-LICENCE_ID = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
-"""What a card may give as `license`; any other text is given as `license_name`."""
 TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
 CROP_TEXT_COLUMNS = ("mask_file", "flags")
 """Texts of a stroke that only exports of crops have."""
 PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 """Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
-SAMPLE_TYPES: dict[str, str | int] = {
-    **dict.fromkeys(("episode_index", "frame_index", "index", "task_index"), "int64"),
-    "timestamp": "float64",
-    **dict.fromkeys(("t_ns", "log_ns", "sequence"), "int64"),
-}
-"""Columns of samples in Parquet, in the order that LeRobot has."""
 Row = dict[str, Any]
 
 
@@ -74,10 +58,6 @@ class Series:
     columns: tuple[str, ...]
     values: Callable[[bytes], tuple[float, ...]]
     """Values of the columns in a message. Raises `DecodeError` or `ValidationError`."""
-    arrays: dict[str, slice]
-    """Names of the arrays in an `.npz`, and the columns that each holds."""
-    feature: str
-    """Name of all columns together, as LeRobot names it."""
 
 
 def _pose(data: bytes) -> tuple[float, ...]:
@@ -90,12 +70,9 @@ def _wrench(data: bytes) -> tuple[float, ...]:
     return tuple(Wrench.model_validate_json(data).model_dump().values())
 
 
-_POSE = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
-_WRENCH = tuple(Wrench.model_fields)
-_POSE_ARRAYS = {"pose_position_mm": slice(3), "pose_quaternion": slice(3, 7)}
-POSES = Series("pose", Topic.TCP, _POSE, _pose, _POSE_ARRAYS, "observation.state")
+POSES = Series("pose", Topic.TCP, ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"), _pose)
 """Of the brush tip, in the robot's base frame."""
-FORCES = Series("force", Topic.WRENCH, _WRENCH, _wrench, {"force_wrench": slice(6)}, "observation.force")
+FORCES = Series("force", Topic.WRENCH, tuple(Wrench.model_fields), _wrench)
 """In the sensor's own frame."""
 
 
@@ -205,9 +182,9 @@ class Export:
             for _schema, channel, message in self.recording.messages(Topic.STEP, series.topic):
                 on = channel.topic
                 if on == Topic.STEP:
-                    event = StepEvent.model_validate_json(message.data)
-                    pressed = event.phase == "begin" and event.kind != "capture"
-                    current, frame = numbers.get(event.stroke_id or "", -1) if pressed else -1, 0
+                    step = StepEvent.model_validate_json(message.data).step
+                    pressed = step.press if isinstance(step, Begin) and step.kind != StepKind.CAPTURE else None
+                    current, frame = -1 if pressed is None else numbers.get(pressed.stroke_id, -1), 0
                 elif current >= 0:
                     when.append((current, frame, message.publish_time, message.log_time, message.sequence))
                     values.append(series.values(message.data))
@@ -215,6 +192,11 @@ class Export:
         except (ValidationError, DecodeError):
             raise SessionDamaged(self.recording.path, f"a message on {on} does not fit its schema") from None
         return np.array(when, np.int64).reshape(-1, 5), np.array(values, np.float64).reshape(-1, len(series.columns))
+
+    def sample_columns(self, series: Series) -> dict[str, NDArray[Any]]:
+        """The table of `samples`: name of each column and its (n,) values. Raises `SessionDamaged`."""
+        when, values = self.samples(series)
+        return dict(zip((*SAMPLE_COLUMNS, *series.columns), (*when.T, *values.T), strict=True))
 
 
 def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
@@ -285,8 +267,8 @@ def write_png(export: Export, folder: Path) -> None:
     cells = [[row.get(name) for name in columns] for row in rows]
     write_durably(folder / "strokes.csv", csv_text(columns, cells, "\r\n").encode())
     for series in export.series:
-        samples = zip(*(table.tolist() for table in export.samples(series)), strict=True)
-        text = csv_text((*SAMPLE_COLUMNS, *series.columns), ((*when, *values) for when, values in samples), "\r\n")
+        samples = export.sample_columns(series)
+        text = csv_text(list(samples), zip(*(column.tolist() for column in samples.values()), strict=True), "\r\n")
         write_durably(folder / f"{series.name}s.csv", text.encode())
 
 
@@ -313,118 +295,27 @@ def write_npz(export: Export, folder: Path) -> None:
                 values = (row.get(name) for row in rows)
                 add(name, np.array([math.nan if value is None else value for value in values], np.float64))
             for series in export.series:
-                when, values = export.samples(series)
-                for name, column in zip(SAMPLE_COLUMNS, when.T, strict=True):
+                for name, column in export.sample_columns(series).items():
                     add(f"{series.name}_{name}", column)
-                for name, part in series.arrays.items():
-                    add(name, values[:, part])
         sync(file)
 
 
 def write_parquet(export: Export, folder: Path) -> None:
-    """Write the tables and the card. Raises `InputError` where pyarrow is not installed."""
+    """Write the tables. Raises `InputError` where pyarrow is not installed."""
     try:
         pa: Any = importlib.import_module("pyarrow")  # without type stubs
         pq: Any = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise InputError("--format", "parquet needs pyarrow: pip install pyarrow") from None
 
-    numbers = [name for name in export.number_columns() if name != "episode_index"]
-    strokes: dict[str, str | int] = {**dict.fromkeys(export.pictures, "image"), "episode_index": "int64"}
-    strokes |= dict.fromkeys(export.text_columns, "string") | dict.fromkeys(numbers, "float64")
-    tables: list[tuple[str, dict[str, str | int], Iterator[Row]]] = [("strokes", strokes, _pictured_rows(export))]
+    types = dict.fromkeys(export.pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
+    types |= dict.fromkeys(export.text_columns, pa.string())
+    types |= dict.fromkeys(export.number_columns(), pa.float64()) | {"episode_index": pa.int64()}
+    features = {"info": {"features": {name: {"_type": "Image"} for name in export.pictures}}}
+    schema = pa.schema(list(types.items())).with_metadata({"huggingface": json.dumps(features)})
+    with pq.ParquetWriter(folder / "strokes.parquet", schema) as writer:
+        for row, pictures in export.captures():  # one photograph in memory
+            images = {name: {"bytes": data, "path": row[file_column(name)]} for name, data in pictures.items()}
+            writer.write_table(pa.Table.from_pylist([row | images], schema=schema))
     for series in export.series:
-        columns = {**SAMPLE_TYPES, series.feature: len(series.columns)}
-        tables.append((f"{series.name}s", columns, _sample_rows(export, series)))
-    counts: dict[str, int] = {}
-    for name, columns, rows in tables:
-        group = ROWS_PER_GROUP if name == "strokes" else SAMPLES_PER_GROUP
-        types = {column: _types(pa, kind) for column, kind in columns.items()}
-        features = {column: feature for column, (_type, feature) in types.items()}
-        schema = pa.schema([(column, kind) for column, (kind, _feature) in types.items()])
-        schema = schema.with_metadata({"huggingface": json.dumps({"info": {"features": features}})})
-        some = list(islice(rows, group))
-        if not some:
-            continue  # `datasets` refuses a file without rows
-        (folder / name).mkdir()
-        with pq.ParquetWriter(folder / name / FILE, schema) as writer:
-            while some:
-                writer.write_table(pa.Table.from_pylist(some, schema=schema))
-                counts[name] = counts.get(name, 0) + len(some)
-                some = list(islice(rows, group))
-    write_durably(folder / "README.md", _card(export, counts))
-
-
-def _pictured_rows(export: Export) -> Iterator[Row]:
-    for row, pictures in export.captures():
-        yield row | {name: {"bytes": data, "path": row[file_column(name)]} for name, data in pictures.items()}
-
-
-def _sample_rows(export: Export, series: Series) -> Iterator[Row]:
-    start_ns = 0
-    for index, (when, values) in enumerate(zip(*export.samples(series), strict=True)):
-        row = dict(zip(SAMPLE_COLUMNS, when.tolist(), strict=True))
-        start_ns = row["t_ns"] if row["frame_index"] == 0 else start_ns
-        seconds = (row["t_ns"] - start_ns) / 1e9
-        yield {**row, "index": index, "task_index": 0, "timestamp": seconds, series.feature: values.tolist()}
-
-
-def _types(pa: Any, kind: str | int) -> tuple[Any, Row]:
-    """Arrow type of a column, and its description as `datasets` stores it in the file's metadata.
-
-    `kind` is `image`, the name of a type, or the length of a list of numbers.
-    """
-    if kind == "image":
-        return pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
-    if isinstance(kind, int):
-        value = {"dtype": "float64", "_type": "Value"}
-        return pa.list_(pa.float64(), kind), {"feature": value, "length": kind, "_type": "Sequence"}
-    return pa.type_for_alias(kind), {"dtype": kind, "_type": "Value"}
-
-
-def _card(export: Export, counts: dict[str, int]) -> bytes:
-    header = export.recording.header
-    configs = "".join(
-        f"- config_name: {name}\n  default: {str(name == 'strokes').lower()}\n  data_files:\n"
-        f"  - split: train\n    path: {name}/train-*.parquet\n"
-        for name in counts
-    )
-    facts = " ".join(
-        f"{name.capitalize()}: {_text(str(getattr(header, name)))}."
-        for name in ("brush", "ink", "paper", "robot", "licence")
-    )
-    text = f"""---
-{_licence(header.licence)}configs:
-{configs}---
-# {_text(header.session_id)}
-
-Source: **{header.source}**. {", ".join(f"{count} {name}" for name, count in counts.items())}, from \
-{_text(export.recording.path.name)} (SHA-256 `{export.recording.sha256}`).
-
-{facts}
-
-`strokes`: one row per stroke; `depth_mm` is the commanded depth H, `reached_mm` the depth that the arm reached,
-`tilt_deg` the tilt alpha. `image` is the photograph as it was recorded; beside a `mask`, which is 255 where the
-stroke's ink is, it is a crop seen from above, in which ink of neighbouring strokes may show.
-
-`poses`: of the brush tip in the robot's base frame; `observation.state` is {", ".join(POSES.columns)}.
-`forces`: of the sensor, in its own frame; `observation.force` is {", ".join(FORCES.columns)}.
-
-`episode_index` joins the tables. `timestamp` is in seconds from the stroke's first sample, as measured.
-"""
-    if export.left_out:
-        text += "\n## Strokes without a crop, left out\n"
-        text += "".join(f"- {_text(stroke_id)}: {_text(reason)}\n" for stroke_id, reason in export.left_out)
-    return text.encode()
-
-
-def _licence(name: str) -> str:
-    """The card's YAML about the licence; JSON strings are YAML."""
-    if not name:
-        return ""
-    return f"license: {name}\n" if LICENCE_ID.fullmatch(name) else f"license: other\nlicense_name: {json.dumps(name)}\n"
-
-
-def _text(text: str) -> str:
-    """A text from a recording, in a card: neither HTML, Markdown nor a new line."""
-    return re.sub(r"([\\`*_\[\]#|~])", r"\\\1", html.escape(plain(text))) or "not given"
+        pq.write_table(pa.table(export.sample_columns(series)), folder / f"{series.name}s.parquet")

@@ -7,7 +7,6 @@ refused import leaves nothing behind.
 from __future__ import annotations
 
 import csv
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,13 +27,10 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 
 MAX_TABLE_BYTES = 16 * 1024 * 1024
 MAX_ROWS = 100_000
-UNITS = {
-    **{"mm": ("mm", 1.0), "cm": ("mm", 10.0), "m": ("mm", 1000.0), "in": ("mm", 25.4)},
-    **{"deg": ("deg", 1.0), "rad": ("deg", 180.0 / math.pi)},
-}
-"""Suffixes of columns that are converted: the unit in which they are stored, and the factor to it."""
-FRACTIONS = ("frac", "px", "nominal", "ratio")
-"""Parts of names of columns that are not converted: shares, pixels, and values that the source itself calls nominal."""
+UNITS = ("mm", "deg")
+"""Ends of the names of columns of lengths and angles."""
+UNITLESS = ("frac", "px", "nominal", "ratio")
+"""Parts of names of other columns: shares, pixels, and values that the source itself calls nominal."""
 PAIRS = (("px_per_mm_x", "px_per_mm_y"), ("start_x_px", "start_y_px"))
 PRESSED = ("depth_mm", "tilt_deg", *PAIRS[1])
 """Columns that presses need."""
@@ -42,9 +38,8 @@ SPECIAL = {"px_per_mm", "depth_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns of numbers that become fields of a stroke; all others are kept in `commanded`."""
 EARLIER_NAMES = {"height_mm": "depth_mm"}
 """Columns of tables that were made when the depth was called a height."""
-DEPTHS = ("height", "depth")
-"""Prefixes of the names of columns that hold a depth, measured downwards from where the tip touches the paper."""
 DEEPEST_MM = 500.0
+"""Limit of columns whose name begins with `depth`: depths below where the tip touches the paper."""
 STEEPEST_DEG = 90.0
 MOST = 1e6
 """Limit of any other number: a length of a kilometre is a typing error."""
@@ -140,7 +135,7 @@ def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[
     rows: dict[str, tuple[Path, Stroke]] = {}
     try:
         names = [EARLIER_NAMES.get(name, name) for name in _texts(next(lines, list[str]()))]
-        columns = _columns(names, options)
+        ranges = _ranges(names, options)
         for cells in filter(any, lines):
             if len(rows) == MAX_ROWS:
                 raise ValueError(f"more than {MAX_ROWS} rows")
@@ -153,8 +148,8 @@ def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[
                 raise ValueError(f"column `name`: {name[:80]!r}, allowed: 1 to {MAX_NAME_CHARS} characters")
             if name in rows:
                 raise ValueError(f"stroke {name} appears twice")
-            values = {name: column.value(fields[name]) for name, column in columns.items()}
-            rows[name] = image, _stroke(name, len(rows), columns, values, options)
+            values = {column: _value(column, fields[column], allowed) for column, allowed in ranges.items()}
+            rows[name] = image, _stroke(name, len(rows), values, options)
     except (ValueError, csv.Error) as error:
         raise InputError(path, f"line {max(lines.line_num, 1)}: {error}") from None
     if not rows:
@@ -171,33 +166,8 @@ def _texts(cells: list[str]) -> list[str]:
     return texts
 
 
-@dataclass(frozen=True, slots=True)
-class _Column:
-    """A column of numbers, `quantity_unit`."""
-
-    name: str
-    stored: str
-    """Its name with the unit in which they are stored: mm for lengths, deg for angles."""
-    factor: float
-    """From the unit of the table to that one."""
-    least: float
-    most: float
-    """Range of what is stored."""
-
-    def value(self, text: str) -> float:
-        """A number in its stored unit. Raises `ValueError`."""
-        try:
-            value = number(text) * self.factor
-        except ValueError as error:
-            raise ValueError(f"column `{self.name}`: {error}") from None
-        if not self.least <= value <= self.most:
-            allowed = f"{self.least / self.factor:g} to {self.most / self.factor:g}"
-            raise ValueError(f"column `{self.name}`: {text[:80]!r}, allowed: {allowed}")
-        return value
-
-
-def _columns(names: list[str], options: ImportOptions) -> dict[str, _Column]:
-    """The columns of numbers. Raises `ValueError` for names that are missing, unknown or not distinct."""
+def _ranges(names: list[str], options: ImportOptions) -> dict[str, tuple[float, float]]:
+    """Ranges of the columns of numbers. Raises `ValueError` for names that are missing, unknown or not distinct."""
     if "file" not in names:
         raise ValueError(f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
     if "px_per_mm" not in names and "px_per_mm_x" not in names and options.px_per_mm is None:
@@ -206,39 +176,42 @@ def _columns(names: list[str], options: ImportOptions) -> dict[str, _Column]:
     for name in (*(PRESSED if options.kind == "press" else ()), *required):
         if name not in names:
             raise ValueError(f"column `{name}` is missing")
-    columns = {name: _column(name, options) for name in names if name not in ("file", "name")}
-    stored = [columns[name].stored if name in columns else name for name in names]
-    for name in stored:
-        if stored.count(name) > 1:
-            raise ValueError(f"column `{name}` occurs twice, perhaps in two units")
-    return columns
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"column `{name}` occurs twice")
+    return {name: _range(name, options) for name in names if name not in ("file", "name")}
 
 
-def _column(name: str, options: ImportOptions) -> _Column:
-    stem, _, suffix = name.rpartition("_")
-    unit, factor = UNITS.get(suffix if stem else "", ("", 1.0))
-    if not unit and not any(part in FRACTIONS for part in name.split("_")):
-        allowed = ", ".join([*UNITS, *FRACTIONS])
+def _range(name: str, options: ImportOptions) -> tuple[float, float]:
+    """Smallest and largest number that a column may hold. Raises `ValueError` for a name without a unit."""
+    parts = name.split("_")
+    if not (len(parts) > 1 and parts[-1] in UNITS) and set(UNITLESS).isdisjoint(parts):
+        allowed = ", ".join([*UNITS, *UNITLESS])
         raise ValueError(f"column `{name}` has no known unit; its name must end in one of: {allowed}")
-    least, most = -MOST, MOST
-    if unit == "mm" and name.startswith(DEPTHS):
-        least, most = 0.0, DEEPEST_MM
-    elif name == "tilt_deg":  # a drag may lean to either side of its path
-        least, most = (0.0 if options.kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
-    elif name.startswith("px_per_mm"):
-        least, most = MIN_PX_PER_MM, MAX_PX_PER_MM
-    return _Column(name, f"{stem}_{unit}" if unit else name, factor, least, most)
+    if name.startswith("depth") and parts[-1] == "mm":
+        return 0.0, DEEPEST_MM
+    if name == "tilt_deg":  # a drag may lean to either side of its path
+        return (0.0 if options.kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
+    return (MIN_PX_PER_MM, MAX_PX_PER_MM) if name.startswith("px_per_mm") else (-MOST, MOST)
 
 
-def _stroke(
-    name: str, still: int, columns: dict[str, _Column], values: dict[str, float], options: ImportOptions
-) -> Stroke:
-    """What the values of a line say, those of its columns that have no field of their own in `commanded`."""
+def _value(column: str, text: str, allowed: tuple[float, float]) -> float:
+    try:
+        value = number(text)
+    except ValueError as error:
+        raise ValueError(f"column `{column}`: {error}") from None
+    if not allowed[0] <= value <= allowed[1]:
+        raise ValueError(f"column `{column}`: {text[:80]!r}, allowed: {allowed[0]:g} to {allowed[1]:g}")
+    return value
+
+
+def _stroke(name: str, still: int, values: dict[str, float], options: ImportOptions) -> Stroke:
+    """What the values of a line say, those without a field of their own in `commanded`."""
 
     def pair(first: str, second: str) -> tuple[float, float] | None:
         return (values[first], values[second]) if first in values else None
 
-    given = None if options.px_per_mm is None else (options.px_per_mm, options.px_per_mm)
+    scale = None if options.px_per_mm is None else (options.px_per_mm, options.px_per_mm)
     return Stroke(
         stroke_id=name,
         kind="press" if options.kind == "press" else "drag",
@@ -246,8 +219,8 @@ def _stroke(
         depth_mm=values.get("depth_mm"),
         tilt_deg=values.get("tilt_deg"),
         anchor_px=pair(*PAIRS[1]),
-        px_per_mm=pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0]) or given,
-        commanded={columns[name].stored: value for name, value in values.items() if name not in SPECIAL},
+        px_per_mm=pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0]) or scale,
+        commanded={name: value for name, value in values.items() if name not in SPECIAL},
     )
 
 

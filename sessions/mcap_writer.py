@@ -11,6 +11,7 @@ most the last 250 ms of a step, and that step is done again anyway.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import queue
 import struct
@@ -47,15 +48,7 @@ from mcap.writer import MCAP0_MAGIC
 from brushloop.sessions.disk import file_sha256, fsync_folder, sync
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
 from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, scan_sound
-from brushloop.sessions.records import (
-    BEGIN_NOTE,
-    DONE_NOTE,
-    HEADER_NOTE,
-    Event,
-    Header,
-    Topic,
-    note,
-)
+from brushloop.sessions.records import HEADER_NOTE, Event, Header, Topic, note
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Protobuf
@@ -87,9 +80,10 @@ def encoded(message: Event | Protobuf) -> bytes:
     return message.SerializeToString()
 
 
-def channel_of(outgoing: Outgoing) -> tuple[Schema, Channel]:
-    """The schema of a message and the channel of its topic, both under the topic's number."""
-    kind, number = type(outgoing.message), NUMBERS[outgoing.topic]
+@functools.cache
+def channel_of(topic: Topic, kind: type[Event | Protobuf]) -> tuple[Schema, Channel]:
+    """The schema of a kind of message and the channel of its topic, both under the topic's number."""
+    number = NUMBERS[topic]
     if issubclass(kind, Event):
         encoding, data = "json", json.dumps(kind.model_json_schema(), sort_keys=True).encode()
         schema = Schema(id=number, name=f"brushloop.{kind.__name__}", encoding="jsonschema", data=data)
@@ -98,7 +92,7 @@ def channel_of(outgoing: Outgoing) -> tuple[Schema, Channel]:
 
         encoding, data = "protobuf", build_file_descriptor_set(kind).SerializeToString()
         schema = Schema(id=number, name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data)
-    return schema, Channel(number, str(outgoing.topic), encoding, {}, number)
+    return schema, Channel(number, str(topic), encoding, {}, number)
 
 
 class McapWriter:
@@ -163,12 +157,14 @@ class McapWriter:
     def record(self, outgoing: Outgoing) -> None:
         """Encode a message and add it; the first on a topic with its schema, which is then flushed."""
         number = NUMBERS[outgoing.topic]
+        if outgoing.topic == Topic.STEP:  # in a chunk of its own: damage elsewhere does not hide a step
+            self.flush()
         new = number not in self.channels
         if new:
-            self.add_channel(*channel_of(outgoing))
+            self.add_channel(*channel_of(outgoing.topic, type(outgoing.message)))
         data = encoded(outgoing.message)
         self.add_message(number, outgoing.sequence, outgoing.log_ns, outgoing.publish_ns, data)
-        if new or outgoing.topic == Topic.STROKE:  # ends the chunk, so that a damaged chunk costs one stroke
+        if new or outgoing.topic in (Topic.STEP, Topic.STROKE):  # a damaged chunk costs at most one stroke
             self.flush()
 
     def copy(self, schema: Schema | None, channel: Channel, message: Message) -> None:
@@ -293,19 +289,20 @@ def new_mcap(
 class SegmentWriter:
     """Writes `<name>.mcap.part`, then renames it to `<name>.mcap`.
 
-    `begun` is stored inside as metadata, so that a lost journal can be rebuilt from the files. Raises `SessionError`
-    where either file exists: recordings are never overwritten.
+    Raises `SessionError` where either file exists: recordings are never overwritten.
     """
 
-    def __init__(self, final: Path, header: Header, begun: dict[str, Any] | None = None) -> None:
+    def __init__(self, final: Path, header: Header, *first: Outgoing) -> None:
+        """`first` are the first messages of the file."""
         self.final = final
         self._part = final.with_name(final.name + ".part")
         self._header = header
         self._queue: queue.SimpleQueue[Outgoing | None] = queue.SimpleQueue()
-        self._begun = begun
-        self._finished: dict[str, Any] | None = None
         self._error: Exception | None = None
         self.counts: Counter[str] = Counter()
+        """Messages by topic, those in the queue among them."""
+        for outgoing in first:
+            self._put(outgoing)
         try:
             if final.exists():
                 raise FileExistsError
@@ -322,15 +319,17 @@ class SegmentWriter:
         self._raise_error()
         if self._queue.qsize() >= QUEUE_LIMIT:
             raise SessionError(self._part, f"{QUEUE_LIMIT} messages wait: the disk does not keep up")
+        self._put(outgoing)
+
+    def _put(self, outgoing: Outgoing) -> None:
+        self.counts[outgoing.topic] += 1
         self._queue.put(outgoing)
 
-    def finish(self, finished: dict[str, Any] | None = None) -> str:
+    def finish(self) -> str:
         """Drain, finish, fsync, rename, fsync the folder, and return the file's digest.
 
-        `finished` is stored inside as metadata, with the counts of messages. Raises `SessionError`; the part file then
-        stays.
+        Raises `SessionError`; the part file then stays.
         """
-        self._finished = finished
         self.abandon()
         self._raise_error()
         try:
@@ -360,7 +359,7 @@ class SegmentWriter:
             self._error = error
 
     def _write_all(self) -> None:
-        writer = start_mcap(self._file, self._header, {} if self._begun is None else {BEGIN_NOTE: self._begun})
+        writer = start_mcap(self._file, self._header, {})
         writer.flush()
         flushed = time.monotonic()
         while True:
@@ -371,11 +370,4 @@ class SegmentWriter:
             if time.monotonic() - flushed > FLUSH_S:
                 writer.flush()
                 flushed = time.monotonic()
-        writer.flush()
-        self.counts = writer.counts
-        if self._finished is not None:
-            done = note({**self._finished, "counts": dict(self.counts)})
-            # All twice, so that one wrong bit takes nothing from a session that has lost its journal as well.
-            for name, values in ((BEGIN_NOTE, note(self._begun or {})), (DONE_NOTE, done), (DONE_NOTE, done)):
-                writer.add_metadata(name, values)
         writer.finish()

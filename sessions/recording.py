@@ -18,11 +18,11 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.events import CaptureResult, Remark, line_of
+from brushloop.sessions.events import Begin, CaptureResult, Remark, StepEvent, line_of
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, replay, undamaged
 from brushloop.sessions.mcap_file import McapFile, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.records import Event, Header, StepEvent, Stroke, Topic
+from brushloop.sessions.records import Event, Header, Stroke, Topic
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,8 +126,8 @@ class Recording:
         current = ""
         for _schema, channel, message in self.messages(Topic.STEP, Topic.STILL):
             if channel.topic == Topic.STEP:
-                event = _event(self.path, StepEvent, message.data)
-                current = event.kind if event.phase == "begin" else ""
+                step = _event(self.path, StepEvent, message.data).step
+                current = step.kind if isinstance(step, Begin) else ""
             elif current == kind:
                 yield message.log_time, decode_still(message.data, self.path)
 
@@ -137,17 +137,14 @@ class Recording:
 
 
 def merged_file(folder: Path, state: RunState | None = None) -> Path:
-    """Where a session's one recording is: under the folder's name, or, if the folder was renamed, under its old one.
+    """Where a session's one recording is: it is named after the session, whatever the folder is called now.
 
     `state` is that of its journal; without one, the only recording in the folder is the session's.
     """
-    own = folder / f"{folder.resolve().name}.mcap"
-    if own.exists():
-        return own
-    if state is not None:
-        return own if state.closed is None else folder / state.closed.file
+    if state is not None and state.opened is not None:
+        return folder / f"{state.opened.header.session_id}.mcap"
     recordings = [path for path in folder.glob("*.mcap") if not SEGMENT_NAME.fullmatch(path.name)]
-    return recordings[0] if len(recordings) == 1 else own
+    return recordings[0] if len(recordings) == 1 else folder / f"{folder.resolve().name}.mcap"
 
 
 def find_recording(path: Path, state: RunState | None = None) -> Path:

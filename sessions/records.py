@@ -18,11 +18,9 @@ from brushloop.sessions.disk import SESSION_ID
 
 SCHEMA_VERSION = 1
 HEADER_NOTE = "brushloop.header"
-BEGIN_NOTE, DONE_NOTE = "brushloop.begin", "brushloop.done"
-"""Notes of a step's file: the journal's lines about it, so that a lost journal can be rebuilt."""
 REPAIRS_NOTE = "brushloop.repairs"
 """Note in a merged file whose session was repaired: what was rewritten, what is missing, and what was lost."""
-NOTES = (HEADER_NOTE, BEGIN_NOTE, DONE_NOTE, REPAIRS_NOTE)
+NOTES = (HEADER_NOTE, REPAIRS_NOTE)
 
 
 BareName = Annotated[str, Field(pattern=f"^({SESSION_ID.pattern})?$")]
@@ -43,7 +41,7 @@ class Topic(StrEnum):
     INK = "/ink/state"  # InkState
     QUALITY = "/quality"
     CADENCE = "/cadence"
-    STEP = "/step"  # StepEvent
+    STEP = "/step"  # StepEvent, in events.py
     STROKE = "/stroke"
 
 
@@ -70,18 +68,6 @@ class Event(BaseModel):
     """Base of our JSON messages: frozen, without unknown fields or NaN (JSON would write it as null)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class StepEvent(Event):
-    """A step began or ended. The journal holds the same; this copy travels with the file."""
-
-    key: str
-    kind: str
-    index: int
-    attempt: int
-    phase: Literal["begin", "end"]
-    stroke_id: str | None = None
-    """The stroke that the step presses, draws or photographs."""
 
 
 class Stroke(Event):

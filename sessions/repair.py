@@ -14,9 +14,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from types import MappingProxyType
 
-from mcap.records import Message
 from pydantic import ValidationError
 
 from brushloop.sessions import events
@@ -25,15 +24,22 @@ from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.events import Begin, Done, Event, line_of, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
-from brushloop.sessions.mcap_writer import new_mcap
+from brushloop.sessions.mcap_writer import Outgoing, new_mcap
 from brushloop.sessions.recording import check_path, find_recording, parse_header
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Header, StepEvent, Stroke, Topic
-from brushloop.sessions.store import closed, lock, merge_session
-from brushloop.sessions.verify import Evidence, count_words, gather, is_collected, judge, verify_session
+from brushloop.sessions.records import HEADER_NOTE, Header, Stroke, Topic
+from brushloop.sessions.store import closed, lock, merge_session, step_message
+from brushloop.sessions.verify import (
+    Evidence,
+    count_words,
+    gather,
+    is_collected,
+    judge,
+    parsed_step,
+    verify_session,
+)
 
 MEASURED = (str(Topic.STILL), str(Topic.STROKE))
 """Topics without which a step is useless and is done again; a gap in any other topic is reported and accepted."""
-_E = TypeVar("_E", Stroke, StepEvent)
 
 
 @dataclass(slots=True)
@@ -84,7 +90,7 @@ def _repair_file(path: Path) -> Report:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
     if HEADER_NOTE not in file.notes:
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
-    kept, counts, lost = _rewrite(file, parse_header(file), file.stated)
+    kept, counts, lost = _rewrite(file, parse_header(file))
     why = "; ".join(finding.what for finding in verdict.findings)
     report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept}")
     report.lost += lost
@@ -102,8 +108,6 @@ class _FolderRepair:
         self._now_ns = now_ns
         self._header = read_header(evidence.folder, evidence.state)
         self._report = Report(evidence.folder.name)
-        self._lost_steps: list[str] = []
-        """Reported as lost unless the merged file holds them."""
         self._begins = {event.file: event for event in evidence.events() if isinstance(event, Begin)}
 
     def run(self) -> Report:
@@ -119,15 +123,14 @@ class _FolderRepair:
             for name, what in self._evidence.strays.items():
                 report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")
                 if name in self._begins:
-                    self._lost_steps.append(f"{step_words(self._begins[name])}, whose file {what}")
+                    report.lost.append(f"{step_words(self._begins[name])}, whose file {what}")
             if state.closed is None and self._final_problems and self._final.exists():
                 kept = self._move_aside(self._final)
                 report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept}")
-            elif state.closed is not None:
-                self._lost_steps = self._merge_again() if self._final_problems else []
+            elif state.closed is not None and self._final_problems:
+                self._merge_again()
         finally:
             self._journal.close()
-        report.lost += self._lost_steps
         counts = state.counts() if state.closed is None else state.closed.counts
         report.strokes = counts.get(Topic.STROKE, 0)
         return report
@@ -189,29 +192,23 @@ class _FolderRepair:
                     yield from _in_steps(file, steps)
 
     def _write_again(self, step: Done, records: list[Record]) -> None:
-        path, why, sheet = self._folder / step.file, self._verdict.damaged[step.file], self._state.sheet
-        # Where neither the journal nor a file has its `begin`, one is made from its `done`.
-        begin = self._begins.get(step.file) or Begin(
-            t_ns=step.t_ns, key=step.key, kind=step.kind, attempt=step.attempt, sheet=sheet, file=step.file
-        )
-        notes: dict[str, Line] = {
-            BEGIN_NOTE: {"t_ns": begin.t_ns, **line_of(begin)},
-            DONE_NOTE: {"t_ns": step.t_ns, **line_of(step), "counts": dict(_count(records))},
-        }
-        kept, counts = _replace_damaged(path, self._header, notes, {}, records)
+        path, why = self._folder / step.file, self._verdict.damaged[step.file]
+        begin = [step_message(self._begins[step.file])] if step.file in self._begins else []
+        end = step_message(step.model_copy(update={"sha256": ""}))
+        kept, counts = _replace_damaged(path, self._header, [*begin, *records, end])
         missing = dict(Counter(step.counts) - Counter(counts))
         t_ns, sha256 = self._now_ns(), file_sha256(path)
         self._log(events.Repaired(t_ns=t_ns, file=step.file, sha256=sha256, counts=counts, missing=missing, why=why))
         how = f"without {count_words(missing)}" if missing else "whole"
         self._report.did.append(f"wrote {step.file} ({step_words(step)}) again {how}: {why}{kept}")
         if missing:
-            self._lost_steps.append(f"messages in {step.file} ({step_words(step)}): {count_words(missing)}")
+            self._report.lost.append(f"messages in {step.file} ({step_words(step)}): {count_words(missing)}")
 
     def _lose(self, step: Done) -> None:
         kept = self._move_aside(self._folder / step.file)
         self._mark_lost(step, self._verdict.damaged[step.file], kept)
         again = "" if self._state.closed is not None else "; it is done again when the session goes on"
-        self._lost_steps.append(f"{step_words(step)}{again}")
+        self._report.lost.append(f"{step_words(step)}{again}")
         if self._state.closed is not None or not isinstance(step.result, events.CaptureResult):
             return
         # If its sheet was removed, the stroke cannot be photographed again: its press is lost too.
@@ -234,32 +231,12 @@ class _FolderRepair:
         fsync_folder(self._folder)
         return kept
 
-    def _merge_again(self) -> list[str]:
-        """Merge the steps' files again, or rewrite the damaged merged file where it holds more strokes.
-
-        Returns descriptions of what was lost.
-        """
-        state, file = self._state, self._evidence.files.get(self._final.name)
-        counts, lost, how = state.counts(), self._lost_steps, "from the steps' files"
-        if file is not None and state.closed is not None and self._holds_more(file):
-            kept, counts, lost = _rewrite(file, self._header, state.closed.counts)
-            how = "from what can be read of it"
-        else:
-            kept = _keep(self._final)
-            merge_session(self._folder, state, self._header, "damaged")
-        self._log(closed(self._final, counts, self._now_ns()))
-        self._report.did.append(f"wrote {self._final.name} again {how}: {'; '.join(self._final_problems)}{kept}")
-        return lost
-
-    def _holds_more(self, final: McapFile) -> bool:
-        """Whether more whole strokes can be read of the damaged merged file than the files of steps hold."""
-        in_steps = self._state.counts().get(Topic.STROKE, 0)
-        if final.counts[Topic.STROKE] <= in_steps:
-            return False
-        strokes: dict[str, bool] = {}
-        for _record in _whole(final, strokes):
-            pass
-        return sum(strokes.values()) > in_steps
+    def _merge_again(self) -> None:
+        kept = _keep(self._final)
+        merge_session(self._folder, self._state, self._header, "damaged")
+        self._log(closed(self._final, self._state.counts(), self._now_ns()))
+        why = "; ".join(self._final_problems)
+        self._report.did.append(f"wrote {self._final.name} again from the steps' files: {why}{kept}")
 
     def _log(self, event: Event) -> None:
         self._journal.append(event.t_ns, line_of(event))
@@ -272,7 +249,11 @@ def _whole(file: McapFile, strokes: dict[str, bool]) -> Iterator[Record]:
     for schema, channel, message in file.messages():
         if channel.topic == Topic.STILL:
             stills.add(message.sequence)
-        elif channel.topic == Topic.STROKE and (stroke := _parsed(Stroke, message)) is not None:
+        elif channel.topic == Topic.STROKE:
+            try:
+                stroke = Stroke.model_validate_json(message.data)
+            except ValidationError:
+                continue
             whole = stroke.still in stills and not strokes.get(stroke.stroke_id)
             strokes[stroke.stroke_id] = whole or strokes.get(stroke.stroke_id, False)
             if not whole:
@@ -280,25 +261,17 @@ def _whole(file: McapFile, strokes: dict[str, bool]) -> Iterator[Record]:
         yield schema, channel, message
 
 
-def _parsed(kind: type[_E], message: Message) -> _E | None:
-    """The event in a message; None where it does not fit its schema."""
-    try:
-        return kind.model_validate_json(message.data)
-    except ValidationError:
-        return None
-
-
-def _rewrite(file: McapFile, header: Header, before: Mapping[str, int]) -> tuple[str, dict[str, int], list[str]]:
-    """Write a damaged recording again from what can be read of it; `before` are its messages by topic as they were.
+def _rewrite(file: McapFile, header: Header) -> tuple[str, dict[str, int], list[str]]:
+    """Write a damaged recording again from what can be read of it.
 
     Returns where the damaged file is kept, the messages by topic, and descriptions of what was lost.
     """
     strokes: dict[str, bool] = {}
     notes = {name: values for name, values in file.notes.items() if name != HEADER_NOTE}
     attached = {attachment.name: attachment.data for attachment in file.attachments()}
-    kept, counts = _replace_damaged(file.path, header, notes, attached, _whole(file, strokes))
+    kept, counts = _replace_damaged(file.path, header, _whole(file, strokes), notes, attached)
     lost = [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
-    gone = Counter(before) - Counter(counts)
+    gone = Counter(file.stated) - Counter(counts)
     unknown = gone.pop(Topic.STROKE, 0) - len(lost)
     if unknown > 0:
         lost.append(f"strokes that cannot be read: {unknown}")
@@ -312,46 +285,46 @@ def _rewrite(file: McapFile, header: Header, before: Mapping[str, int]) -> tuple
     return kept, counts, lost
 
 
-def _in_steps(file: McapFile, steps: Mapping[object, Done]) -> Iterator[tuple[Done, list[Record]]]:
-    """What is readable of these steps in a file; they are found by their key and attempt, or by the number of a still.
+def _in_steps(file: McapFile, damaged: Mapping[object, Done]) -> Iterator[tuple[Done, list[Record]]]:
+    """What is readable of damaged steps in a file, without the messages of their begin and end.
 
-    The messages of a step stand between its begin and its end, one of which may be lost.
+    They are found by their key and attempt, or by the number of a still: their begin, their end or both may be lost.
     """
     records, step = list[Record](), None
-    for record in file.messages():
-        _schema, channel, message = record
-        event = _parsed(StepEvent, message) if channel.topic == Topic.STEP else None
-        if event is not None and event.phase == "begin":
+    for record in [*file.messages(), None]:
+        event = parsed_step(record[2].data) if record is not None and record[1].topic == Topic.STEP else None
+        if record is None or isinstance(event, Begin):
             if step is not None:
                 yield step, records
             records, step = [], None
-        records.append(record)
         if event is not None:
-            step = step or steps.get((event.key, event.attempt))
-        elif channel.topic == Topic.STILL:
-            step = step or steps.get(message.sequence)
-        if event is not None and event.phase == "end":
+            step = step or damaged.get((event.key, event.attempt))
+        elif record is not None:
+            records.append(record)
+            step = step or (damaged.get(record[2].sequence) if record[1].topic == Topic.STILL else None)
+        if isinstance(event, Done):
             if step is not None:
                 yield step, records
             records, step = [], None
-    if step is not None:
-        yield step, records
 
 
 def _worth(step: Done, records: list[Record]) -> tuple[bool, int]:
     """How good a copy of a step is: whether it will do, and how many messages it holds."""
     counts, present = Counter(step.counts), _count(records)
-    # A photograph without a stroke (the board) is found by the event of its step.
-    needed = MEASURED if counts[Topic.STROKE] or not counts[Topic.STILL] else (*MEASURED, str(Topic.STEP))
-    return present <= counts and not any(topic in counts - present for topic in needed), len(records)
+    return present <= counts and not any(topic in counts - present for topic in MEASURED), len(records)
 
 
 def _count(records: list[Record]) -> Counter[str]:
-    return Counter(channel.topic for _schema, channel, _message in records)
+    """Messages of a step by topic, those of its begin and end among them."""
+    return Counter({str(Topic.STEP): 2}) + Counter(channel.topic for _schema, channel, _message in records)
 
 
 def _replace_damaged(
-    path: Path, header: Header, notes: dict[str, Line], attached: dict[str, bytes], messages: Iterable[Record]
+    path: Path,
+    header: Header,
+    messages: Iterable[Record | Outgoing],
+    notes: Mapping[str, Line] = MappingProxyType({}),
+    attached: Mapping[str, bytes] = MappingProxyType({}),
 ) -> tuple[str, dict[str, int]]:
     """Write a file with these contents in place of `path`, and keep the damaged one beside it.
 
@@ -362,8 +335,11 @@ def _replace_damaged(
     try:
         fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
         with new_mcap(fresh, header, notes, attached) as writer:
-            for record in messages:
-                writer.copy(*record)
+            for message in messages:
+                if isinstance(message, Outgoing):
+                    writer.record(message)
+                else:
+                    writer.copy(*message)
         counts = dict(scan_sound(fresh).counts)
         return _put_in_place(fresh, path), counts
     except OSError as error:

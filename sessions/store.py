@@ -24,12 +24,22 @@ from brushloop.sessions.disk import (
     write_durably,
 )
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
-from brushloop.sessions.events import Begin, Done, Event, Press, StepKind, StepResult, line_of
+from brushloop.sessions.events import (
+    Begin,
+    Done,
+    Event,
+    Press,
+    StepEvent,
+    StepKind,
+    StepResult,
+    line_of,
+    serial_of,
+)
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, read_header, replay
 from brushloop.sessions.mcap_file import scan_sound
-from brushloop.sessions.mcap_writer import SegmentWriter, new_mcap
+from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter, new_mcap
 from brushloop.sessions.recording import merged_file
-from brushloop.sessions.records import REPAIRS_NOTE, Header
+from brushloop.sessions.records import REPAIRS_NOTE, Header, Topic
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
@@ -132,17 +142,22 @@ class SessionStore:
             file=f"{serial:04d}-{kind}-{key[:8]}.mcap",
         )
         self._log(begin)
-        begun = {"t_ns": begin.t_ns, **line_of(begin)}
-        return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, begun))
+        return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, step_message(begin)))
 
     def done(self, attempt: Attempt, result: StepResult) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""
-        begin, t_ns = attempt.begin, self._now_ns()
+        begin, writer = attempt.begin, attempt.writer
         done = Done(
-            t_ns=t_ns, key=begin.key, attempt=begin.attempt, file=begin.file, sha256="", counts={}, result=result
+            t_ns=self._now_ns(),
+            key=begin.key,
+            attempt=begin.attempt,
+            file=begin.file,
+            sha256="",
+            counts={**writer.counts, Topic.STEP: 2},
+            result=result,
         )
-        sha256 = attempt.writer.finish({"t_ns": done.t_ns, **line_of(done)})
-        self._log(done.model_copy(update={"sha256": sha256, "counts": dict(attempt.writer.counts)}))
+        writer.write(step_message(done))
+        self._log(done.model_copy(update={"sha256": writer.finish()}))
 
     def void(self, attempt: Attempt, why: str) -> None:
         """Journal that an attempt was cut; its part file is kept as evidence, and its patch stays used."""
@@ -228,6 +243,11 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
     except OSError as error:
         raise disk_error(part, "cannot write", error) from error
     return final
+
+
+def step_message(event: Begin | Done) -> Outgoing:
+    """The message that tells the begin or the end of a step in its file."""
+    return Outgoing(Topic.STEP, event.t_ns, event.t_ns, serial_of(event.file), StepEvent(step=event))
 
 
 def next_session_id(root: Path, label: str, today: dt.date) -> str:

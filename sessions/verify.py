@@ -1,8 +1,8 @@
 """Judge a session: what it contained according to its journal and its files together, and every difference from that.
 
-The file of every step holds a copy of the journal's `begin` line and, once finished, of its `done` line: lines that the
-journal lost are rebuilt from these word for word. Every file is read again in full. `brushloop sessions verify` prints
-the verdict, and `repair` acts on it; judging changes nothing.
+The file of every step holds a copy of the journal's `begin` line and, once finished, of its `done` line, and so does
+the merged file: lines that the journal lost are rebuilt from these word for word. Every file is read again in full.
+`brushloop sessions verify` prints the verdict, and `repair` acts on it; judging changes nothing.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from pydantic import ValidationError
 
@@ -27,18 +26,17 @@ from brushloop.sessions.disk import (
     read_bounded,
 )
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
-from brushloop.sessions.events import Begin, Done, Event, StepKind, parse_event, serial_of, step_words
+from brushloop.sessions.events import Begin, Done, Event, StepEvent, StepKind, serial_of, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, DoneTwice, Reading, RunState, read, read_journal
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.recording import Recording, check_path, find_recording, merged_file, parse_header, remarks_of
-from brushloop.sessions.records import BEGIN_NOTE, DONE_NOTE, HEADER_NOTE, Stroke, Topic
+from brushloop.sessions.recording import Recording, check_path, find_recording, parse_header, remarks_of
+from brushloop.sessions.records import HEADER_NOTE, Stroke, Topic
 from brushloop.sessions.store import closed
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
 """Kinds of steps that use patches."""
-_E = TypeVar("_E", Begin, Done)
 
 
 @dataclass(slots=True)
@@ -114,9 +112,7 @@ def gather(folder: Path) -> Evidence:
     if session not in ("", named):
         reading = read(data, session)
     reading.faults[:0] = unreadable
-    final = merged_file(folder, reading.state)
-    if not final.is_file():  # the folder was renamed, and the journal has lost the name of the merged file
-        final = next((path for path in recordings if files[path.name].may_be_of(session)), final)
+    final = folder / f"{session}.mcap"
     files = {name: file for name, file in files.items() if SEGMENT_NAME.fullmatch(name) or name == final.name}
     foreign = {name: files.pop(name).session for name in list(files) if not files[name].may_be_of(session)}
     evidence = Evidence(folder, final, reading, files, session)
@@ -129,18 +125,16 @@ def gather(folder: Path) -> Evidence:
         except DoneTwice:
             # Only a rebuilt event can raise this: the journal's own were applied before.
             evidence.rebuilt = [other for other in evidence.rebuilt if other is not event]
+    _find_strays(evidence)
     merged, state = files.get(final.name), evidence.state
-    for name, other in foreign.items():
-        # What the journal lists is told as changed, and written again from its other copy.
-        if name not in state.files and (state.closed is None or name != state.closed.file):
-            evidence.strays[name] = f"is of another session, {other[:100]!r}"
-    if state.closed is not None or merged is None or merged.damage:
-        return evidence
-    # It holds more than the steps where their files are lost with their lines: it is then the only copy.
-    if merged.counts and merged.counts >= Counter(state.counts()):
+    if state.closed is None and merged is not None and not merged.damage and merged.counts == Counter(state.counts()):
         last_ns = max(event.t_ns for event in evidence.events())
         evidence.rebuilt.append(closed(final, dict(merged.counts), last_ns))
         state.apply(evidence.rebuilt[-1])
+    for name, other in foreign.items():
+        # What the journal lists is told as changed, and written again from its other copy.
+        if name not in state.files and (state.closed is None or name != final.name):
+            evidence.strays[name] = f"is of another session, {other[:100]!r}"
     return evidence
 
 
@@ -161,49 +155,77 @@ def _session(folder: str, named: str, files: Counter[str]) -> str:
 
 
 def _rebuild_steps(evidence: Evidence) -> None:
-    """Rebuild `begin` and `done` from the notes in the files of steps, whatever these are called now."""
+    """Rebuild `begin` and `done` from the files, whatever these are called now."""
     known = evidence.reading.events
+    steps = [(name, step) for name, file in evidence.files.items() for step in steps_in(file)]
+    begun = {event.file: event for event in known if isinstance(event, Begin)}
+    begins = [step for _name, step in steps if isinstance(step, Begin)]
+    ends = [event for event in [*known, *(step for _name, step in steps)] if isinstance(event, Done)]
+    for begin in [*begins, *map(begin_of, ends)]:
+        if begin is not None and begun.setdefault(begin.file, begin) is begin:
+            evidence.rebuilt.append(begin)
+    latest: dict[str, int] = {}
+    for begin in begun.values():
+        latest[begin.key] = max(latest.get(begin.key, 0), begin.attempt)
+    over = _over(known)
+    for name, step in steps:
+        if isinstance(step, Begin) or name.endswith(".part") or step.file not in begun:
+            continue
+        if step.attempt == latest[step.key] and over.isdisjoint((step.file, (step.key, step.attempt))):
+            over.add(step.file)
+            # An empty digest matches no file, so a damaged file is found and repaired like any other.
+            file = evidence.files[name]
+            whole = name == step.file and not file.damage and dict(file.counts) == step.counts
+            evidence.rebuilt.append(step.model_copy(update={"sha256": file_sha256(file.path) if whole else ""}))
+
+
+def _over(known: list[Event]) -> set[str | tuple[str, int]]:
+    """Files, and keys and attempts, of steps that are done, void or lost."""
+    over: set[str | tuple[str, int]] = {event.file for event in known if isinstance(event, Done | events.Lost)}
+    return over | {(event.key, event.attempt) for event in known if isinstance(event, events.Void)}
+
+
+def _find_strays(evidence: Evidence) -> None:
+    """Tell the files of steps that belong to none, and those that may hide a press on an unknown patch."""
+    known = evidence.events()
     begun = {event.file: event for event in known if isinstance(event, Begin)}
     doubted = {event.file for event in known if isinstance(event, events.Doubt)}
-    over: set[str | tuple[str, int]] = {event.file for event in known if isinstance(event, Done | events.Lost)}
-    over |= {(event.key, event.attempt) for event in known if isinstance(event, events.Void)}
-    steps: list[tuple[str, McapFile, Begin]] = []
+    over = _over(known)
     for name, file in evidence.files.items():
-        step_name, own = SEGMENT_NAME.fullmatch(name), name.removesuffix(".part")
-        if step_name is None:
+        begin, step_name = begun.get(name.removesuffix(".part")), SEGMENT_NAME.fullmatch(name)
+        if step_name is None or (begin is not None and name.endswith(".part")):
             continue
-        if begin := _noted(file, BEGIN_NOTE, Begin) or begun.get(own):
-            steps.append((name, file, begin))
-            if begin.file not in begun:
-                begun[begin.file] = begin
-                evidence.rebuilt.append(begin)
-        elif step_name[2] not in MARKING:
-            evidence.strays[name] = "does not say of which step it is"
-        elif name not in doubted:
-            evidence.doubtful.append(name)
-    for name, file, begin in steps:
-        if name.removesuffix(".part") not in begun:
-            evidence.strays[name] = "holds a step that the journal lists under another file"
-        done_again = evidence.reading.state.attempts.get(begin.key, 0) > begin.attempt
-        if name.endswith(".part") or done_again or over & {begin.file, (begin.key, begin.attempt)}:
-            continue
-        if (done := _noted(file, DONE_NOTE, Done)) is not None:
-            # An empty digest matches no file, so a damaged file is found and repaired like any other.
-            whole = name == begin.file and not file.damage and dict(file.counts) == done.counts
-            over.add(begin.file)
-            sha256 = file_sha256(file.path) if whole else ""
-            evidence.rebuilt.append(done.model_copy(update={"file": begin.file, "sha256": sha256}))
-        elif name == begin.file:
+        if begin is None and step_name[2] in MARKING and begun.keys().isdisjoint(step.file for step in steps_in(file)):
+            evidence.doubtful += [] if name in doubted else [name]
+        elif begin is None:
+            evidence.strays[name] = "belongs to no step of the session"
+        elif evidence.state.attempts[begin.key] == begin.attempt and over.isdisjoint(
+            (name, (begin.key, begin.attempt))
+        ):
             evidence.strays[name] = "is finished, but the result of its step cannot be read"
 
 
-def _noted(file: McapFile, note: str, kind: type[_E]) -> _E | None:
-    """The event that a file notes; None where it makes no sense."""
+def steps_in(file: McapFile) -> list[Begin | Done]:
+    """The begins and ends of steps that can be read in a file, in order."""
+    return [step for record in file.messages([Topic.STEP]) if (step := parsed_step(record[2].data)) is not None]
+
+
+def parsed_step(data: bytes) -> Begin | Done | None:
+    """The event in a message on /step; None where it does not fit its schema."""
     try:
-        event = parse_event(file.notes.get(note, {}))
-    except ValueError:
+        return StepEvent.model_validate_json(data).step
+    except ValidationError:
         return None
-    return event if isinstance(event, kind) else None
+
+
+def begin_of(done: Done) -> Begin | None:
+    """The begin of a finished step whose own is lost; None where the patches that it used are not known either."""
+    press = done.press if isinstance(done.result, events.PressResult) else None
+    sheet, patch = (0, None) if press is None else (press.sheet, press.patch)
+    if sheet is None or (patch is None and done.kind in MARKING):
+        return None
+    values = {"t_ns": done.t_ns, "key": done.key, "kind": done.kind, "attempt": done.attempt, "file": done.file}
+    return Begin.model_validate({**values, "sheet": sheet, "patch": patch, "press": done.press})
 
 
 def _opened(evidence: Evidence) -> events.Open:

@@ -153,7 +153,7 @@ class _Channels:
 
         channel = self._channels.get(outgoing.topic)
         if channel is None:
-            schema, record = channel_of(outgoing)
+            schema, record = channel_of(outgoing.topic, type(outgoing.message))
             described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
             channel = self._channels[outgoing.topic] = foxglove.Channel(
                 record.topic, schema=described, message_encoding=record.message_encoding, context=self._context

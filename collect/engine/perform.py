@@ -30,7 +30,7 @@ from brushloop.collect.protocols.steps import (
 from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.errors import ArmMoved
 from brushloop.sessions.events import DipResult, StepKind, StepResult
-from brushloop.sessions.records import StepEvent
+from brushloop.sessions.store import step_message
 
 HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
 """Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""
@@ -65,28 +65,20 @@ class Performer:
         patch = free if marks else None
         more = partners(run.sheet, patch, used) if patch is not None and isinstance(step, SelfCheckStep) else ()
         index = None if patch is None else patch.index
-        planned = press_of(step)
         attempt = store.begin(
             step.key,
             step.kind,
             patch=index,
             more_patches=tuple(other.index for other in more),
-            press=planned,
+            press=press_of(step),
         )
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
+        if self._show is not None:
+            self._show(step_message(attempt.begin))
         progress.begun(step)
         guard = ForceGuard(rig, recorder.force)
-        event = StepEvent(
-            key=step.key,
-            kind=step.kind,
-            index=step.index,
-            attempt=attempt.begin.attempt,
-            phase="begin",
-            stroke_id=None if planned is None else planned.stroke_id,
-        )
         try:
-            recorder.step(event)
             rig.robot.listen(recorder.pose)
             guard.listen()
             try:
@@ -102,7 +94,6 @@ class Performer:
                 guard.deafen()
                 rig.robot.listen(None)
             recorder.cadence(lag_ms)
-            recorder.step(event.model_copy(update={"phase": "end"}))
         except BaseException as error:
             run.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)

@@ -24,7 +24,6 @@ from brushloop.sessions.records import (
     Event,
     InkState,
     Quality,
-    StepEvent,
     Stroke,
     Topic,
     Wrench,
@@ -125,10 +124,6 @@ class Recorder:
     def stroke(self, stroke: Stroke) -> None:
         """Record a captured stroke; call it after its still."""
         self._now(Topic.STROKE, stroke, stroke.still)
-
-    def step(self, event: StepEvent) -> None:
-        """Record the beginning or the end of the step."""
-        self._now(Topic.STEP, event, event.index)
 
     def log(self, text: str, *, warning: bool = False) -> None:
         """Record a line of the log."""

@@ -18,7 +18,7 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, StepResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message
-from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
+from brushloop.sessions.records import Header, Source, Stroke, Topic
 from brushloop.sessions.store import SessionStore
 
 T0_NS = 1_700_000_000_000_000_000
@@ -82,12 +82,7 @@ def _photographed(
 
 def _take(store: SessionStore, number: int, messages: list[Outgoing], result: StepResult) -> None:
     attempt = store.begin(f"{result.kind} {number}", result.kind)
-    event: dict[str, Any] = {"key": "k", "kind": result.kind, "index": number, "attempt": 1}
-    begin, end = (
-        Outgoing(Topic.STEP, message.log_ns, message.log_ns, number, StepEvent(**event, phase=phase))
-        for message, phase in ((messages[0], "begin"), (messages[-1], "end"))
-    )
-    for message in (begin, *messages, end):
+    for message in messages:
         attempt.writer.write(message)
     store.done(attempt, result)
 

@@ -20,7 +20,7 @@ from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.journal import JOURNAL_NAME, encode_line
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message
-from brushloop.sessions.records import Header, Source, StepEvent, Stroke, Topic
+from brushloop.sessions.records import Header, Source, Stroke, Topic
 from brushloop.sessions.repair import Report, repair_session
 from brushloop.sessions.store import SessionStore
 from tests.journal_lines import read_lines
@@ -62,11 +62,6 @@ class Make:
     def strokes(self, count: int) -> list[Outgoing]:
         return [message for number in range(count) for message in (self.still(number), self.stroke(number))]
 
-    def step(self, number: int, kind: str, phase: str) -> Outgoing:
-        t_ns = self.t0_ns + number * 1000 + (2 if phase == "end" else -2)
-        values = {"key": "k", "kind": kind, "index": number, "attempt": 1, "phase": phase}
-        return Outgoing(Topic.STEP, t_ns, t_ns, number, StepEvent.model_validate(values))
-
     def record(self, path: Path, *messages: Outgoing) -> Path:
         """A finished MCAP file with these messages."""
         writer = SegmentWriter(path, self.header)
@@ -107,17 +102,10 @@ class Make:
     def take(
         self, store: SessionStore, key: str, messages: list[Outgoing], result: StepResult, patch: int | None = None
     ) -> None:
-        """One step from begin to done, with its step events around the messages."""
+        """One step from begin to done."""
         press = result.press if isinstance(result, PressResult | CaptureResult) else None
         attempt = store.begin(key, result.kind, patch=patch, press=press)
-        stroke_id = None if press is None else press.stroke_id
-        event = {"key": key, "kind": result.kind, "index": 0, "attempt": attempt.begin.attempt, "stroke_id": stroke_id}
-        times = (messages[0].log_ns - 1, messages[-1].log_ns + 1)
-        begin, end = (
-            Outgoing(Topic.STEP, t_ns, t_ns, attempt.serial, StepEvent.model_validate({**event, "phase": phase}))
-            for t_ns, phase in zip(times, ("begin", "end"), strict=True)
-        )
-        for message in (begin, *messages, end):
+        for message in messages:
             attempt.writer.write(message)
         store.done(attempt, result)
 

@@ -75,16 +75,14 @@ def test_the_header_holds_what_was_given(rows, out, run, options, fields):
     assert Recording(out).header.model_dump(include=set(fields)) == fields
 
 
-def test_units_are_converted_and_the_anchor_is_kept(make, photos, out, run):
-    row = {"file": "a.png", "start_x_px": "3", "start_y_px": "4.5", "depth_nominal": "0.4", "ink_frac": "0.9"}
-    lengths = {"reach_cm": "2", "span_m": "0.01", "bend_in": "1", "turn_rad": str(math.pi), "yaw_deg": "7"}
-    make.photographs(photos, row | lengths)
+def test_columns_without_a_field_of_their_own_are_kept_under_their_names(make, photos, out, run):
+    others = {"depth_nominal": "0.4", "ink_frac": "0.9", "reach_mm": "2", "yaw_deg": "7"}
+    make.photographs(photos, {"file": "a.png", "start_x_px": "3", "start_y_px": "4.5"} | others)
     run(ImportOptions(px_per_mm=8.0))
     [capture] = Recording(out).captures()
     assert capture.stroke.anchor_px == (3.0, 4.5)
     assert capture.stroke.px_per_mm == (8.0, 8.0)
-    stored = {"reach_mm": 20.0, "span_mm": 10.0, "bend_mm": 25.4, "turn_deg": 180.0, "yaw_deg": 7.0}
-    assert capture.stroke.commanded == pytest.approx({"depth_nominal": 0.4, "ink_frac": 0.9} | stored)
+    assert capture.stroke.commanded == {name: float(value) for name, value in others.items()}
 
 
 def test_a_table_may_come_from_a_spreadsheet(make, photos, out, run):
@@ -142,15 +140,15 @@ REFUSED = [
     (HEAD, "has no rows"),
     ("file,depth_mm,tilt_deg", "column `px_per_mm` (or px_per_mm_x and px_per_mm_y) is missing"),
     ("file,px_per_mm,depth_mm,tilt_deg", "column `start_x_px` is missing"),
-    (f"{HEAD},l_furlong", "must end in one of: mm, cm, m, in, deg"),
-    (f"{HEAD},l_mm,l_cm", "column `l_mm` occurs twice"),
+    (f"{HEAD},l_furlong", "must end in one of: mm, deg, frac"),
+    (f"{HEAD},l_mm,l_mm", "column `l_mm` occurs twice"),
     ('"fi\nle",px_per_mm', "line 2: 'fi\\nle' holds control characters"),
     (row(depth="deep"), "line 2: column `depth_mm`: 'deep' is not a finite"),
     (row(scale="inf"), "line 2: column `px_per_mm`: 'inf' is not a finite"),
-    (f"{HEAD},l_m\na.png,1,1,1,1,1,1e308", "column `l_m`: '1e308', allowed: -1000 to 1000"),
+    (f"{HEAD},l_mm\na.png,1,1,1,1,1,1e308", "column `l_mm`: '1e308', allowed: -1e+06 to 1e+06"),
     (row(scale="0"), "line 2: column `px_per_mm`: '0', allowed: 0.01 to"),
     (row(depth="-13"), "line 2: column `depth_mm`: '-13', allowed: 0 to 500"),
-    (f"{HEAD},depth_mid_cm\na.png,1,1,1,1,1,-1.5", "column `depth_mid_cm`: '-1.5', allowed: 0 to 50"),
+    (f"{HEAD},depth_mid_mm\na.png,1,1,1,1,1,-1.5", "column `depth_mid_mm`: '-1.5', allowed: 0 to 500"),
     (f"{HEAD}\na.png,1,1,1,1", "line 2: 5 fields, expected 6"),
     (row(more="\u2028,1"), "line 2: 7 fields"),
     (row(more="\n\n./a.png,1,1,1,1,1"), "line 4: stroke a appears twice"),

@@ -57,12 +57,11 @@ def test_captures_are_lazy_so_that_a_session_need_not_fit_in_memory(make, path):
         list(Recording(path).captures())
 
 
-def test_stills_are_found_by_the_kind_of_their_step(make, path):
-    board = [make.step(1, "board", "begin"), make.still(1), make.step(1, "board", "end")]
-    capture = [make.step(2, "capture", "begin"), make.still(2), make.step(2, "capture", "end")]
-    make.record(path, *board, *capture)
-    assert list(Recording(path).stills_of("board")) == [(make.still(1).log_ns, make.png(1))]
-    assert list(Recording(path).stills_of("dip")) == []
+def test_stills_are_found_by_the_kind_of_their_step(make, closed):
+    recording = Recording(closed)
+    assert list(recording.stills_of("board")) == [(make.still(1000).log_ns, make.png(1000))]
+    assert len(list(recording.stills_of("capture"))) == 2
+    assert list(recording.stills_of("dip")) == []
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"hello, world: this is no recording\n" * 30, None], ids=str)

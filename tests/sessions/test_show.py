@@ -55,7 +55,7 @@ def test_an_open_session_shows_what_is_done_cut_and_next(collected):
     assert shown.grid == [GridCell(13.0, 5.0, 1, 2), GridCell(15.0, 5.0, 1, 2)]
     assert shown.sheets == {1: [0, 1, 2], 2: [0]}
     assert shown.header.robot == "aubo_i5"
-    assert shown.messages == {"/camera/still": 2, "/stroke": 2}
+    assert shown.messages == {"/step": 8, "/camera/still": 2, "/stroke": 2}
 
 
 def test_what_is_marked_bad_is_distinguished_from_what_counts(collected):

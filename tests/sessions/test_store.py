@@ -67,11 +67,11 @@ def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(ma
     make.perform(store, "b")
     final = store.close()
     [closed] = make.events(store.folder, "closed")
-    assert closed["counts"] == scan_sound(final).counts == {"/camera/still": 2, "/stroke": 2}
+    assert closed["counts"] == scan_sound(final).counts == {"/step": 4, "/camera/still": 2, "/stroke": 2}
     with final.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         attached = {a.name: a.data.decode() for a in reader.iter_attachments()}
-        assert reader.get_summary().statistics.message_count == 4
+        assert reader.get_summary().statistics.message_count == 8
     assert attached == make.snapshots
     recording = Recording(store.folder)
     assert recording.header == make.header

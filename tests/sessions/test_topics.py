@@ -52,7 +52,7 @@ def each(make):
         ),
     }
     outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]
-    return [*outgoing, make.pose(0), make.step(0, "press", "begin"), make.still(0), make.stroke(0)]
+    return [*outgoing, make.pose(0), make.still(0), make.stroke(0)]
 
 
 def test_the_merged_file_carries_every_topic_under_a_name_that_viewers_know(make, store, each):
