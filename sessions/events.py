@@ -212,8 +212,7 @@ class Begin(_Event):
     kind: StepKind
     attempt: Whole
     sheet: Whole
-    patch: Whole | None = None
-    more_patches: tuple[Whole, ...] = ()
+    patches: tuple[Whole, ...] = ()
     press: Press | None = None
     file: StepFile
 

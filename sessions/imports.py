@@ -100,7 +100,7 @@ def import_photographs(
         origin=options.origin or f"{folder.resolve().name}, {table.name}",
     )
     try:
-        with staged_folder(out) as stage, new_mcap(stage / f"{out.name}.mcap", header, {}, {}) as writer:
+        with staged_folder(out) as stage, new_mcap(stage / f"{out.name}.mcap", header, {}) as writer:
             for image, stroke in counted(rows, "photographs imported", len(rows), progress):
                 t_ns = now_ns()
                 writer.record(Outgoing(Topic.STILL, t_ns, t_ns, stroke.still, _photograph(image, t_ns)))

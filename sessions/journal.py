@@ -136,8 +136,7 @@ class RunState:
         self.attempts[begin.key] = max(self.attempts.get(begin.key, 0), begin.attempt)
         self.running[begin.key, begin.attempt] = begin
         self.sheet = max(self.sheet, begin.sheet)
-        if begin.patch is not None:
-            self.used_patches |= {(begin.sheet, patch) for patch in (begin.patch, *begin.more_patches)}
+        self.used_patches |= {(begin.sheet, patch) for patch in begin.patches}
 
     def _done(self, done: Done) -> None:
         earlier, known = self.files.get(done.file), self.done.get(done.key)

@@ -7,6 +7,7 @@ of error. Here every length is bounded before anything is unpacked, every CRC is
 from __future__ import annotations
 
 import io
+import json
 import os
 import struct
 import zlib
@@ -21,13 +22,13 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE, SeekingReader
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.records import HEADER_NOTE, NOTES, read_note
+from brushloop.sessions.records import HEADER_FILE
 
 MAX_RECORD_BYTES = 512 * 1024 * 1024
 """Largest record, chunk or index that is read: a chunk is 512 KiB plus one message, the largest image allowed."""
@@ -66,10 +67,10 @@ class McapFile:
         """Messages by topic in the sound chunks, once `check` has read them."""
         self.channels: dict[int, tuple[Schema | None, Channel]] = {}
         """Channels by number, each with its schema; without an index those that `check` found."""
-        self.notes: dict[str, dict[str, Any]] = {}
-        """Our own notes (`brushloop.header`, ...) that match their CRC."""
         self.header: dict[str, Any] | None = None
         """Values of the header, also where they do not match their CRC; None for a file without a header."""
+        self.session = ""
+        """Id of the session of a header that matches its CRC."""
         self._attached: list[int] = []
         with opened(path) as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -84,11 +85,6 @@ class McapFile:
         statistics = None if self.index is None else self.index.statistics
         counts = {} if statistics is None else statistics.channel_message_counts
         return dict(self._by_topic({number: count for number, count in counts.items() if number in self.channels}))
-
-    @property
-    def session(self) -> str:
-        """Id of the session whose header the file holds; empty where it holds none that matches its CRC."""
-        return str(self.notes.get(HEADER_NOTE, {}).get("session_id", ""))
 
     def may_be_of(self, session: str) -> bool:
         """Whether the file is of this session, as far as its header can be read."""
@@ -162,9 +158,8 @@ class McapFile:
         self.channels = {n: (index.schemas.get(one.schema_id), one) for n, one in index.channels.items()}
         chunks = {one.chunk_start_offset: one for one in index.chunk_indexes}
         self._chunks = {offset: chunks[offset] for offset in sorted(chunks)}
-        self._attached = [one.offset for one in index.attachment_indexes]
-        for one in index.metadata_indexes:
-            self._add_metadata(file, one.offset)
+        for one in index.attachment_indexes:
+            self._attach(file, one.offset, one.name)
         if not chunks and self.stated:
             self.damage.append("has messages outside chunks, which no CRC protects")
 
@@ -183,9 +178,7 @@ class McapFile:
             if opcode == Opcode.CHUNK:
                 self._chunks[at] = None
             elif opcode == Opcode.ATTACHMENT:
-                self._attached.append(at)
-            elif opcode == Opcode.METADATA:
-                self._add_metadata(file, at)
+                self._attach(file, at)
             at += RECORD_START.size + length
 
     def _read_chunk(self, file: IO[bytes], offset: int) -> Counter[int]:
@@ -211,17 +204,16 @@ class McapFile:
             by_topic[self.channels[number][1].topic] += count
         return by_topic
 
-    def _add_metadata(self, file: IO[bytes], offset: int) -> None:
-        with self._noting(f"the metadata at byte {offset}"):
-            record = Metadata.read(_stream(_record(file, offset, Opcode.METADATA)))
-            if record.name not in NOTES:
-                return
-            values, sound = read_note(record.metadata)
-            if sound:
-                self.notes[record.name] = values
-            else:
-                self.damage.append(f"its note {record.name!r} does not match its CRC")
-            self.header = values if record.name == HEADER_NOTE else self.header
+    def _attach(self, file: IO[bytes], offset: int, name: str = HEADER_FILE) -> None:
+        """Take over an attachment; if it is the header, read it."""
+        self._attached.append(offset)
+        if name == HEADER_FILE:
+            with self._noting(f"the attachment at byte {offset}"):
+                attached = Attachment.read(_stream(_record(file, offset, Opcode.ATTACHMENT)))
+                if attached.name == HEADER_FILE:
+                    self.header = json.loads(attached.data)
+                    _attachment(file, offset)
+                    self.session = str((self.header or {})["session_id"])
 
     @contextmanager
     def _noting(self, what: str) -> Generator[None]:

@@ -22,7 +22,7 @@ from collections import Counter, defaultdict
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -37,8 +37,6 @@ from mcap.records import (
     Footer,
     McapRecord,
     Message,
-    Metadata,
-    MetadataIndex,
     Schema,
     Statistics,
 )
@@ -48,7 +46,7 @@ from mcap.writer import MCAP0_MAGIC
 from brushloop.sessions.disk import file_sha256, fsync_folder, sync
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
 from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, scan_sound
-from brushloop.sessions.records import HEADER_NOTE, Event, Header, Topic, note
+from brushloop.sessions.records import HEADER_FILE, Event, Header, Topic
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Protobuf
@@ -109,7 +107,6 @@ class McapWriter:
         self.channels: dict[int, Channel] = {}
         self._chunks: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
         self._counts: Counter[int] = Counter()
         self._crc = 0
         """Of everything written to the file so far."""
@@ -124,15 +121,9 @@ class McapWriter:
             counts[self.channels[number].topic] += count
         return counts
 
-    def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write metadata."""
-        offset = self._file.tell()
-        length = self._write(_packed(Metadata(name=name, metadata=data)))
-        self._metadata.append(MetadataIndex(offset=offset, length=length, name=name))
-
-    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Write an attached file."""
-        offset = self._file.tell()
+    def add_attachment(self, name: str, data: bytes) -> None:
+        """Write an attached file, JSON or TOML."""
+        offset, media_type = self._file.tell(), f"application/{Path(name).suffix[1:]}"
         length = self._write(_packed(Attachment(0, 0, name, media_type, data)))
         self._attachments.append(AttachmentIndex(offset, length, 0, 0, len(data), name, media_type))
 
@@ -210,11 +201,11 @@ class McapWriter:
             message_count=self._counts.total(),
             message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
             message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
-            metadata_count=len(self._metadata),
+            metadata_count=0,
             schema_count=len(self.schemas),
         )
         summary: list[McapRecord] = [*self.schemas.values(), *self.channels.values(), statistics]
-        summary += [*self._chunks, *self._attachments, *self._metadata]
+        summary += [*self._chunks, *self._attachments]
         data = b"".join(map(_packed, summary))
         footer = _packed(Footer(start, 0, 0))[:-4]  # its CRC covers all but itself
         self._write(data)
@@ -264,23 +255,20 @@ def _packed(record: McapRecord) -> bytes:
     return builder.end()
 
 
-def start_mcap(file: IO[bytes], header: Header, notes: Mapping[str, Mapping[str, Any]]) -> McapWriter:
-    """Begin an MCAP file with the session's header and notes."""
+def start_mcap(file: IO[bytes], header: Header) -> McapWriter:
+    """Begin an MCAP file with the session's header."""
     writer = McapWriter(file, header.software)
-    for name, values in {HEADER_NOTE: header.model_dump(mode="json"), **notes}.items():
-        writer.add_metadata(name, note(values))
+    writer.add_attachment(HEADER_FILE, header.model_dump_json().encode())
     return writer
 
 
 @contextlib.contextmanager
-def new_mcap(
-    path: Path, header: Header, notes: Mapping[str, Mapping[str, Any]], attachments: Mapping[str, bytes]
-) -> Generator[McapWriter]:
+def new_mcap(path: Path, header: Header, attachments: Mapping[str, bytes]) -> Generator[McapWriter]:
     """A new file to copy messages into; finished and durable after the block. Raises `OSError`."""
     with path.open("xb") as file:
-        writer = start_mcap(file, header, notes)
+        writer = start_mcap(file, header)
         for name, data in attachments.items():
-            writer.add_attachment(name, "application/json" if name.endswith(".json") else "application/toml", data)
+            writer.add_attachment(name, data)
         yield writer
         writer.finish()
         sync(file)
@@ -359,7 +347,7 @@ class SegmentWriter:
             self._error = error
 
     def _write_all(self) -> None:
-        writer = start_mcap(self._file, self._header, {})
+        writer = start_mcap(self._file, self._header)
         writer.flush()
         flushed = time.monotonic()
         while True:

@@ -5,24 +5,19 @@ Foxglove's types are protobuf, which any viewer shows; our events are JSON, whic
 
 from __future__ import annotations
 
-import json
-import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from brushloop.sessions.disk import SESSION_ID
 
 SCHEMA_VERSION = 1
-HEADER_NOTE = "brushloop.header"
-REPAIRS_NOTE = "brushloop.repairs"
-"""Note in a merged file whose session was repaired: what was rewritten, what is missing, and what was lost."""
-NOTES = (HEADER_NOTE, REPAIRS_NOTE)
-
-
+HEADER_FILE = "header.json"
+"""Attachment of every recording: its `Header`."""
+REPAIRS_FILE = "repairs.json"
+"""Attachment of the merged file of a repaired session: what was rewritten, what is missing, and what was lost."""
 BareName = Annotated[str, Field(pattern=f"^({SESSION_ID.pattern})?$")]
 """Name of a session or of a file in one; empty until it is known."""
 
@@ -193,19 +188,3 @@ class Condition:
     depth_mm: float
     tilt_deg: float
     heading_deg: float = 0.0
-
-
-def note(values: Mapping[str, Any]) -> dict[str, str]:
-    """Values as MCAP metadata: each as JSON, so that it reads back unchanged, and a CRC, which MCAP lacks."""
-    texts = {name: json.dumps(value, separators=(",", ":"), allow_nan=False) for name, value in values.items()}
-    return {**texts, "crc": _crc(texts)}
-
-
-def read_note(metadata: dict[str, str]) -> tuple[dict[str, Any], bool]:
-    """Values of a note, and whether they match its CRC. Raises `ValueError` or `RecursionError` where they are none."""
-    texts = {name: text for name, text in metadata.items() if name != "crc"}
-    return {name: json.loads(text) for name, text in texts.items()}, metadata.get("crc") == _crc(texts)
-
-
-def _crc(texts: dict[str, str]) -> str:
-    return f"{zlib.crc32(json.dumps(texts, sort_keys=True).encode()):08x}"

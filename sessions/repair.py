@@ -22,11 +22,11 @@ from brushloop.sessions import events
 from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside, sync
 from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.events import Begin, Done, Event, line_of, step_words
-from brushloop.sessions.journal import JOURNAL_NAME, Journal, Line, encode_line, read_header
+from brushloop.sessions.journal import JOURNAL_NAME, Journal, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
 from brushloop.sessions.mcap_writer import Outgoing, new_mcap
 from brushloop.sessions.recording import check_path, find_recording, parse_header
-from brushloop.sessions.records import HEADER_NOTE, Header, Stroke, Topic
+from brushloop.sessions.records import HEADER_FILE, Header, Stroke, Topic
 from brushloop.sessions.store import closed, lock, merge_session, step_message
 from brushloop.sessions.verify import (
     Evidence,
@@ -88,7 +88,7 @@ def _repair_file(path: Path) -> Report:
     file = scan(path)
     if file.header is None:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
-    if HEADER_NOTE not in file.notes:
+    if not file.session:
         report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
     kept, counts, lost = _rewrite(file, parse_header(file))
     why = "; ".join(finding.what for finding in verdict.findings)
@@ -267,9 +267,8 @@ def _rewrite(file: McapFile, header: Header) -> tuple[str, dict[str, int], list[
     Returns where the damaged file is kept, the messages by topic, and descriptions of what was lost.
     """
     strokes: dict[str, bool] = {}
-    notes = {name: values for name, values in file.notes.items() if name != HEADER_NOTE}
-    attached = {attachment.name: attachment.data for attachment in file.attachments()}
-    kept, counts = _replace_damaged(file.path, header, _whole(file, strokes), notes, attached)
+    attached = {one.name: one.data for one in file.attachments() if one.name != HEADER_FILE}
+    kept, counts = _replace_damaged(file.path, header, _whole(file, strokes), attached)
     lost = [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
     gone = Counter(file.stated) - Counter(counts)
     unknown = gone.pop(Topic.STROKE, 0) - len(lost)
@@ -279,9 +278,8 @@ def _rewrite(file: McapFile, header: Header) -> tuple[str, dict[str, int], list[
     if file.index is None and len(file.damage) > 1:
         lost.append("anything else behind the damage: without its index its amount is unknown")
     if file.index is not None:
-        noted = {one.name for one in file.index.metadata_indexes} - {HEADER_NOTE, *notes}
-        if noted or len(attached) < len(file.index.attachment_indexes):
-            lost.append("an attached file, or a note of what was done to the recording")
+        names = {one.name for one in file.index.attachment_indexes} - {HEADER_FILE, *attached}
+        lost += [f"the attached file {name}" for name in sorted(names)]
     return kept, counts, lost
 
 
@@ -323,7 +321,6 @@ def _replace_damaged(
     path: Path,
     header: Header,
     messages: Iterable[Record | Outgoing],
-    notes: Mapping[str, Line] = MappingProxyType({}),
     attached: Mapping[str, bytes] = MappingProxyType({}),
 ) -> tuple[str, dict[str, int]]:
     """Write a file with these contents in place of `path`, and keep the damaged one beside it.
@@ -334,7 +331,7 @@ def _replace_damaged(
     fresh = path.with_name(path.name + ".repair")
     try:
         fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
-        with new_mcap(fresh, header, notes, attached) as writer:
+        with new_mcap(fresh, header, attached) as writer:
             for message in messages:
                 if isinstance(message, Outgoing):
                     writer.record(message)

@@ -6,6 +6,7 @@ The engine writes only through this.
 from __future__ import annotations
 
 import datetime as dt
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, read_hea
 from brushloop.sessions.mcap_file import scan_sound
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter, new_mcap
 from brushloop.sessions.recording import merged_file
-from brushloop.sessions.records import REPAIRS_NOTE, Header, Topic
+from brushloop.sessions.records import REPAIRS_FILE, Header, Topic
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
@@ -107,23 +108,15 @@ class SessionStore:
             raise disk_error(folder, "cannot create", error) from error
         return cls(folder, header, now_ns, snapshots)
 
-    def begin(
-        self,
-        key: str,
-        kind: StepKind,
-        *,
-        patch: int | None = None,
-        more_patches: tuple[int, ...] = (),
-        press: Press | None = None,
-    ) -> Attempt:
+    def begin(self, key: str, kind: StepKind, *, patches: tuple[int, ...] = (), press: Press | None = None) -> Attempt:
         """Journal that an attempt starts, then open its file.
 
-        `patch` and `more_patches` are those that it marks. Raises `DiskFull`, or `SessionError` for a press on a sheet
-        that may hold an unrecorded one, before anything is written.
+        `patches` are those that it marks. Raises `DiskFull`, or `SessionError` for a press on a sheet that may hold an
+        unrecorded one, before anything is written.
         """
         check_room(self.folder, STEP_BYTES)
         state = self.state
-        if patch is not None and state.sheet in state.doubtful_sheets:
+        if patches and state.sheet in state.doubtful_sheets:
             raise SessionError(
                 self.folder,
                 f"the record of a press on sheet {state.sheet + 1} was lost, so any of its patches may already hold "
@@ -136,8 +129,7 @@ class SessionStore:
             kind=kind,
             attempt=state.attempts.get(key, 0) + 1,
             sheet=state.sheet,
-            patch=patch,
-            more_patches=more_patches,
+            patches=patches,
             press=press,
             file=f"{serial:04d}-{kind}-{key[:8]}.mcap",
         )
@@ -217,7 +209,7 @@ class SessionStore:
 def merge_session(folder: Path, state: RunState, header: Header, tag: str = "superseded") -> Path:
     """Merge the finished steps of a session into its one MCAP file, in the order of the journal.
 
-    The file includes the configuration and a note of any repairs, so that it can be shared alone. It gets its name
+    The file includes the configuration and a list of any repairs, so that it can be shared alone. It gets its name
     once it was read back with correct CRCs and the journal's counts. A file of that name, left by an interrupted close,
     is kept beside it under `tag`. Raises `SessionDamaged` naming the step that cannot be read, or the wrong counts.
     """
@@ -228,11 +220,12 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
     expected = state.counts()
     try:
         part.unlink(missing_ok=True)  # only a copy of steps that still exist
-        repairs = [repair.model_dump(mode="json") for repair in state.repairs]
-        notes = {REPAIRS_NOTE: {"repairs": repairs}} if repairs else {}
         snapshots = {} if state.opened is None else state.opened.snapshots
         attachments = {name: text.encode() for name, text in snapshots.items()}
-        with new_mcap(part, header, notes, attachments) as writer:
+        if state.repairs:
+            repairs = [repair.model_dump(mode="json") for repair in state.repairs]
+            attachments[REPAIRS_FILE] = json.dumps(repairs, indent=1).encode()
+        with new_mcap(part, header, attachments) as writer:
             for file in state.files:
                 writer.copy_file(folder / file)
         counts = dict(scan_sound(part).counts)

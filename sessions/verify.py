@@ -31,7 +31,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, DoneTwice, Reading, RunStat
 from brushloop.sessions.mcap_file import McapFile, scan
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording, check_path, find_recording, parse_header, remarks_of
-from brushloop.sessions.records import HEADER_NOTE, Stroke, Topic
+from brushloop.sessions.records import HEADER_FILE, Stroke, Topic
 from brushloop.sessions.store import closed
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -220,12 +220,24 @@ def parsed_step(data: bytes) -> Begin | Done | None:
 
 def begin_of(done: Done) -> Begin | None:
     """The begin of a finished step whose own is lost; None where the patches that it used are not known either."""
-    press = done.press if isinstance(done.result, events.PressResult) else None
-    sheet, patch = (0, None) if press is None else (press.sheet, press.patch)
-    if sheet is None or (patch is None and done.kind in MARKING):
+    sheet, patches = 0, tuple[int, ...]()
+    if isinstance(done.result, events.PressResult):
+        press = done.result.press
+        if press.sheet is None or press.patch is None:
+            return None
+        sheet, patches = press.sheet, (press.patch,)
+    elif done.kind in MARKING:
         return None
-    values = {"t_ns": done.t_ns, "key": done.key, "kind": done.kind, "attempt": done.attempt, "file": done.file}
-    return Begin.model_validate({**values, "sheet": sheet, "patch": patch, "press": done.press})
+    return Begin(
+        t_ns=done.t_ns,
+        key=done.key,
+        kind=done.kind,
+        attempt=done.attempt,
+        sheet=sheet,
+        patches=patches,
+        press=done.press,
+        file=done.file,
+    )
 
 
 def _opened(evidence: Evidence) -> events.Open:
@@ -292,8 +304,8 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
 def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
     file = scan(path)
     verdict = Verdict(name, "recording", files=1, strokes=file.counts[Topic.STROKE], messages=file.counts.total())
-    if file.index is not None and HEADER_NOTE not in (one.name for one in file.index.metadata_indexes):
-        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}")
+    if file.index is not None and HEADER_FILE not in (one.name for one in file.index.attachment_indexes):
+        raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_FILE}")
     verdict.find(path.name, *file.damage, *_content_problems(file, progress))
     if verdict.sound:
         try:

@@ -40,8 +40,8 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store = make.store(folder / name, **HEADER, session_id=name, protocol=HOSTILE)
         shown = [make.still(0), make.stroke(0, stroke_id=f"key{NAME}")]
         make.take(store, "key", shown, make.captured(f"key{NAME}", 0), 1)
-        store.void(store.begin("cut", StepKind.PRESS, patch=2, press=make.press(HOSTILE)), HOSTILE)
-        store.begin("begun", StepKind.PRESS, patch=3, press=make.press(HOSTILE)).writer.abandon()
+        store.void(store.begin("cut", StepKind.PRESS, patches=(2,), press=make.press(HOSTILE)), HOSTILE)
+        store.begin("begun", StepKind.PRESS, patches=(3,), press=make.press(HOSTILE)).writer.abandon()
         if name == "closed":
             store.close()
         store.release()

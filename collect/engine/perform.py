@@ -64,14 +64,8 @@ class Performer:
         free = run.sheet.free(used, store.state.sheet + 1) if marks or isinstance(step, DipStep) else None
         patch = free if marks else None
         more = partners(run.sheet, patch, used) if patch is not None and isinstance(step, SelfCheckStep) else ()
-        index = None if patch is None else patch.index
-        attempt = store.begin(
-            step.key,
-            step.kind,
-            patch=index,
-            more_patches=tuple(other.index for other in more),
-            press=press_of(step),
-        )
+        marked = () if patch is None else (patch.index, *(other.index for other in more))
+        attempt = store.begin(step.key, step.kind, patches=marked, press=press_of(step))
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, self._show)
         if self._show is not None:

@@ -243,8 +243,8 @@ def _tally_of(state: RunState, planned: list[Planned], since_ns: int) -> _Tally:
     """Count what the journal holds; of the strokes that were pressed again after a review, only the repetition."""
     tally = _Tally(planned, state.sheet, len(state.cut), dict.fromkeys(state.used_patches, Mark.VOID))
     for begin in state.running.values():
-        if begin.patch is not None:
-            tally.marks[begin.sheet, begin.patch] = Mark.NOW
+        for patch in begin.patches[:1]:
+            tally.marks[begin.sheet, patch] = Mark.NOW
     kept: dict[str, Press] = {}
     for step in state.files.values():
         match step.result:

@@ -206,8 +206,8 @@ def check(lab: Lab, toll: Toll, presses_before: int) -> None:
     assert not state.is_open
     wanted = stroke_ids(lab)
     assert captures_done(path) == wanted
-    begun = [line for line in read_lines(path) if line["event"] == "begin" and "patch" in line]
-    patches = [(line["sheet"], line["patch"]) for line in begun]
+    begun = [line for line in read_lines(path) if line["event"] == "begin" and line["patches"]]
+    patches = [(line["sheet"], line["patches"][0]) for line in begun]
     assert len(patches) == len(set(patches)), "a patch was used twice"
 
     verdict = verify_session(path.parent)

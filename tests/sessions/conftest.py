@@ -80,9 +80,9 @@ class Make:
     def captured(self, stroke_id: str, still: int, **known: Any) -> CaptureResult:
         return CaptureResult(press=self.press(stroke_id), still=still, **known)
 
-    def perform(self, store: SessionStore, key: str, patch: int | None = None) -> None:
+    def perform(self, store: SessionStore, key: str, *patches: int) -> None:
         """One step from begin to done, with a still and a stroke in it."""
-        attempt = store.begin(key, StepKind.CAPTURE, patch=patch)
+        attempt = store.begin(key, StepKind.CAPTURE, patches=patches)
         attempt.writer.write(self.still(attempt.serial))
         attempt.writer.write(self.stroke(attempt.serial, stroke_id=key))
         store.done(attempt, self.captured(key, attempt.serial))
@@ -90,7 +90,7 @@ class Make:
     def collect(self, store: SessionStore, strokes: int = 2) -> None:
         """A small grid as the engine collects it: a board, presses with poses, captures, and one press that was cut."""
         self.take(store, "board", [self.still(1000)], BOARD)
-        store.void(store.begin("H13-a05-r00 press", StepKind.PRESS, patch=0), "stopped by the operator")
+        store.void(store.begin("H13-a05-r00 press", StepKind.PRESS, patches=(0,)), "stopped by the operator")
         for number in range(strokes):
             stroke, sheet, patch = f"H13-a05-r{number:02d}", store.state.sheet, number + 1
             poses = [self.pose(100 * number + at) for at in range(5)]
@@ -104,7 +104,7 @@ class Make:
     ) -> None:
         """One step from begin to done."""
         press = result.press if isinstance(result, PressResult | CaptureResult) else None
-        attempt = store.begin(key, result.kind, patch=patch, press=press)
+        attempt = store.begin(key, result.kind, patches=() if patch is None else (patch,), press=press)
         for message in messages:
             attempt.writer.write(message)
         store.done(attempt, result)

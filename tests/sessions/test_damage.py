@@ -330,9 +330,9 @@ def test_where_nobody_knows_which_patch_was_pressed_the_sheet_is_not_used_again(
     assert "nothing more is pressed on sheet 1; go on with a fresh one, --sheet 2" in repair(opened).lost[1]
     store = resume(opened)
     with pytest.raises(SessionError, match="run the same command with --sheet 2"):
-        store.begin("H15-a05", StepKind.PRESS, patch=7)
+        store.begin("H15-a05", StepKind.PRESS, patches=(7,))
     store.fresh_sheet()
-    make.perform(store, "H15-a05", patch=0)
+    make.perform(store, "H15-a05", 0)
     store.release()
     assert verify_session(opened).sound
 

@@ -13,7 +13,15 @@ from brushloop.sessions.journal import Journal, encode_line, read, replay
 from brushloop.sessions.recording import REMARKS_NAME, add_remark, remarks_of
 from tests.journal_lines import read_lines
 
-BEGIN = {"event": "begin", "key": "k1", "kind": "press", "attempt": 1, "sheet": 0, "patch": 4, "file": "0000-k1.mcap"}
+BEGIN = {
+    "event": "begin",
+    "key": "k1",
+    "kind": "press",
+    "attempt": 1,
+    "sheet": 0,
+    "patches": [4],
+    "file": "0000-k1.mcap",
+}
 DONE = {
     "event": "done",
     "key": "k1",
@@ -109,9 +117,9 @@ def test_a_step_that_is_done_twice_is_damage(path):
 
 
 def test_replay_folds_begin_done_void_and_sheet(path):
-    other = {**BEGIN, "key": "k2", "patch": 5, "file": "0001-k2.mcap"}
+    other = {**BEGIN, "key": "k2", "patches": [5], "file": "0001-k2.mcap"}
     void = {"event": "void", "key": "k2", "attempt": 1, "why": "stopped"}
-    again = {**other, "attempt": 2, "sheet": 1, "patch": 0}
+    again = {**other, "attempt": 2, "sheet": 1, "patches": [0]}
     state = replay(written(path, BEGIN, DONE, other, void, {"event": "sheet", "sheet": 1}, again))
     assert state.done["k1"].result.press.condition == Condition(depth_mm=13.0, tilt_deg=5.0)
     assert list(state.files) == ["0000-k1.mcap"]

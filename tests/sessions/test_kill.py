@@ -35,7 +35,7 @@ for key in keys:
     if key in store.state.done:
         continue
     patch = max((patch for _, patch in store.state.used_patches), default=-1) + 1
-    attempt = store.begin(key, StepKind.PRESS, patch=patch)
+    attempt = store.begin(key, StepKind.PRESS, patches=(patch,))
     for number in range(4):
         t_ns = time.time_ns()
         still = image_message(t_ns, random.randbytes(20_000))
@@ -73,7 +73,7 @@ def kill_and_finish(make, root, seed, most):
     assert make.stroke_names(recording.path) == KEYS
     done = make.events(folder, "done")
     assert Counter(line["key"] for line in done) == Counter(KEYS)
-    patches = [line["patch"] for line in make.events(folder, "begin")]
+    patches = [patch for line in make.events(folder, "begin") for patch in line["patches"]]
     assert len(patches) == len(set(patches)), "a patch was pressed twice"
     assert sum(line["counts"]["/camera/still"] for line in done) == 48
     return kills

@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import json
 
 import pytest
 import zstandard
@@ -13,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import StepKind
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import HEADER_NOTE, note
+from brushloop.sessions.records import HEADER_FILE
 from brushloop.sessions.repair import repair_session
 from brushloop.sessions.show import details
 from brushloop.sessions.verify import verify_session
@@ -25,13 +26,14 @@ def path(tmp_path):
     return tmp_path / "a.mcap"
 
 
-def foreign(path, *, metadata=None, messages=(), **options):
-    """An MCAP file written by somebody else: (topic, encoding, data) of its messages."""
+def foreign(path, header=None, messages=(), **options):
+    """An MCAP file written by somebody else, with this text as its header: (topic, encoding, data) of its messages."""
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start()
-        for name, values in (metadata or {}).items():
-            writer.add_metadata(name, values)
+        writer.add_metadata("trip", {"car": "blue"})
+        if header is not None:
+            writer.add_attachment(0, 0, HEADER_FILE, "application/json", header.encode())
         for number, (topic, encoding, data) in enumerate(messages):
             channel = writer.register_channel(topic, encoding, 0)
             writer.add_message(channel, number, data, number, 0)
@@ -90,7 +92,8 @@ def test_an_open_session_is_refused_with_the_way_out(make, store):
     ids=lambda damaged: next(iter(damaged)),
 )
 def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damaged):
-    foreign(path, metadata={HEADER_NOTE: note(make.header.model_dump(mode="json")) | damaged})
+    texts = {name: json.dumps(value) for name, value in make.header.model_dump(mode="json").items()} | damaged
+    foreign(path, "{" + ",".join(f'"{name}":{text}' for name, text in texts.items()) + "}")
     with pytest.raises(SessionDamaged) as caught:
         Recording(path)
     assert "\n" not in str(caught.value)
@@ -109,7 +112,7 @@ def test_a_header_that_cannot_be_read_is_reported_in_one_line(make, path, damage
     ],
 )
 def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, message):
-    foreign(path, metadata={HEADER_NOTE: note(make.header.model_dump(mode="json"))}, messages=[(topic, "json", data)])
+    foreign(path, make.header.model_dump_json(), [(topic, "json", data)])
     recording = Recording(path)
     with pytest.raises(SessionDamaged, match=message) as caught:
         list(recording.captures())
@@ -118,8 +121,7 @@ def test_a_message_that_cannot_be_read_names_its_field(make, path, topic, data, 
 
 
 def test_messages_outside_chunks_are_refused_because_no_crc_protects_them(make, path):
-    ours = {HEADER_NOTE: note(make.header.model_dump(mode="json"))}
-    foreign(path, metadata=ours, use_chunking=False, messages=[("/stroke", "json", b"{}")])
+    foreign(path, make.header.model_dump_json(), [("/stroke", "json", b"{}")], use_chunking=False)
     with pytest.raises(SessionDamaged, match="outside chunks"):
         Recording(path)
 
@@ -169,7 +171,7 @@ LOOKS = [Recording, details, verify_session, lambda path: repair_session(path, l
 
 @pytest.mark.parametrize("look", LOOKS)
 def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
-    store.begin("k", StepKind.PRESS, patch=0).writer.abandon()
+    store.begin("k", StepKind.PRESS, patches=(0,)).writer.abandon()
     (part,) = store.folder.glob("*.part")
     (tmp_path / "empty").mkdir()
     before = make.tree(tmp_path)
@@ -189,11 +191,10 @@ def test_what_is_no_session_is_named_as_what_it_is(make, store, tmp_path, look):
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
 def test_a_recording_of_another_program_is_no_session_and_not_damaged(tmp_path, command, compression):
     path = tmp_path / "drive.mcap"
-    trip, stroke = {"trip": {"car": "blue"}}, ("/stroke", "cdr", b"\0\1\0\0")
-    foreign(path, metadata=trip, messages=[stroke], compression=compression)
+    foreign(path, messages=[("/stroke", "cdr", b"\0\1\0\0")], compression=compression)
     before = path.read_bytes()
     ran = brushloop("sessions", command, path)
     assert (ran.returncode, ran.stdout) == (2, "")
-    what = f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_NOTE}"
+    what = f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_FILE}"
     assert ran.stderr == f"brushloop: {path}: {what}\n"
     assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])

@@ -25,7 +25,7 @@ def store(make, tmp_path):
 
 def press(make, store, stroke_id, depth_mm, patch):
     made = make.press(stroke_id, depth_mm, sheet=store.state.sheet, patch=patch)
-    store.done(store.begin(f"press {stroke_id}", StepKind.PRESS, patch=patch, press=made), PressResult(press=made))
+    store.done(store.begin(f"press {stroke_id}", StepKind.PRESS, patches=(patch,), press=made), PressResult(press=made))
     attempt = store.begin(f"capture {stroke_id}", StepKind.CAPTURE, press=made)
     attempt.writer.write(make.still(attempt.serial))
     attempt.writer.write(make.stroke(attempt.serial, stroke_id=stroke_id, depth_mm=depth_mm, tilt_deg=5.0))
@@ -36,10 +36,10 @@ def press(make, store, stroke_id, depth_mm, patch):
 def collected(make, store):
     """Two strokes of four, one press that was stopped, one that the process did not survive."""
     press(make, store, "H13-a5-r01", 13.0, 0)
-    store.void(store.begin("v", StepKind.PRESS, patch=1, press=make.press("H15-a5-r01")), "stopped")
+    store.void(store.begin("v", StepKind.PRESS, patches=(1,), press=make.press("H15-a5-r01")), "stopped")
     press(make, store, "H15-a5-r01", 15.0, 2)
     store.fresh_sheet()
-    store.begin("k", StepKind.PRESS, patch=0, press=make.press("H13-a5-r02")).writer.abandon()
+    store.begin("k", StepKind.PRESS, patches=(0,), press=make.press("H13-a5-r02")).writer.abandon()
     return store
 
 

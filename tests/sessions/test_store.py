@@ -32,12 +32,12 @@ def test_an_existing_folder_is_refused_and_left_as_it_is(make, tmp_path):
 
 
 def test_attempts_cells_and_results_are_kept_across_processes(make, store, resume):
-    make.perform(store, "H13-a05", patch=0)
-    store.void(store.begin("H15-a05", StepKind.PRESS, patch=1), "stopped by the operator")
+    make.perform(store, "H13-a05", 0)
+    store.void(store.begin("H15-a05", StepKind.PRESS, patches=(1,)), "stopped by the operator")
     second = resume(store)
     assert second.state.done["H13-a05"].result == make.captured("H13-a05", 0)
     assert second.state.used_patches == {(0, 0), (0, 1)}
-    attempt = second.begin("H15-a05", StepKind.PRESS, patch=2)
+    attempt = second.begin("H15-a05", StepKind.PRESS, patches=(2,))
     assert (attempt.begin.attempt, attempt.serial) == (2, 2)
     second.done(attempt, PressResult(press=make.press()))
     assert [line["why"] for line in make.events(store.folder, "void")] == ["stopped by the operator"]
@@ -45,20 +45,20 @@ def test_attempts_cells_and_results_are_kept_across_processes(make, store, resum
 
 
 def test_a_fresh_sheet_frees_its_cells_and_stays_fresh(make, store, resume):
-    make.perform(store, "H13-a05", patch=0)
+    make.perform(store, "H13-a05", 0)
     store.fresh_sheet()
-    make.perform(store, "H15-a05", patch=0)
+    make.perform(store, "H15-a05", 0)
     state = resume(store).state
     assert (state.sheet, state.used_patches) == (1, {(0, 0), (1, 0)})
 
 
 def test_a_process_that_dies_between_rename_and_done_does_the_step_again(make, store, resume):
-    attempt = store.begin("H13-a05", StepKind.PRESS, patch=3)
+    attempt = store.begin("H13-a05", StepKind.PRESS, patches=(3,))
     attempt.writer.write(make.stroke(0, stroke_id="never journalled"))
     attempt.writer.finish()
     second = resume(store)
     assert second.state.done == {}
-    make.perform(second, "H13-a05", patch=4)
+    make.perform(second, "H13-a05", 4)
     assert make.stroke_names(second.close()) == ["H13-a05"]
 
 
@@ -72,7 +72,7 @@ def test_the_merged_file_holds_what_the_journal_counted_and_the_configuration(ma
         reader = make_reader(file, validate_crcs=True)
         attached = {a.name: a.data.decode() for a in reader.iter_attachments()}
         assert reader.get_summary().statistics.message_count == 8
-    assert attached == make.snapshots
+    assert attached == {"header.json": make.header.model_dump_json(), **make.snapshots}
     recording = Recording(store.folder)
     assert recording.header == make.header
     assert recording.attachment("rig.toml").decode() == make.snapshots["rig.toml"]
@@ -125,7 +125,7 @@ def test_session_ids_count_up_until_the_day_is_full(tmp_path):
 
 
 def test_an_attempt_that_marks_several_cells_burns_them_all(make, store, resume):
-    store.begin("check", StepKind.SELF_CHECK, patch=0, more_patches=(5, 36)).writer.abandon()
+    store.begin("check", StepKind.SELF_CHECK, patches=(0, 5, 36)).writer.abandon()
     assert store.state.used_patches == {(0, 0), (0, 5), (0, 36)}
     assert resume(store).state.used_patches == store.state.used_patches
 
@@ -142,7 +142,7 @@ def test_a_step_is_not_begun_where_its_files_might_not_fit(make, store, monkeypa
     before = make.tree(store.folder)
     free(monkeypatch, 1_000_000)
     with pytest.raises(DiskFull, match="the disk has 1 MB left, 84 MB are needed; make room") as caught:
-        store.begin("b", StepKind.PRESS, patch=0)
+        store.begin("b", StepKind.PRESS, patches=(0,))
     assert caught.value.exit_code == 4
     assert make.tree(store.folder) == before
     assert store.state.used_patches == set(), "no patch is burnt"
@@ -162,7 +162,7 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
     make, store, resume, monkeypatch
 ):
     """Neither the step's file nor its `void` fits; with room again, the session goes on with the next attempt."""
-    make.perform(store, "a", patch=0)
+    make.perform(store, "a", 0)
     open_, write = Path.open, os.write
 
     class Full(io.FileIO):
@@ -176,7 +176,7 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
         return io.BufferedWriter(Full(path, mode)) if mode == "xb" else open_(path, mode, **options)
 
     monkeypatch.setattr(Path, "open", open_on_it)
-    attempt = store.begin("b", StepKind.PRESS, patch=1)
+    attempt = store.begin("b", StepKind.PRESS, patches=(1,))
     monkeypatch.setattr(os, "write", no_room)
 
     def finish():
@@ -193,7 +193,7 @@ def test_a_disk_that_fills_up_during_a_step_ends_the_attempt_and_nothing_finishe
     again = resume(store)
     assert set(again.state.done) == {"a"}
     assert again.state.used_patches == {(0, 0), (0, 1)}
-    make.perform(again, "b", patch=2)
+    make.perform(again, "b", 2)
     assert make.stroke_names(again.close()) == ["a", "b"]
     assert verify_session(store.folder).sound
 

@@ -93,8 +93,8 @@ def theirs(file):
     def add_message(channel_id, sequence, log_ns, publish_ns, data):
         writer.add_message(channel_id, log_ns, data, publish_ns, sequence)
 
-    def attach(name, media_type, data):
-        writer.add_attachment(0, 0, name, media_type, data)
+    def attach(name, data):
+        writer.add_attachment(0, 0, name, "application/toml", data)
 
     return writer, attach, add_channel, add_message
 
@@ -108,8 +108,7 @@ def written(begin):
     """A file with two topics, large and small messages, a clock that goes back, and whatever else a file may hold."""
     file = io.BytesIO()
     writer, attach, add_channel, add_message = begin(file)
-    writer.add_metadata("note", {"a": "1"})
-    attach("rig.toml", "application/toml", b"x = 1")
+    attach("rig.toml", b"x = 1")
     add_channel(THING, THINGS)
     add_channel(None, BARE)
     for number in range(500):
@@ -118,7 +117,6 @@ def written(begin):
     writer.flush()  # nothing waits: no chunk is written
     for number, size in enumerate((0, CHUNK_BYTES, 10)):
         add_message(BARE.id, 2**32 - 1, 100 - number, 0, bytes(size))
-    writer.add_metadata("done", {})
     writer.finish()
     file.seek(0)
     return file
@@ -129,7 +127,6 @@ def test_the_mcap_library_finds_by_our_index_what_it_finds_by_its_own(topic):
     def found(file):
         reader = make_reader(file, validate_crcs=True)
         assert [(a.name, a.data) for a in reader.iter_attachments()] == [("rig.toml", b"x = 1")]
-        assert [m.name for m in reader.iter_metadata()] == ["note", "done"]
         return [asdict(message) for _, _, message in reader.iter_messages([topic])]
 
     assert found(written(ours)) == found(written(theirs))

@@ -46,7 +46,7 @@ def test_a_disk_that_fills_up_in_mid_step_parks_the_arm_and_with_room_the_same_c
     assert finished <= {(step.file, step.sha256) for step in replay(folder / JOURNAL_NAME).files.values()}
     assert len({capture.stroke.stroke_id for capture in Recording(folder).captures()}) == 2
     begun = [line for line in read_lines(folder / JOURNAL_NAME) if line["event"] == "begin"]
-    patches = [line["patch"] for line in begun if "patch" in line]
+    patches = [patch for line in begun for patch in line["patches"]]
     assert len(patches) == len(set(patches))
     assert verify_session(folder).sound
 

@@ -170,7 +170,7 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
     [folder] = lab.sessions.iterdir()
     assert sum(1 for _ in Recording(folder).captures()) == 6
     pressed = [
-        (line["sheet"], line["patch"]) for line in read_lines(folder / "journal.jsonl") if line.get("patch") is not None
+        (line["sheet"], patch) for line in read_lines(folder / "journal.jsonl") for patch in line.get("patches", [])
     ]
     assert len(pressed) == len(set(pressed))
     assert {sheet for sheet, _ in pressed} == {0, 1}

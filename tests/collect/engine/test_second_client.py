@@ -274,7 +274,7 @@ def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_ne
     wait_for_end(again)
     [folder] = lab.sessions.iterdir()
     lines = list(read_lines(folder / "journal.jsonl"))
-    begun = [line["patch"] for line in lines if line["event"] == "begin" and line["kind"] == "press"]
+    begun = [line["patches"][0] for line in lines if line["event"] == "begin" and line["kind"] == "press"]
     assert len(set(begun)) == 2
     assert any("nother client" in line["why"] for line in lines if line["event"] == "void")
     assert again.snapshot().strokes_done == 1

@@ -318,8 +318,8 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
         assert done == kept
         assert [line["kind"] for line in voids] == ([] if cut is None else [cut])
     for line in voids:
-        assert ("patch" in line) is (line["kind"] == "press")
-        assert "patch" not in line or (line["sheet"], line["patch"]) in state.used_patches, "burnt"
+        assert bool(line["patches"]) is (line["kind"] == "press")
+        assert {(line["sheet"], patch) for patch in line["patches"]} <= state.used_patches, "burnt"
         assert (folder / f"{line['file']}.part").is_file(), "its evidence is kept"
     store = SessionStore(folder, None, time.time_ns)
     store.verify()
