@@ -117,7 +117,7 @@ def training_page(folder: Path | None, **_: object) -> None:
 def export(
     session: Annotated[Path, typer.Argument(help="A closed session's folder, or an .mcap file.")],
     out: Annotated[Path, typer.Argument(help="The new folder.")],
-    kind: Annotated[str, typer.Option("--format", help="png (images and CSV), npz, or parquet.")] = "png",
+    kind: Annotated[str, typer.Option("--format", help="How tables are written: csv, npz or parquet.")] = "csv",
     crops: Annotated[
         bool, typer.Option("--crops", help="Rectified crops at 20 px/mm with masks, instead of photographs.")
     ] = False,
@@ -125,7 +125,7 @@ def export(
         Path | None, typer.Option(help="With --crops: the calibration; the one in use by default.")
     ] = None,
 ) -> None:
-    """Export strokes, poses and forces: images with CSV, NumPy arrays, or Parquet for Hugging Face `datasets`.
+    """Export strokes, poses and forces: pictures as files, and tables as CSV, NumPy arrays or Parquet.
 
     Ends with exit code 3 if strokes could not be cropped; they are named.
     """

@@ -82,7 +82,7 @@ def sync(file: IO[Any]) -> None:
 
 
 def fsync_folder(folder: Path) -> None:
-    """Make a rename or a new file in `folder` durable."""
+    """Make a rename or a new file in `folder`, or the content of a file, durable."""
     fd = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(fd)
@@ -109,8 +109,8 @@ def staged_folder(out: Path) -> Generator[Path]:
         shutil.rmtree(stage, ignore_errors=True)  # left by a killed process: only a copy
         stage.mkdir(parents=True)
         yield stage
-        for inside, _folders, _files in os.walk(stage):
-            fsync_folder(Path(inside))
+        for path in (*stage.rglob("*"), stage):
+            fsync_folder(path)
         stage.rename(out)
         fsync_folder(out.parent)
     finally:

@@ -1,6 +1,6 @@
 """Values of a session: a press and its condition, the results of steps, and the events of the journal.
 
-A journal is one event a line. `parse_event` and `line_of` turn lines into events and back, and nothing else does.
+A journal is one event a line, which `parse_event` reads.
 """
 
 from __future__ import annotations
@@ -335,11 +335,6 @@ def parse_event(line: dict[str, Any]) -> Event:
         field = ".".join(str(part) for part in problem["loc"][1:]) or "event"
         wrong = "is missing" if problem["type"] == "missing" else f"is wrong: {problem['msg']}"
         raise ValueError(f"{field!r} of event {str(line.get('event'))[:40]!r} {wrong}") from None
-
-
-def line_of(event: Event) -> dict[str, Any]:
-    """The line of an event, without its time."""
-    return event.model_dump(mode="json", exclude={"t_ns"}, exclude_none=True)
 
 
 def step_words(step: Begin | Done) -> str:

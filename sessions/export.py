@@ -1,23 +1,22 @@
-"""Export a recording for other tools: images with CSV tables, NumPy arrays, or Parquet.
+"""Export a recording for other tools: its pictures as files, and tables of strokes, poses and forces.
 
-Every export is a folder, written under a temporary name and renamed when complete; a folder that is not empty is never
-written to. The images are the photographs as they were recorded, byte for byte, or crops and masks by a cropper, one at
-a time; the tables are held in memory. `header.json` says where everything comes from.
+An export is a folder, written under a temporary name and renamed when complete; a folder that is not empty is never
+written to. The pictures are the photographs as they were recorded, byte for byte, or crops and masks by a cropper, one
+at a time; the tables are held in memory. `header.json` says where everything comes from.
 
-`png`      images/, with a cropper masks/; strokes.csv, poses.csv, forces.csv
-`npz`      strokes.npz, which loads without pickle: an array per column of the table of strokes, (n,), NaN where a value
-           is missing; image_0000, ... (h, w) uint8 gray, also mask_0000; pose_<column> and force_<column>, (m,)
-`parquet`  strokes.parquet, with each picture as a struct {bytes, path}, as Hugging Face `datasets` stores images;
-           poses.parquet, forces.parquet
+`images/`, with a cropper `masks/`, and by format:
+`csv`      strokes.csv, poses.csv, forces.csv
+`parquet`  strokes.parquet, poses.parquet, forces.parquet
+`npz`      strokes.npz, poses.npz, forces.npz: an array per column, (n,), which loads without pickle
 
-The tables have the same columns in every format, and `episode_index`, the number of the stroke, joins them.
+Values that are not recorded are empty, null or NaN. `episode_index`, the number of the stroke, joins the tables, and
+the column `file` of a stroke names its picture.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
-import math
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,25 +27,28 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import check_room, csv_text, staged_folder, sync, write_durably
+from brushloop.sessions.disk import check_room, csv_text, staged_folder, write_durably
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
 from brushloop.sessions.events import Begin, StepEvent, StepKind
-from brushloop.sessions.messages import PNG_START, decode_gray
+from brushloop.sessions.messages import PNG_START
 from brushloop.sessions.recording import Capture, Recording, unlike
 from brushloop.sessions.records import Quality, Stroke, Topic, Wrench
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import NDArray
 
-TEXT_COLUMNS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence")
-CROP_TEXT_COLUMNS = ("mask_file", "flags")
-"""Texts of a stroke that only exports of crops have."""
+TEXTS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence", "mask_file", "flags")
+"""Columns of text."""
 PATCH_COLUMNS = ("cell_x_mm", "cell_y_mm", "cell_width_mm", "cell_height_mm")
 SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
 """Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
 Row = dict[str, Any]
+Table = dict[str, list[Any]]
+"""Columns by name."""
+TableWriter = Callable[[Path, Table], None]
+"""Writes a table under a name without its suffix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,6 @@ class Export:
         """(stroke, reason) of those that could not be cropped; filled while the captures are read."""
         self.pictures = ("image",) if cropper is None else ("image", "mask")
         """Names of the pictures that each stroke has."""
-        self.text_columns = TEXT_COLUMNS if cropper is None else TEXT_COLUMNS + CROP_TEXT_COLUMNS
         self.series = (POSES, FORCES) if recording.counts.get(Topic.WRENCH, 0) else (POSES,)
 
     def captures(self) -> Iterator[tuple[Row, dict[str, bytes]]]:
@@ -162,11 +163,6 @@ class Export:
             **{f"commanded_{name}": value for name, value in stroke.commanded.items()},
         }
 
-    def number_columns(self) -> list[str]:
-        """Names of the numeric columns that any stroke has."""
-        names = dict.fromkeys(name for stroke in self.strokes.values() for name in self.row(0, stroke))
-        return [name for name in names if name not in self.text_columns]
-
     def samples(self, series: Series) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """(n, 5) `SAMPLE_COLUMNS` and (n, w) values of the messages during presses, in the order of the recording.
 
@@ -193,10 +189,11 @@ class Export:
             raise SessionDamaged(self.recording.path, f"a message on {on} does not fit its schema") from None
         return np.array(when, np.int64).reshape(-1, 5), np.array(values, np.float64).reshape(-1, len(series.columns))
 
-    def sample_columns(self, series: Series) -> dict[str, NDArray[Any]]:
-        """The table of `samples`: name of each column and its (n,) values. Raises `SessionDamaged`."""
+    def sample_columns(self, series: Series) -> Table:
+        """The table of `samples`. Raises `SessionDamaged`."""
         when, values = self.samples(series)
-        return dict(zip((*SAMPLE_COLUMNS, *series.columns), (*when.T, *values.T), strict=True))
+        columns = (*when.T.tolist(), *values.T.tolist())
+        return dict(zip((*SAMPLE_COLUMNS, *series.columns), columns, strict=True))
 
 
 def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
@@ -223,15 +220,14 @@ def export(
     progress: Progress = unseen,
     make_cropper: Callable[[Recording], Cropper] | None = None,
 ) -> list[tuple[str, str]]:
-    """Export a session into the new or empty folder `out` as `png`, `npz` or `parquet`.
+    """Export a session into the new or empty folder `out` as `csv`, `npz` or `parquet`.
 
     With `make_cropper`, every photograph is replaced by a crop and its mask. Returns (stroke, reason) of the strokes
     that could not be cropped. Raises `InputError` for an unknown format, a folder that is not empty, or a session of
     which no stroke can be cropped, `SessionDamaged` for a recording that cannot be read; nothing is left behind then.
     """
-    writers = {"png": write_png, "npz": write_npz, "parquet": write_parquet}
-    if (write := writers.get(kind)) is None:
-        raise InputError("--format", f"{kind!r}, allowed: {', '.join(writers)}")
+    if (write := WRITERS.get(kind)) is None:
+        raise InputError("--format", f"{kind!r}, allowed: {', '.join(WRITERS)}")
     recording = Recording(source)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(out, "exists and is not an empty folder; nothing is ever overwritten")
@@ -242,7 +238,9 @@ def export(
         check_room(out.parent, recording.path.stat().st_size)
         exported = Export(recording, progress, None if make_cropper is None else make_cropper(recording))
         with staged_folder(out) as stage:
-            write(exported, stage)
+            _write_strokes(exported, stage, write)
+            for series in exported.series:
+                write(stage / f"{series.name}s", exported.sample_columns(series))
             origin = {"file": recording.path.name, "sha256": recording.sha256}
             header = recording.header.model_dump(mode="json") | {"exported_from": origin}
             write_durably(stage / "header.json", (json.dumps(header, indent=2, ensure_ascii=False) + "\n").encode())
@@ -254,8 +252,8 @@ def export(
     return exported.left_out
 
 
-def write_png(export: Export, folder: Path) -> None:
-    """Write pictures and tables."""
+def _write_strokes(export: Export, folder: Path, write: TableWriter) -> None:
+    """Write the pictures, and the table of strokes."""
     for name in export.pictures:
         (folder / f"{name}s").mkdir()
     rows: list[Row] = []
@@ -263,59 +261,37 @@ def write_png(export: Export, folder: Path) -> None:
         for name, data in pictures.items():
             write_durably(folder / str(row[file_column(name)]), data)
         rows.append(row)
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [[row.get(name) for name in columns] for row in rows]
-    write_durably(folder / "strokes.csv", csv_text(columns, cells, "\r\n").encode())
-    for series in export.series:
-        samples = export.sample_columns(series)
-        text = csv_text(list(samples), zip(*(column.tolist() for column in samples.values()), strict=True), "\r\n")
-        write_durably(folder / f"{series.name}s.csv", text.encode())
+    columns = dict.fromkeys(name for row in rows for name in row)
+    write(folder / "strokes", {name: [row.get(name) for row in rows] for name in columns})
 
 
-def write_npz(export: Export, folder: Path) -> None:
-    """Write `strokes.npz`."""
+def _write_csv(path: Path, table: Table) -> None:
+    text = csv_text(list(table), zip(*table.values(), strict=True), "\r\n")
+    write_durably(path.with_suffix(".csv"), text.encode())
+
+
+def _write_npz(path: Path, table: Table) -> None:
     import numpy as np
 
-    with (folder / "strokes.npz").open("xb") as file:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-
-            def add(name: str, values: ArrayLike) -> None:
-                # Members opened by name carry no time, so that equal arrays make equal files.
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
-                    np.lib.format.write_array(out, np.asarray(values), allow_pickle=False)
-
-            rows: list[Row] = []
-            for number, (row, pictures) in enumerate(export.captures()):
-                for name, data in pictures.items():
-                    add(f"{name}_{number:04d}", decode_gray(data, f"stroke {row['stroke_id']}"))
-                rows.append(row)
-            for name in export.text_columns:
-                add(name, np.array([row.get(name) or "" for row in rows], np.str_))
-            for name in export.number_columns():
-                values = (row.get(name) for row in rows)
-                add(name, np.array([math.nan if value is None else value for value in values], np.float64))
-            for series in export.series:
-                for name, column in export.sample_columns(series).items():
-                    add(f"{series.name}_{name}", column)
-        sync(file)
+    with zipfile.ZipFile(path.with_suffix(".npz"), "x", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in table.items():
+            texts = name in TEXTS
+            array = np.array([value or "" for value in values] if texts else values, np.str_ if texts else None)
+            if array.dtype == object:
+                array = array.astype(np.float64)  # in which None is NaN
+            # Members opened by name carry no time, so that equal tables make equal files.
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
+                np.lib.format.write_array(out, array, allow_pickle=False)
 
 
-def write_parquet(export: Export, folder: Path) -> None:
-    """Write the tables. Raises `InputError` where pyarrow is not installed."""
+def _write_parquet(path: Path, table: Table) -> None:
     try:
         pa: Any = importlib.import_module("pyarrow")  # without type stubs
         pq: Any = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise InputError("--format", "parquet needs pyarrow: pip install pyarrow") from None
+    pq.write_table(pa.table(table), path.with_suffix(".parquet"))
 
-    types = dict.fromkeys(export.pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
-    types |= dict.fromkeys(export.text_columns, pa.string())
-    types |= dict.fromkeys(export.number_columns(), pa.float64()) | {"episode_index": pa.int64()}
-    features = {"info": {"features": {name: {"_type": "Image"} for name in export.pictures}}}
-    schema = pa.schema(list(types.items())).with_metadata({"huggingface": json.dumps(features)})
-    with pq.ParquetWriter(folder / "strokes.parquet", schema) as writer:
-        for row, pictures in export.captures():  # one photograph in memory
-            images = {name: {"bytes": data, "path": row[file_column(name)]} for name, data in pictures.items()}
-            writer.write_table(pa.Table.from_pylist([row | images], schema=schema))
-    for series in export.series:
-        pq.write_table(pa.table(export.sample_columns(series)), folder / f"{series.name}s.parquet")
+
+WRITERS: dict[str, TableWriter] = {"csv": _write_csv, "npz": _write_npz, "parquet": _write_parquet}
+"""How each format writes a table."""

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from brushloop.sessions.disk import SESSION_ID, as_text, number, read_bounded, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
 from brushloop.sessions.mcap_writer import Outgoing, new_mcap
@@ -38,11 +40,6 @@ SPECIAL = {"px_per_mm", "depth_mm", "tilt_deg", *PAIRS[0], *PAIRS[1]}
 """Columns of numbers that become fields of a stroke; all others are kept in `commanded`."""
 EARLIER_NAMES = {"height_mm": "depth_mm"}
 """Columns of tables that were made when the depth was called a height."""
-DEEPEST_MM = 500.0
-"""Limit of columns whose name begins with `depth`: depths below where the tip touches the paper."""
-STEEPEST_DEG = 90.0
-MOST = 1e6
-"""Limit of any other number: a length of a kilometre is a typing error."""
 MAX_NAME_CHARS = 100
 LINE = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
 """A line with its end, whatever system wrote it."""
@@ -135,7 +132,7 @@ def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[
     rows: dict[str, tuple[Path, Stroke]] = {}
     try:
         names = [EARLIER_NAMES.get(name, name) for name in _texts(next(lines, list[str]()))]
-        ranges = _ranges(names, options)
+        _check_columns(names, options)
         for cells in filter(any, lines):
             if len(rows) == MAX_ROWS:
                 raise ValueError(f"more than {MAX_ROWS} rows")
@@ -148,7 +145,7 @@ def _read_table(folder: Path, path: Path, options: ImportOptions) -> list[tuple[
                 raise ValueError(f"column `name`: {name[:80]!r}, allowed: 1 to {MAX_NAME_CHARS} characters")
             if name in rows:
                 raise ValueError(f"stroke {name} appears twice")
-            values = {column: _value(column, fields[column], allowed) for column, allowed in ranges.items()}
+            values = {column: _value(column, fields[column]) for column in names if column not in ("file", "name")}
             rows[name] = image, _stroke(name, len(rows), values, options)
     except (ValueError, csv.Error) as error:
         raise InputError(path, f"line {max(lines.line_num, 1)}: {error}") from None
@@ -166,8 +163,8 @@ def _texts(cells: list[str]) -> list[str]:
     return texts
 
 
-def _ranges(names: list[str], options: ImportOptions) -> dict[str, tuple[float, float]]:
-    """Ranges of the columns of numbers. Raises `ValueError` for names that are missing, unknown or not distinct."""
+def _check_columns(names: list[str], options: ImportOptions) -> None:
+    """Raise `ValueError` for columns that are missing, unknown or not distinct."""
     if "file" not in names:
         raise ValueError(f"column `file` is missing; found: {', '.join(names)[:200] or 'none'}")
     if "px_per_mm" not in names and "px_per_mm_x" not in names and options.px_per_mm is None:
@@ -179,49 +176,40 @@ def _ranges(names: list[str], options: ImportOptions) -> dict[str, tuple[float, 
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"column `{name}` occurs twice")
-    return {name: _range(name, options) for name in names if name not in ("file", "name")}
+        parts = name.split("_")
+        if name not in ("file", "name") and parts[-1] not in UNITS and set(UNITLESS).isdisjoint(parts):
+            allowed = ", ".join([*UNITS, *UNITLESS])
+            raise ValueError(f"column `{name}` has no known unit; its name must end in one of: {allowed}")
 
 
-def _range(name: str, options: ImportOptions) -> tuple[float, float]:
-    """Smallest and largest number that a column may hold. Raises `ValueError` for a name without a unit."""
-    parts = name.split("_")
-    if not (len(parts) > 1 and parts[-1] in UNITS) and set(UNITLESS).isdisjoint(parts):
-        allowed = ", ".join([*UNITS, *UNITLESS])
-        raise ValueError(f"column `{name}` has no known unit; its name must end in one of: {allowed}")
-    if name.startswith("depth") and parts[-1] == "mm":
-        return 0.0, DEEPEST_MM
-    if name == "tilt_deg":  # a drag may lean to either side of its path
-        return (0.0 if options.kind == "press" else -STEEPEST_DEG), STEEPEST_DEG
-    return (MIN_PX_PER_MM, MAX_PX_PER_MM) if name.startswith("px_per_mm") else (-MOST, MOST)
-
-
-def _value(column: str, text: str, allowed: tuple[float, float]) -> float:
+def _value(column: str, text: str) -> float:
     try:
-        value = number(text)
+        return number(text)
     except ValueError as error:
         raise ValueError(f"column `{column}`: {error}") from None
-    if not allowed[0] <= value <= allowed[1]:
-        raise ValueError(f"column `{column}`: {text[:80]!r}, allowed: {allowed[0]:g} to {allowed[1]:g}")
-    return value
 
 
 def _stroke(name: str, still: int, values: dict[str, float], options: ImportOptions) -> Stroke:
-    """What the values of a line say, those without a field of their own in `commanded`."""
+    """What the values of a line say, those without a field of their own in `commanded`. Raises `ValueError`."""
 
     def pair(first: str, second: str) -> tuple[float, float] | None:
         return (values[first], values[second]) if first in values else None
 
     scale = None if options.px_per_mm is None else (options.px_per_mm, options.px_per_mm)
-    return Stroke(
-        stroke_id=name,
-        kind="press" if options.kind == "press" else "drag",
-        still=still,
-        depth_mm=values.get("depth_mm"),
-        tilt_deg=values.get("tilt_deg"),
-        anchor_px=pair(*PAIRS[1]),
-        px_per_mm=pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0]) or scale,
-        commanded={name: value for name, value in values.items() if name not in SPECIAL},
-    )
+    try:
+        return Stroke(
+            stroke_id=name,
+            kind="press" if options.kind == "press" else "drag",
+            still=still,
+            depth_mm=values.get("depth_mm"),
+            tilt_deg=values.get("tilt_deg"),
+            anchor_px=pair(*PAIRS[1]),
+            px_per_mm=pair("px_per_mm", "px_per_mm") or pair(*PAIRS[0]) or scale,
+            commanded={name: value for name, value in values.items() if name not in SPECIAL},
+        )
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        raise ValueError(f"column `{problem['loc'][0]}`: {problem['input']}, {problem['msg'].lower()}") from None
 
 
 def _image(folder: Path, name: str) -> Path:

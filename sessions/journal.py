@@ -192,10 +192,14 @@ class Reading:
     """Number of the next line."""
 
 
-def encode_line(t_ns: int, line: Line, seq: int, session: str) -> bytes:
-    """One line with its CRC and newline. Raises `ValueError` for values that JSON cannot hold."""
-    values = {"seq": seq, "session": session, "t_ns": t_ns, **line}
-    body = json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
+def encode_line(event: Event, seq: int, session: str) -> bytes:
+    """The line of an event with its CRC and newline."""
+    return seal({"seq": seq, "session": session, **event.model_dump(mode="json", exclude_none=True)})
+
+
+def seal(line: Line) -> bytes:
+    """A line with its CRC and newline. Raises `ValueError` for values that JSON cannot hold."""
+    body = json.dumps(line, separators=(",", ":"), allow_nan=False).encode()
     return body[:-1] + f',"crc":"{zlib.crc32(body):08x}"}}\n'.encode()
 
 
@@ -340,9 +344,9 @@ class Journal:
         except OSError as error:
             raise disk_error(path, "cannot open", error) from error
 
-    def append(self, t_ns: int, line: Line) -> None:
+    def append(self, event: Event) -> None:
         """Write one event and wait until it is on disk. Raises `SessionError` where that fails."""
-        data = encode_line(t_ns, line, self._seq, self._session)
+        data = encode_line(event, self._seq, self._session)
         try:
             if os.fstat(self._fd).st_size != self._size:
                 os.ftruncate(self._fd, self._size)  # part of a line that did not fit on the disk

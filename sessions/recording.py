@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.events import Begin, CaptureResult, Remark, StepEvent, line_of
+from brushloop.sessions.events import Begin, CaptureResult, Remark, StepEvent
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, replay, undamaged
 from brushloop.sessions.mcap_file import McapFile, Record, open_mcap
 from brushloop.sessions.messages import decode_gray, decode_still
@@ -224,7 +224,7 @@ def add_remark(folder: Path, remark: Remark) -> None:
     """Append a remark and wait until it is on disk. Raises `SessionError` where that fails."""
     journal = Journal(folder / REMARKS_NAME)
     try:
-        journal.append(remark.t_ns, line_of(remark))
+        journal.append(remark)
     finally:
         journal.close()
 

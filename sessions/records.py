@@ -73,11 +73,11 @@ class Stroke(Event):
     kind: Literal["press", "drag"]
     still: int = Field(ge=0)
     """`sequence` of the message on /camera/still that shows this stroke."""
-    depth_mm: float | None = None
+    depth_mm: Annotated[float, Field(ge=0.0, le=500.0)] | None = None
     """Commanded press depth H; None where the source has none."""
     reached_mm: float | None = None
     """Depth that the arm reached, measured along the paper's normal; None where it was not measured."""
-    tilt_deg: float | None = None
+    tilt_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
     heading_deg: float = 0.0
     cell_mm: tuple[float, float, float, float] | None = None
     """x, y, width, height of the paper patch in the paper frame."""

@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from brushloop.sessions import events
 from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside, sync
 from brushloop.sessions.errors import SessionDamaged, disk_error
-from brushloop.sessions.events import Begin, Done, Event, line_of, step_words
+from brushloop.sessions.events import Begin, Done, Event, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, encode_line, read_header
 from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
 from brushloop.sessions.mcap_writer import Outgoing, new_mcap
@@ -29,6 +29,7 @@ from brushloop.sessions.recording import check_path, find_recording, parse_heade
 from brushloop.sessions.records import HEADER_FILE, Header, Stroke, Topic
 from brushloop.sessions.store import closed, lock, merge_session, step_message
 from brushloop.sessions.verify import (
+    UNKNOWN_PATCH,
     Evidence,
     count_words,
     gather,
@@ -117,13 +118,9 @@ class _FolderRepair:
             self._rewrite_journal()
         self._journal = Journal(self._folder / JOURNAL_NAME, self._header.session_id)
         try:
-            self._doubt()
             self._snapshots()
             self._repair_steps()
-            for name, what in self._evidence.strays.items():
-                report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")
-                if name in self._begins:
-                    report.lost.append(f"{step_words(self._begins[name])}, whose file {what}")
+            self._put_strays_aside()
             if state.closed is None and self._final_problems and self._final.exists():
                 kept = self._move_aside(self._final)
                 report.did.append(f"put {self._final.name} aside, for which the journal has no close{kept}")
@@ -137,7 +134,7 @@ class _FolderRepair:
 
     def _rewrite_journal(self) -> None:
         evidence, session, report = self._evidence, self._header.session_id, self._report
-        lines = (encode_line(event.t_ns, line_of(event), n, session) for n, event in enumerate(evidence.events(), 1))
+        lines = (encode_line(event, n, session) for n, event in enumerate(evidence.events(), 1))
         kept = _write_anew(self._folder / JOURNAL_NAME, b"".join(lines))
         as_they_were, rebuilt = len(evidence.reading.events), len(evidence.rebuilt)
         what = f"{as_they_were} lines as they were, {rebuilt} rebuilt from the files"
@@ -147,14 +144,18 @@ class _FolderRepair:
             count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
             report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
 
-    def _doubt(self) -> None:
+    def _put_strays_aside(self) -> None:
         sheet = self._state.sheet
-        for name in [] if sheet in self._state.doubtful_sheets else self._evidence.doubtful:
-            self._log(events.Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
-            self._report.lost.append(
-                f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
-                f"go on with a fresh one, --sheet {sheet + 2}"
-            )
+        for name, what in self._evidence.strays.items():
+            if what == UNKNOWN_PATCH and sheet not in self._state.doubtful_sheets:
+                self._log(events.Doubt(t_ns=self._now_ns(), sheet=sheet, file=name))
+                self._report.lost.append(
+                    f"which patch {name} pressed: nothing more is pressed on sheet {sheet + 1}; "
+                    f"go on with a fresh one, --sheet {sheet + 2}"
+                )
+            self._report.did.append(f"put {name} aside: it {what}{self._move_aside(self._folder / name)}")
+            if name in self._begins:
+                self._report.lost.append(f"{step_words(self._begins[name])}, whose file {what}")
 
     def _snapshots(self) -> None:
         for name, text in ({} if self._state.opened is None else self._state.opened.snapshots).items():
@@ -239,7 +240,7 @@ class _FolderRepair:
         self._report.did.append(f"wrote {self._final.name} again from the steps' files: {why}{kept}")
 
     def _log(self, event: Event) -> None:
-        self._journal.append(event.t_ns, line_of(event))
+        self._journal.append(event)
         self._state.apply(event)
 
 

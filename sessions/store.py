@@ -33,7 +33,6 @@ from brushloop.sessions.events import (
     StepEvent,
     StepKind,
     StepResult,
-    line_of,
     serial_of,
 )
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, read_header, replay
@@ -195,7 +194,7 @@ class SessionStore:
 
     def _log(self, event: Event) -> None:
         assert self._journal is not None, "the store was released"
-        self._journal.append(event.t_ns, line_of(event))
+        self._journal.append(event)
         self.state.apply(event)
 
     def _check_serials(self) -> None:

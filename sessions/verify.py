@@ -37,6 +37,7 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 
 MARKING = (StepKind.PRESS, StepKind.DRAW, StepKind.SELF_CHECK)
 """Kinds of steps that use patches."""
+UNKNOWN_PATCH = "does not say which patch it pressed, on which sheet"
 
 
 @dataclass(slots=True)
@@ -53,8 +54,6 @@ class Evidence:
     """Id of the session: neither lines nor files of another one are evidence of anything."""
     rebuilt: list[Event] = field(default_factory=list[Event])
     """Events missing from the journal and found in the files."""
-    doubtful: list[str] = field(default_factory=list[str])
-    """Files of attempts whose sheet and patch are unknown."""
     strays: dict[str, str] = field(default_factory=dict[str, str])
     """Files that cannot stand where they are, and why."""
     state: RunState = field(default_factory=RunState)
@@ -189,14 +188,13 @@ def _find_strays(evidence: Evidence) -> None:
     """Tell the files of steps that belong to none, and those that may hide a press on an unknown patch."""
     known = evidence.events()
     begun = {event.file: event for event in known if isinstance(event, Begin)}
-    doubted = {event.file for event in known if isinstance(event, events.Doubt)}
     over = _over(known)
     for name, file in evidence.files.items():
         begin, step_name = begun.get(name.removesuffix(".part")), SEGMENT_NAME.fullmatch(name)
         if step_name is None or (begin is not None and name.endswith(".part")):
             continue
         if begin is None and step_name[2] in MARKING and begun.keys().isdisjoint(step.file for step in steps_in(file)):
-            evidence.doubtful += [] if name in doubted else [name]
+            evidence.strays[name] = UNKNOWN_PATCH
         elif begin is None:
             evidence.strays[name] = "belongs to no step of the session"
         elif evidence.state.attempts[begin.key] == begin.attempt and over.isdisjoint(
@@ -367,8 +365,6 @@ def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
                 verdict.find(JOURNAL_NAME, "does not say how the session was opened")
     for name, what in evidence.strays.items():
         verdict.find(name, what)
-    for name in evidence.doubtful:
-        verdict.find(name, "the patch and the sheet that it pressed are unknown")
 
 
 def _judge_file(

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 
 from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, PressResult, StepKind, StepResult
 from brushloop.sessions.imports import ImportOptions, import_photographs
-from brushloop.sessions.journal import JOURNAL_NAME, encode_line
+from brushloop.sessions.journal import JOURNAL_NAME, seal
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Header, Source, Stroke, Topic
@@ -130,7 +130,7 @@ class Make:
     def rewrite_journal(self, folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
         """Change what lines say, as a program would that knows the format."""
         lines = [change(dict(line)) for line in read_lines(folder / JOURNAL_NAME)]
-        data = [encode_line(line.pop("t_ns"), line, n, self.header.session_id) for n, line in enumerate(lines, 1)]
+        data = [seal({"seq": n, "session": self.header.session_id, **line}) for n, line in enumerate(lines, 1)]
         (folder / JOURNAL_NAME).write_bytes(b"".join(data))
 
     def stroke_names(self, path: Path) -> list[str]:

@@ -408,7 +408,7 @@ def test_a_renamed_session_is_sound_and_every_command_finds_its_recording(make, 
     assert verify_session(copy).sound
     assert repair(copy).did == []
     assert list(summaries(copy.parent)) == [Summary("s1", "closed", "loopback rig", 2, f"{ID}.mcap")]
-    export(copy, tmp_path / "exported", "png")
+    export(copy, tmp_path / "exported", "csv")
     assert {name: data for name, data in make.tree(copy).items() if name != ".lock"} == {
         name: data for name, data in before.items() if name != ".lock"
     }

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from brushloop.sessions.errors import SessionDamaged, SessionError
-from brushloop.sessions.events import Condition, Remark
-from brushloop.sessions.journal import Journal, encode_line, read, replay
+from brushloop.sessions.events import Condition, Remark, parse_event
+from brushloop.sessions.journal import Journal, read, replay, seal
 from brushloop.sessions.recording import REMARKS_NAME, add_remark, remarks_of
 from tests.journal_lines import read_lines
 
@@ -36,7 +36,7 @@ DONE = {
 def written(path, *lines, t_ns=1):
     journal = Journal(path, "s")
     for line in lines:
-        journal.append(t_ns, line)
+        journal.append(parse_event({"t_ns": t_ns, **line}))
     journal.close()
     return path
 
@@ -52,7 +52,7 @@ def test_every_line_is_on_disk_before_append_returns(path, monkeypatch):
     fsync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda fd: (fsync(fd), synced.append(path.read_bytes().count(b"\n"))))
     for _ in range(3):
-        journal.append(1, BEGIN)
+        journal.append(parse_event({"t_ns": 1, **BEGIN}))
     journal.close()
     assert synced == [1, 2, 3]
 
@@ -75,9 +75,9 @@ def test_a_last_line_without_only_its_end_is_a_whole_line(path):
     assert [line["event"] for line in read_lines(path)] == ["begin", "done", "sheet"]
 
 
-LINES = [encode_line(1, {"event": "sheet", "sheet": n}, n, "s") for n in range(1, 13)]
-FOREIGN = encode_line(1, {"event": "sheet", "sheet": 7}, 7, "other")
-BARE = encode_line(1, {"event": "sheet"}, 5, "s")
+LINES = [seal({"seq": n, "session": "s", "t_ns": 1, **{"event": "sheet", "sheet": n}}) for n in range(1, 13)]
+FOREIGN = seal({"seq": 7, "session": "other", "t_ns": 1, **{"event": "sheet", "sheet": 7}})
+BARE = seal({"seq": 5, "session": "s", "t_ns": 1, **{"event": "sheet"}})
 WRONG = "line 5 does not match its CRC"
 
 
@@ -129,7 +129,7 @@ def test_replay_folds_begin_done_void_and_sheet(path):
 
 def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, monkeypatch):
     journal = Journal(path)
-    journal.append(1, BEGIN)
+    journal.append(parse_event({"t_ns": 1, **BEGIN}))
     write = os.write
 
     def half_then_full(fd, data):
@@ -140,9 +140,9 @@ def test_what_does_not_fit_on_the_disk_is_an_error_and_damages_nothing(path, mon
     with monkeypatch.context() as full_disk:
         full_disk.setattr(os, "write", half_then_full)
         with pytest.raises(SessionError, match="cannot write: No space left on device"):
-            journal.append(2, DONE)
+            journal.append(parse_event({"t_ns": 2, **DONE}))
     assert not path.read_bytes().endswith(b"\n"), "the test means to leave half a line"
-    journal.append(3, DONE)
+    journal.append(parse_event({"t_ns": 3, **DONE}))
     journal.close()
     assert [line["t_ns"] for line in read_lines(path)] == [1, 3]
 

@@ -25,7 +25,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate import sources
 from brushloop.calibrate.validate.sources import fetched, open_session
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.events import Open, line_of
+from brushloop.sessions.events import Closed, Open
 from brushloop.sessions.journal import Journal
 from brushloop.sessions.recording import Recording
 from tests.calibrate.given import CALIBRATION
@@ -204,10 +204,10 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
     folder.mkdir()
     (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
     header = Recording(session).header.model_copy(update={"session_id": "presses"})
-    closed = {"event": "closed", "file": "presses.mcap", "sha256": "0" * 64, "counts": {}}
+    closed = Closed(t_ns=1, file="presses.mcap", sha256="0" * 64, counts={})
     journal = Journal(folder / "journal.jsonl", "presses")
-    for line in (line_of(Open(t_ns=1, header=header)), closed):
-        journal.append(1, line)
+    for event in (Open(t_ns=1, header=header), closed):
+        journal.append(event)
     journal.close()
     with pytest.raises(SessionDamaged, match="SHA-256 differs"):
         open_session(str(folder), tmp_path / "work", None, None)
