@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Artefact, Frozen
-from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import apply
 from brushloop.calibrate.board.spec import BoardSpec
 
@@ -46,7 +46,7 @@ class Calibration(Artefact):
     corners_dropped: int
     """Outliers: seen, but not on the plane of the others."""
     preprocess: dict[str, float]
-    lens: LensUsed
+    lens: Lens
     """Lens by which photographs are undistorted first."""
     middle_px: tuple[float, float]
     """Pixel at which `mm_per_px` holds, in the photograph as it was taken."""
@@ -64,11 +64,11 @@ class Calibration(Artefact):
     def to_image(self, paper_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
         undistorted = apply(np.asarray(np.linalg.inv(self.homography()), np.float64), paper_mm)
-        return self.lens.lens().distorted(undistorted)
+        return self.lens.distorted(undistorted)
 
     def to_paper(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
-        return apply(self.homography(), self.lens.lens().undistorted(pixels))
+        return apply(self.homography(), self.lens.undistorted(pixels))
 
     @property
     def named(self) -> str:

@@ -36,8 +36,7 @@ def board(
     page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
 ) -> None:
     """Write a printable board as a PDF at true scale, with a ruler to check the print."""
-    from brushloop.calibrate.board.pdf import write_pdf
-    from brushloop.calibrate.board.spec import describe
+    from brushloop.calibrate.board.spec import describe, write_pdf
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     say(f"{write_pdf(made, out, page)}: {describe(made)}")
@@ -58,9 +57,8 @@ def intrinsics(
     import hashlib
 
     from brushloop.calibrate.artefact import made_by
-    from brushloop.calibrate.board.artefact import lens_file
     from brushloop.calibrate.board.detect import BoardView, find_board
-    from brushloop.calibrate.board.intrinsics import fit_lens, named
+    from brushloop.calibrate.board.intrinsics import fit_lens, lens_file, named
     from brushloop.calibrate.board.spec import describe
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
@@ -81,26 +79,25 @@ def intrinsics(
                 seen.append(find_board(image, made, name))
             except CalibrationError as error:
                 unusable[name] = error.what
-    fitted = fit_lens(seen, limit_px, unusable)
-    file = lens_file(fitted, describe(made), digests, limit_px, made_by())
+    file = lens_file(fit_lens(seen, limit_px, unusable), describe(made), digests, limit_px, made_by())
     for name, residual in file.residuals_px.items():
-        say(f"{name}: {residual:.3f} px, slanted by {fitted.slants_deg[name]:.0f} deg")
+        say(f"{name}: {residual:.3f} px, slanted by {file.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
         say(f"{name}: {residual:.3f} px, dropped: it does not fit the others")
     for name, why in file.unusable.items():
         say(f"{name}: {why}")
-    fx, fy, cx, cy = file.matrix
-    reach = fitted.focal_reach_px
+    fx, fy, cx, cy = file.lens.matrix
+    reach = file.focal_reach_px
     across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
     say(
         f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
-        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.distortion[0]:+.4f}",
-        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {fitted.ways} ways",
+        f"centre {cx:.1f}, {cy:.1f} px, k1 {file.lens.distortion[0]:+.4f}",
+        f"residual {file.rms_px:.3f} px over {len(file.residuals_px)} views, the board held in {file.ways} ways",
     )
     for line in (*(f"warning: {w}" for w in file.warnings), *(f"to do: {g}" for g in file.guidance)):
         say(line)
     path = file.save(out)
-    say(str(path), f"Page: {write_lens_page(path, file, fitted, seen, small)}")
+    say(str(path), f"Page: {write_lens_page(path, file, seen, small)}")
 
 
 @app.command()
@@ -115,7 +112,7 @@ def check(
 ) -> None:
     """Measure pix2len with its interval on one photograph of the board before a session. Exit code 5 on warnings."""
     from brushloop.calibrate.artefact import load_artefact
-    from brushloop.calibrate.board.artefact import LensFile
+    from brushloop.calibrate.board.intrinsics import LensFile
     from brushloop.calibrate.board.spec import BoardSpec
     from brushloop.calibrate.board.view import preflight
     from brushloop.calibrate.files import read_gray
@@ -126,7 +123,7 @@ def check(
     low, high = plane.interval_mm_per_px
     say(
         f"pix2len {plane.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), residual {plane.rms_px:.3f} px over "
-        f"{plane.corners} corners, k1 {float(plane.lens.distortion[0]):+.4f}"
+        f"{plane.corners} corners, k1 {plane.lens.distortion[0]:+.4f}"
     )
     for warning in warnings:
         say(f"warning: {warning}")
@@ -140,14 +137,14 @@ def drift(
     lens: LensOption = None,
 ) -> None:
     """Show pix2len at each view of the board in a session, and its trend. Exit code 5 on warnings."""
-    from brushloop.calibrate.board.session import board_of, board_over_session, known_lens
+    from brushloop.calibrate.board.view import board_of, board_over_session, known_lens
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
 
     recording = Recording(session)
     known = known_lens(recording, lens)
     with shown() as progress:
-        found = board_over_session(recording, board_of(recording), known.lens() if known else None, progress)
+        found = board_over_session(recording, board_of(recording), known, progress)
     for seen in found.seen:
         low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
         after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
@@ -187,10 +184,9 @@ def register(
     import hashlib
 
     from brushloop.calibrate.artefact import made_by
-    from brushloop.calibrate.board.artefact import read_lens, registration_file
-    from brushloop.calibrate.board.register import read_points
+    from brushloop.calibrate.board.intrinsics import read_lens
+    from brushloop.calibrate.board.register import PaperLines, RegistrationFile, read_points, read_rig
     from brushloop.calibrate.board.register import register as fit
-    from brushloop.calibrate.board.rig_file import PaperLines, read_rig
     from brushloop.calibrate.board.spec import BoardSpec
     from brushloop.calibrate.board.view import calibration_plane
     from brushloop.calibrate.errors import CalibrationError
@@ -211,15 +207,17 @@ def register(
     points = read_points(table)
     lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None
-    plane = calibration_plane(read_gray(photograph), spec, known.lens() if known else None, str(photograph))
+    plane = calibration_plane(read_gray(photograph), spec, known, str(photograph))
     fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px))
-    for name, (dx, dy) in zip(fitted.names, fitted.residuals_mm.tolist(), strict=True):
-        out_of_it = ", dropped: it does not fit the others" if name in fitted.dropped else ""
-        say(f"{name}: {dx:+.3f}, {dy:+.3f} mm{out_of_it}")
+    for name, (dx, dy) in fitted.residuals_mm.items():
+        say(f"{name}: {dx:+.3f}, {dy:+.3f} mm")
+    for name, (dx, dy) in fitted.dropped.items():
+        say(f"{name}: {dx:+.3f}, {dy:+.3f} mm, dropped: it does not fit the others")
     seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
     through = known.source if known else "no lens"
     source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
-    file = registration_file(fitted, spec.origin_mm, source, made_by())
+    about = {"board_origin_mm": spec.origin_mm, "source": source, "software": made_by()}
+    file = RegistrationFile.model_validate(dict(fitted) | about)
     for flag in plane.flags:
         say(f"warning: {flag}")
     say(

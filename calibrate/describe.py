@@ -10,7 +10,8 @@ from typing import Any, cast
 import numpy as np
 
 from brushloop.calibrate.artefact import Artefact, current, load_artefact
-from brushloop.calibrate.board.artefact import LensFile, RegistrationFile
+from brushloop.calibrate.board.intrinsics import LensFile
+from brushloop.calibrate.board.register import RegistrationFile
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded

@@ -10,9 +10,17 @@ from typing import Literal
 
 from brushloop.calibrate.artefact import current, load_artefact, made_by, put_to_use
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import LensUsed, rms
-from brushloop.calibrate.board.session import NO_BOARD, board_of, board_stills, known_lens, lens_of_session, sheet_of
-from brushloop.calibrate.board.view import calibration_plane, paper_mm
+from brushloop.calibrate.board.lens import Lens, rms
+from brushloop.calibrate.board.view import (
+    NO_BOARD,
+    board_of,
+    board_stills,
+    calibration_plane,
+    known_lens,
+    lens_of_session,
+    paper_mm,
+    sheet_of,
+)
 from brushloop.calibrate.calibration import Calibration, Foreign
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.store import FOLDER as FINISHED
@@ -89,7 +97,7 @@ def calibrate_session(session: Path, lens: Path | None = None, progress: Progres
     progress(STEPS, 1, 3)
     if not stills:
         raise CalibrationError(where, NO_BOARD)
-    image, given = decode_gray(stills[-1], where), known.lens() if known else None
+    image, given = decode_gray(stills[-1], where), known
     plane = calibration_plane(image, spec, given, where, sheet_of(recording))
     progress(STEPS, 2, 3)
     low, high = plane.interval_mm_per_px
@@ -106,7 +114,7 @@ def calibrate_session(session: Path, lens: Path | None = None, progress: Progres
         corners=plane.corners,
         corners_dropped=len(plane.dropped),
         preprocess=dataclasses.asdict(Params()),
-        lens=LensUsed.of(plane.lens, known.source if known else FITTED),
+        lens=plane.lens if known else plane.lens.model_copy(update={"source": FITTED}),
         middle_px=plane.middle_px,
         board=spec,
         flags=plane.flags,
@@ -155,7 +163,7 @@ def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path
     return calibration
 
 
-def lens_in_use(folder: Path) -> LensUsed | None:
+def lens_in_use(folder: Path) -> Lens | None:
     """The lens of the calibration that a session uses, else the one that it was collected with.
 
     Raises `CalibrationError`.
@@ -189,7 +197,7 @@ def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
     spec, where = board_of(recording), str(recording.path)
     off_mm: float | None = None
     for _, image in board_stills(recording):
-        given.lens.lens().check_size(image, where)
+        given.lens.check_size(image, where)
         try:
             view = find_board(image, spec, where)
         except CalibrationError:

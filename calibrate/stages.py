@@ -107,9 +107,7 @@ def trace_capture(capture: Capture, calibration: Calibration | None, where: str)
     found = {"pix2len_mm_per_px": calibration.mm_per_px, "rms_px": calibration.rms_px}
     before = (
         _captured(image),
-        Stage(
-            "undistort", calibration.lens.lens().undistort(image), {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
-        ),
+        Stage("undistort", calibration.lens.undistort(image), {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}),
         Stage("rectify", raster, SCALE | found),
     )
     return _traced(raster, steps, where, Params.of(calibration), before)

@@ -1,15 +1,17 @@
-"""Intrinsics of a camera from photographs of a board: what each photograph contributes, and which do not fit."""
+"""Intrinsics of a camera from photographs of a board: what each contributes, which do not fit, and the lens file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.artefact import Artefact, Frozen, load_artefact
 from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.lens import Floats, Lens, unknown_lens
 from brushloop.calibrate.board.pix2len import homography
@@ -74,7 +76,7 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
     except cv2.error as error:
         raise CalibrationError(where, f"no lens explains these views: {error.err}") from None
     return Solved(
-        Lens(np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).ravel()[:5], size),
+        Lens.of_opencv(matrix, distortion, size),
         float(rms),
         np.asarray(per_view, np.float64).ravel(),
         tuple(np.asarray(turn, np.float64) for turn in turns),
@@ -89,15 +91,14 @@ def _flat(view: BoardView) -> Floats:
 
 def residuals(lens: Lens, view: BoardView) -> Floats:
     """(n, 2) px from where the lens puts each corner to where it was found, at the pose of the board that fits best."""
-    board = _flat(view)
-    _, turn, shift = cv2.solvePnP(board, view.pixels, lens.matrix, lens.distortion)
-    turn, shift = cv2.solvePnPRefineLM(board, view.pixels, lens.matrix, lens.distortion, turn, shift)
-    seen, _ = cv2.projectPoints(board, turn, shift, lens.matrix, lens.distortion)
+    board, optics = _flat(view), (lens.camera, lens.coefficients)
+    _, turn, shift = cv2.solvePnP(board, view.pixels, *optics)
+    turn, shift = cv2.solvePnPRefineLM(board, view.pixels, *optics, turn, shift)
+    seen, _ = cv2.projectPoints(board, turn, shift, *optics)
     return view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)
 
 
-@dataclass(frozen=True, slots=True)
-class Fitted:
+class LensFit(Frozen):
     """A lens, its uncertainty, and how well it explains each photograph."""
 
     lens: Lens
@@ -129,11 +130,35 @@ class Fitted:
         return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
 
 
+class LensFile(LensFit, Artefact):
+    """Intrinsics on disk, with everything that is needed to judge them."""
+
+    schema_version: Literal[3] = 3
+    software: str
+    photographs: dict[str, str]
+    """Name of every photograph that was given, and the sha256 of its bytes."""
+    board: str
+    """Description: kind, size in squares or corners, mm."""
+    rms_limit_px: float
+
+
+def lens_file(fitted: LensFit, board: str, photographs: dict[str, str], rms_limit_px: float, software: str) -> LensFile:
+    """The artefact of a fitted lens."""
+    about = {"software": software, "photographs": photographs, "board": board, "rms_limit_px": rms_limit_px}
+    return LensFile.model_validate(dict(fitted) | about)
+
+
+def read_lens(path: Path) -> Lens:
+    """Read a lens file written by `camera intrinsics`. Raises `CalibrationError`."""
+    file = load_artefact(path, LensFile)
+    return file.lens.model_copy(update={"source": f"lens file {file.digest}"})
+
+
 def fit_lens(
     views: Sequence[BoardView],
     rms_limit_px: float = RMS_LIMIT_PX,
     unusable: Mapping[str, str] | None = None,
-) -> Fitted:
+) -> LensFit:
     """Fit a lens by Zhang's method to the views that fit together; `unusable` says why other photographs have no view.
 
     Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of several sizes.
@@ -167,17 +192,17 @@ def fit_lens(
     if solved.rms_px > rms_limit_px:
         exceeds = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px"
         warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
-    return Fitted(
-        solved.lens,
-        _focal(kept, ways, where),
-        int(ways.max()) + 1,
-        solved.rms_px,
-        {view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
-        dropped,
-        left_out,
-        slants,
-        guidance(kept, list(slants.values()), int(ways.max()) + 1),
-        tuple(warnings),
+    return LensFit(
+        lens=solved.lens,
+        focal_se_px=_focal(kept, ways, where),
+        ways=int(ways.max()) + 1,
+        rms_px=solved.rms_px,
+        residuals_px={view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
+        dropped=dropped,
+        unusable=left_out,
+        slants_deg=slants,
+        guidance=guidance(kept, list(slants.values()), int(ways.max()) + 1),
+        warnings=tuple(warnings),
     )
 
 
@@ -200,7 +225,7 @@ def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, f
     count = min(int(ways.max()) + 1, MOST_LEFT_OUT)
     left_out = (ways % count).tolist()
     without = [solve([v for v, out in zip(views, left_out, strict=True) if out != k], where) for k in range(count)]
-    focal = np.array([[one.lens.matrix[0, 0], one.lens.matrix[1, 1]] for one in without])
+    focal = np.array([one.lens.matrix[:2] for one in without])
     spread = np.sqrt((count - 1) / count * ((focal - focal.mean(axis=0)) ** 2).sum(axis=0))
     return float(spread[0]), float(spread[1])
 
@@ -271,7 +296,7 @@ def nominal_normals(views: Sequence[BoardView]) -> Floats:
 
     They are rough, but a lens that was wrongly fitted to boards of one orientation cannot make them differ.
     """
-    rays = np.linalg.inv(unknown_lens(views[0].size_px).matrix)
+    rays = np.linalg.inv(unknown_lens(views[0].size_px).camera)
     found = list[Floats]()
     for view in views:
         across, along, _ = (rays @ homography(view.board_mm, view.pixels, view.name)).T

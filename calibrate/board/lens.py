@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import cast
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError
@@ -17,16 +16,36 @@ Floats = NDArray[np.float64]
 ROUNDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
 
 
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """Camera matrix and distortion of one camera at one focus and one image size."""
+class Lens(Frozen):
+    """Camera matrix and distortion of one camera at one focus and one image size, in files as in calculations."""
 
-    matrix: Floats
-    """(3, 3) in pixels, pixel centres on integers."""
-    distortion: Floats
-    """(5,) k1, k2, p1, p2, k3."""
+    source: str = ""
+    """`lens file <hash>`, or `k1 fitted on the board` where no lens file was given and none was needed."""
     size_px: tuple[int, int]
-    """Width and height."""
+    """Width and height of the photographs that it applies to."""
+    matrix: tuple[float, float, float, float]
+    """fx, fy, cx, cy in pixels, pixel centres on integers."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3 of OpenCV's model."""
+
+    @classmethod
+    def of_opencv(cls, camera: ArrayLike, distortion: ArrayLike, size_px: tuple[int, int]) -> Lens:
+        """A lens from OpenCV's (3, 3) camera matrix and its coefficients, of which the first five count."""
+        m = np.asarray(camera, np.float64)
+        k1, k2, p1, p2, k3 = np.asarray(distortion, np.float64).ravel()[:5].tolist()
+        matrix = (float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2]))
+        return cls(size_px=size_px, matrix=matrix, distortion=(k1, k2, p1, p2, k3))
+
+    @property
+    def camera(self) -> Floats:
+        """OpenCV's camera matrix, (3, 3)."""
+        fx, fy, cx, cy = self.matrix
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def coefficients(self) -> Floats:
+        """OpenCV's distortion coefficients, (5,)."""
+        return np.array(self.distortion)
 
     def check_size(self, image: Gray, where: str) -> None:
         """Raise `CalibrationError` for an (h, w) photograph of another size: the lens does not apply to it."""
@@ -37,58 +56,18 @@ class Lens:
 
     def undistorted(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of a photograph -> where they lie in the undistorted one."""
-        none = np.eye(3)
-        found = cv2.undistortPointsIter(
-            pixels.reshape(-1, 1, 2).astype(np.float64), self.matrix, self.distortion, none, self.matrix, ROUNDS
-        )
-        return np.asarray(found, np.float64).reshape(-1, 2)
+        points, camera = pixels.reshape(-1, 1, 2).astype(np.float64), self.camera
+        flat = cv2.undistortPointsIter(points, camera, self.coefficients, np.eye(3), camera, ROUNDS)
+        return np.asarray(flat, np.float64).reshape(-1, 2)
 
     def distorted(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of the undistorted photograph -> where they lie in the photograph as it was taken."""
-        focal, centre = np.array([self.matrix[0, 0], self.matrix[1, 1]]), self.matrix[:2, 2]
-        return distort((pixels - centre) / focal, self.distortion) * focal + centre
+        focal, centre = np.array(self.matrix[:2]), np.array(self.matrix[2:])
+        return distort((pixels - centre) / focal, self.coefficients) * focal + centre
 
     def undistort(self, image: Gray) -> Gray:
         """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
-        return cast("Gray", cv2.undistort(image, self.matrix, self.distortion))
-
-
-def lens_of(
-    matrix: tuple[float, float, float, float],
-    distortion: tuple[float, float, float, float, float],
-    size_px: tuple[int, int],
-) -> Lens:
-    """A lens from the numbers in files: fx, fy, cx, cy in pixels; k1, k2, p1, p2, k3; width and height."""
-    fx, fy, cx, cy = matrix
-    return Lens(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), np.array(distortion), size_px)
-
-
-class LensUsed(Frozen):
-    """The lens by which photographs are undistorted, as files store it, and its source."""
-
-    source: str
-    """`lens file <hash>`, or `k1 fitted on the board` where no lens file was given and none was needed."""
-    size_px: tuple[int, int]
-    """Width and height of the photographs that it applies to."""
-    matrix: tuple[float, float, float, float]
-    """fx, fy, cx, cy in pixels, pixel centres on integers."""
-    distortion: tuple[float, float, float, float, float]
-    """k1, k2, p1, p2, k3 of OpenCV's model."""
-
-    def lens(self) -> Lens:
-        """The lens to compute with."""
-        return lens_of(self.matrix, self.distortion, self.size_px)
-
-    @classmethod
-    def of(cls, lens: Lens, source: str) -> LensUsed:
-        """The file form of a lens."""
-        m, d = lens.matrix, [float(v) for v in lens.distortion]
-        return cls(
-            source=source,
-            size_px=lens.size_px,
-            matrix=(float(m[0, 0]), float(m[1, 1]), float(m[0, 2]), float(m[1, 2])),
-            distortion=(d[0], d[1], d[2], d[3], d[4]),
-        )
+        return cast("Gray", cv2.undistort(image, self.camera, self.coefficients))
 
 
 def distort(rays: Floats, distortion: Floats) -> Floats:
@@ -110,6 +89,6 @@ def rms(residuals: Floats) -> float:
 def unknown_lens(size_px: tuple[int, int]) -> Lens:
     """Lens assumed without intrinsics: no distortion, axis in the middle, focal length of one image width."""
     width, height = size_px
-    focal = float(max(width, height))
-    matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
-    return Lens(matrix, np.zeros(5), size_px)
+    focal = float(max(size_px))
+    matrix = (focal, focal, (width - 1) / 2, (height - 1) / 2)
+    return Lens(size_px=size_px, matrix=matrix, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -227,15 +227,14 @@ class _Model:
         return self._lens(theta), np.asarray(image_to_paper / image_to_paper[2, 2], np.float64)
 
     def _lens(self, theta: Floats) -> Lens:
-        distortion = self.lens.distortion.copy()
-        distortion[: self.radial_terms] = theta[8:]
-        return replace(self.lens, distortion=distortion)
+        distortion = (*theta[8:].tolist(), *self.lens.distortion[self.radial_terms :])
+        return self.lens.model_copy(update={"distortion": distortion})
 
     def _matrix(self, theta: Floats) -> Floats:
         return np.append(theta[:8], 1.0).reshape(3, 3)
 
     def _rays(self) -> Floats:
-        return np.asarray(np.linalg.inv(self.lens.matrix), np.float64)
+        return np.asarray(np.linalg.inv(self.lens.camera), np.float64)
 
     def _from_unit(self) -> Floats:
         s, (x, y) = self.length_mm, self.middle_mm

@@ -1,4 +1,8 @@
-"""Register the robot to the paper, from marks that it touched or pressed and that the camera saw."""
+"""Register the robot to the paper, from marks that it touched or pressed and that the camera saw.
+
+Where the paper lies is written into `rig.toml`: only two values change in the text. Comments, order and everything else
+stay, and the old file is kept beside it.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +10,22 @@ import csv
 import hashlib
 import io
 import itertools
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal, cast
 
 import numpy as np
+import tomlkit
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
+from brushloop.calibrate.artefact import Artefact, Frozen
 from brushloop.calibrate.board.lens import Floats, rms
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import read_bounded
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import read_bounded, write_whole
 from brushloop.sessions.disk import number
 
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")
@@ -29,47 +39,37 @@ MIXED_UP_MM, EXPLAINED = 3.0, 0.2
 """A misfit is taken for mixed names only above this, and if they explain all but this share of it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Registration:
+class Registration(Frozen):
     """The place and turn of the paper frame in the robot's base frame, both in mm."""
 
-    matrix: Floats
-    """(2, 3)."""
-    names: tuple[str, ...]
-    residuals_mm: Floats
-    """(n, 2) seen minus predicted, of every point including dropped ones."""
-    dropped: tuple[str, ...]
+    robot_to_paper: tuple[float, float, float, float, float, float]
+    """(2, 3) row by row: mm in the base frame to mm in the paper frame."""
+    origin_mm: tuple[float, float]
+    """Origin of the paper frame in the base frame, as in `paper.origin_mm`."""
+    yaw_deg: float
+    """Yaw of the paper frame in the base frame, counter-clockwise from base x to paper x, as in `paper.yaw_deg`."""
     rms_mm: float
-    left_out_mm: Floats
-    """(n, 2) seen minus predicted by the other kept points."""
+    left_out_rms_mm: float
+    """Root mean square error of the kept points, each predicted by the others: what to expect of a new point."""
+    residuals_mm: dict[str, tuple[float, float]]
+    """Seen minus predicted, of each kept point."""
+    dropped: dict[str, tuple[float, float]]
 
     @property
-    def left_out_rms_mm(self) -> float:
-        """Root mean square error of the kept points, each predicted by the others: what to expect of a new point."""
-        kept = np.array([name not in self.dropped for name in self.names])
-        return rms(self.left_out_mm[kept])
+    def matrix(self) -> Floats:
+        """`robot_to_paper` as (2, 3)."""
+        return np.array(self.robot_to_paper).reshape(2, 3)
 
-    @property
-    def yaw_deg(self) -> float:
-        """Yaw of the paper frame in the base frame, counter-clockwise from base x to paper x, as in `paper.yaw_deg`.
 
-        The transformation from the base frame to the paper frame turns points the other way.
-        """
-        return float(np.degrees(np.arctan2(-self.matrix[1, 0], self.matrix[0, 0])))
+class RegistrationFile(Registration, Artefact):
+    """A registration on disk, and what it was made from."""
 
-    @property
-    def origin_mm(self) -> tuple[float, float]:
-        """Origin of the paper frame in the base frame, as in `paper.origin_mm`."""
-        x, y = self.to_robot(np.zeros((1, 2)))[0]
-        return float(x), float(y)
-
-    def to_paper(self, robot_mm: Floats) -> Floats:
-        """(n, 2) points in the base frame -> in the paper frame."""
-        return robot_mm @ self.matrix[:, :2].T + self.matrix[:, 2]
-
-    def to_robot(self, paper_mm: Floats) -> Floats:
-        """(n, 2) points in the paper frame -> in the base frame."""
-        return (paper_mm - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
+    schema_version: Literal[4] = 4
+    software: str
+    source: str
+    """The table of points, or the session, and its sha256."""
+    board_origin_mm: tuple[float, float]
+    """Lower left corner of the board in the paper frame, as it was assumed."""
 
 
 def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> Registration:
@@ -95,18 +95,24 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> Registr
     if rms(residuals[kept]) > WORST_RMS_MM:
         problem = f"{rms(residuals[kept]):.1f} mm off on average, allowed {WORST_RMS_MM:g}: are their names mixed up?"
         raise CalibrationError(where, problem)
-    left_out = residuals.copy()
+    left_out: list[Floats] = []
     for index in np.flatnonzero(kept):
         others = kept.copy()
         others[index] = False
-        left_out[index] = seen_mm[index] - _apply(_fit(robot_mm[others], seen_mm[others]), robot_mm[[index]])[0]
+        alone = _fit(robot_mm[others], seen_mm[others])
+        left_out.append(seen_mm[index] - _apply(alone, robot_mm[[index]])[0])
+    each = {name: (float(x), float(y)) for name, (x, y) in zip(names, residuals, strict=True)}
+    a, b, x, c, d, y = (float(v) for v in matrix.ravel())
+    origin = -matrix[:, 2] @ np.linalg.inv(matrix[:, :2]).T
     return Registration(
-        matrix,
-        tuple(names),
-        residuals,
-        tuple(name for name, keep in zip(names, kept, strict=True) if not keep),
-        rms(residuals[kept]),
-        left_out,
+        robot_to_paper=(a, b, x, c, d, y),
+        origin_mm=(float(origin[0]), float(origin[1])),
+        # The transformation from the base frame to the paper frame turns points the other way.
+        yaw_deg=float(np.degrees(np.arctan2(-c, a))),
+        rms_mm=rms(residuals[kept]),
+        left_out_rms_mm=rms(np.array(left_out)),
+        residuals_mm={name: each[name] for name, keep in zip(names, kept, strict=True) if keep},
+        dropped={name: each[name] for name, keep in zip(names, kept, strict=True) if not keep},
     )
 
 
@@ -209,3 +215,83 @@ def _number(table: Path, line: int, name: str, text: str | None) -> float:
         return number(text or "")
     except ValueError as error:
         raise CalibrationError(str(table), f"line {line}, column `{name}`: {error}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class PaperLines:
+    """Where the sheet lies, as two lines of `[paper]`."""
+
+    origin_mm: tuple[float, float]
+    """Lower left corner of the sheet in the base frame."""
+    yaw_deg: float
+    """From base x to paper x, counter-clockwise."""
+
+    @property
+    def values(self) -> dict[str, list[float] | float]:
+        """Each field and its value, rounded to 0.001 mm and 0.0001 deg."""
+        # Adding 0 turns -0.0 into 0.0.
+        return {"origin_mm": [round(v, 3) + 0.0 for v in self.origin_mm], "yaw_deg": round(self.yaw_deg, 4) + 0.0}
+
+    @property
+    def toml(self) -> str:
+        """The lines to paste into rig.toml."""
+        return "\n".join(f"{name} = {value}" for name, value in self.values.items())
+
+
+@dataclass(frozen=True, slots=True)
+class RigFile:
+    """A rig's configuration as text, with the board and the lens file that it names."""
+
+    path: Path
+    text: str
+    board: BoardSpec
+    lens_file: Path | None
+
+    def with_paper(self, lines: PaperLines) -> str:
+        """The text with these two values. Raises `CalibrationError` where there is no table `paper` to hold them."""
+        document: Any = tomlkit.parse(self.text)
+        if not isinstance(document.get("paper"), dict):
+            what = "paper: is not a table; nothing is written. Enter by hand: " + ", ".join(lines.toml.splitlines())
+            raise CalibrationError(str(self.path), what)
+        for name, value in lines.values.items():
+            document["paper"][name] = value
+        return tomlkit.dumps(document)
+
+    def write(self, lines: PaperLines) -> Path:
+        """Write these two values; returns the path of the old file. Raises `CalibrationError` and OSError."""
+        made = self.with_paper(lines)
+        kept = free_name(self.path)
+        with kept.open("xb") as file:
+            file.write(self.text.encode())
+        write_whole(self.path.resolve(), made)
+        return kept
+
+
+def read_rig(path: Path) -> RigFile:
+    """Read a rig's configuration. Raises `CalibrationError` that names file and field."""
+    try:
+        text = read_bounded(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise CalibrationError(str(path), f"is not UTF-8 at byte {error.start}") from None
+    try:
+        tables = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
+        raise CalibrationError(str(path), f"is not TOML: {error}") from None
+    try:
+        board = BoardSpec.model_validate(tables.get("board"))
+    except ValidationError as error:
+        if "board" not in tables:
+            raise CalibrationError(str(path), "[board] is missing") from None
+        raise invalid(str(path), error, "board") from None
+    camera = tables.get("camera")
+    lens = cast("dict[str, Any]", camera).get("lens_file") if isinstance(camera, dict) else None
+    return RigFile(path, text, board, path.parent / lens if isinstance(lens, str) else None)
+
+
+def free_name(path: Path) -> Path:
+    """An unused name beside the file."""
+    number, kept = 1, path.with_name(f"{path.name}.bak")
+    while kept.exists() or kept.is_symlink():
+        number += 1
+        kept = path.with_name(f"{path.name}.bak-{number}")
+    return kept

@@ -1,17 +1,29 @@
-"""The boards that a camera is calibrated with: ChArUco boards and plain checkerboards."""
+"""The boards that a camera is calibrated with, ChArUco boards and plain checkerboards, and their printable PDF."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import cv2
+import numpy as np
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import check_target
 
 Corners = Annotated[int, Field(ge=3, le=60)]
 Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+
+
+MM_PER_INCH = 25.4
+PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "letter": (215.9, 279.4)}
+MARGIN_MM = 8.0
+RULER_MM = 100.0
+RULER_ROOM_MM = 14.0
+Rectangle = tuple[float, float, float, float]
+"""x, y, width, height in mm, y down from the page's upper edge."""
 
 
 class BoardSpec(Frozen):
@@ -70,3 +82,88 @@ def charuco_board(spec: BoardSpec, where: str) -> cv2.aruco.CharucoBoard:
         return cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)
     except cv2.error as error:
         raise CalibrationError(where, f"the board cannot be made: {error}") from None
+
+
+def write_pdf(board: Board, path: Path, page: str = "a4") -> Path:
+    """Write the board on one page, turned if it only fits that way.
+
+    Raises `CalibrationError` if it does not fit, or if `path` is not that of a PDF: no other file is overwritten.
+    """
+    check_target(path, ".pdf")
+    if not path.parent.is_dir():
+        raise CalibrationError(str(path), f"there is no folder {path.parent}")
+    if path.exists() and not (path.is_file() and path.read_bytes().startswith(b"%PDF")):
+        raise CalibrationError(str(path), "exists and is not a PDF; it is not overwritten")
+    drawn(board, page).savefig(path, format="pdf", metadata={"CreationDate": None})
+    return path
+
+
+def rectangles(board: Board) -> list[Rectangle]:
+    """The black rectangles, x right and y down in mm from the board's upper left corner."""
+    if isinstance(board, Checkerboard):
+        columns, rows = (n + 1 for n in board.inner_corners)
+        return _squares(columns, rows, board.square_mm)
+    made = charuco_board(board, "board")
+    dictionary = made.getDictionary()
+    black = _squares(*board.squares, board.square_mm)
+    for number, corners in zip(np.ravel(made.getIds()), made.getObjPoints(), strict=True):
+        left, top = (float(v) for v in np.asarray(corners)[0, :2])
+        side = dictionary.markerSize + 2
+        bits = dictionary.generateImageMarker(int(number), side)
+        bit_mm = board.marker_mm / side
+        for row in range(side):
+            for start, end in _runs(np.asarray(bits)[row] == 0):
+                black.append((left + start * bit_mm, top + row * bit_mm, (end - start) * bit_mm, bit_mm))
+    return black
+
+
+def _page(board: Board, page: str) -> tuple[float, float]:
+    if page not in PAGES_MM:
+        raise CalibrationError(f"page {page!r}", f"is not one of {', '.join(PAGES_MM)}")
+    width, height = size_mm(board)
+    upright = PAGES_MM[page]
+    for page_mm in (upright, (upright[1], upright[0])):
+        if width + 2 * MARGIN_MM <= page_mm[0] and height + 2 * MARGIN_MM + RULER_ROOM_MM <= page_mm[1]:
+            return page_mm
+    raise CalibrationError(
+        f"page {page}",
+        f"has no room for a board of {width:g} x {height:g} mm with {MARGIN_MM:g} mm around it and a ruler below",
+    )
+
+
+def drawn(board: Board, page: str) -> Any:
+    """The page with board and ruler, a matplotlib figure. Raises `CalibrationError` if the board does not fit."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle as Patch
+    from matplotlib.transforms import Affine2D
+
+    page_mm = _page(board, page)
+    width, height = size_mm(board)
+    left, top = (page_mm[0] - width) / 2.0, (page_mm[1] - height - RULER_ROOM_MM) / 2.0
+    black = [(left + x, top + y, w, h) for x, y, w, h in rectangles(board)]
+    below = top + height + 5.0
+    ruler_mm = min(RULER_MM, width // 10.0 * 10.0)
+    black.append((left, below, ruler_mm, 0.2))
+    black += [
+        (left + at - 0.1, below, 0.2, 3.0 if at % 50 == 0 else 2.0) for at in np.arange(0.0, ruler_mm + 1.0, 10.0)
+    ]
+    figure: Any = Figure(figsize=(page_mm[0] / MM_PER_INCH, page_mm[1] / MM_PER_INCH))
+    # From mm with y down to inches with y up.
+    from_mm = Affine2D().translate(0.0, -page_mm[1]).scale(1.0 / MM_PER_INCH, -1.0 / MM_PER_INCH)
+    patches = [Patch((x, y), w, h) for x, y, w, h in black]
+    figure.add_artist(
+        PatchCollection(patches, color="black", linewidth=0.0, transform=from_mm + figure.dpi_scale_trans)
+    )
+    words = f"{describe(board)}. Print at 100 %; the line is {ruler_mm:g} mm long."
+    figure.text(left / page_mm[0], 1.0 - (below + 6.5) / page_mm[1], words, fontsize=7.0)
+    return figure
+
+
+def _squares(columns: int, rows: int, side: float) -> list[Rectangle]:
+    return [(c * side, r * side, side, side) for r in range(rows) for c in range(columns) if (c + r) % 2 == 0]
+
+
+def _runs(black: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], black, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

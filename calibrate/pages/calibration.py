@@ -15,9 +15,8 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX
 from brushloop.calibrate.board.lens import Floats, Gray, rms
 from brushloop.calibrate.board.pix2len import local_scale
-from brushloop.calibrate.board.session import NO_BOARD, sheet_of
 from brushloop.calibrate.board.spec import BoardSpec, describe
-from brushloop.calibrate.board.view import LEAST_PX_PER_MM, WORST_INTERVAL, paper_mm
+from brushloop.calibrate.board.view import LEAST_PX_PER_MM, NO_BOARD, WORST_INTERVAL, paper_mm, sheet_of
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.board.artefact import LensFile
 from brushloop.calibrate.board.detect import BoardView
-from brushloop.calibrate.board.intrinsics import GRID, GRID_WORDS, Fitted, residuals
+from brushloop.calibrate.board.intrinsics import GRID, GRID_WORDS, LensFile, residuals
 from brushloop.calibrate.board.lens import Gray, Lens, rms
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, printable, render
@@ -42,7 +41,7 @@ def thumbnail(image: Gray) -> Thumbnail:
 
 
 def write_lens_page(
-    path: Path, file: LensFile, fitted: Fitted, views: Sequence[BoardView], thumbnails: Mapping[str, Thumbnail]
+    path: Path, file: LensFile, views: Sequence[BoardView], thumbnails: Mapping[str, Thumbnail]
 ) -> Path:
     """Write the page of the lens file at `path` beside it; returns the page's path. Raises OSError.
 
@@ -54,12 +53,12 @@ def write_lens_page(
         label=LABEL,
         note=NOTE,
         file=file,
-        coverage=_coverage(file, fitted.lens, kept),
-        verdict=list(_verdict(file, fitted)),
-        trust=list(_trust(file, fitted)),
+        coverage=_coverage(file.lens, kept),
+        verdict=list(_verdict(file)),
+        trust=list(_trust(file)),
         residuals=_residuals(file),
-        bend=_bend(fitted.lens),
-        photographs=list(_photographs(file, fitted, {view.name: view for view in views}, thumbnails)),
+        bend=_bend(file.lens),
+        photographs=list(_photographs(file, {view.name: view for view in views}, thumbnails)),
         not_shown=max(0, len(file.photographs) - MAX_THUMBNAILS),
         facts=list(_facts(file, path)),
     )
@@ -68,9 +67,9 @@ def write_lens_page(
     return page
 
 
-def _coverage(file: LensFile, lens: Lens, kept: Sequence[BoardView]) -> dict[str, Any]:
+def _coverage(lens: Lens, kept: Sequence[BoardView]) -> dict[str, Any]:
     """Corners of all used photographs on the image, and how many lie in each part of it."""
-    width, height = file.size_px
+    width, height = lens.size_px
     seen = np.concatenate([view.pixels for view in kept])
     off = np.concatenate([residuals(lens, view) for view in kept])
     counts, _, _ = np.histogram2d(seen[:, 1], seen[:, 0], bins=(GRID[1], GRID[0]), range=((0, height), (0, width)))
@@ -104,22 +103,22 @@ def _coverage(file: LensFile, lens: Lens, kept: Sequence[BoardView]) -> dict[str
     }
 
 
-def _verdict(file: LensFile, fitted: Fitted) -> Iterator[str]:
-    reach = fitted.focal_reach_px
+def _verdict(file: LensFile) -> Iterator[str]:
+    reach = file.focal_reach_px
     known = "with unknown precision" if reach is None else f"known to ±{reach[0]:.1f} and ±{reach[1]:.1f} px (95 %)"
-    yield f"The focal lengths are {file.matrix[0]:.1f} px across and {file.matrix[1]:.1f} px down, {known}."
+    yield f"The focal lengths are {file.lens.matrix[0]:.1f} px across and {file.lens.matrix[1]:.1f} px down, {known}."
     yield (
-        f"The corners of {len(file.residuals_px)} photographs, which hold the board in {fitted.ways} ways, lie "
+        f"The corners of {len(file.residuals_px)} photographs, which hold the board in {file.ways} ways, lie "
         f"{file.rms_px:.2f} px from where this lens puts them (root mean square)."
     )
 
 
-def _trust(file: LensFile, fitted: Fitted) -> Iterator[Point]:
+def _trust(file: LensFile) -> Iterator[Point]:
     yield Point(None, f"{NOTE[0].upper()}{NOTE[1:]}: their names and hashes are below.")
     words = f"The residual is {file.rms_px:.2f} px; the limit is {file.rms_limit_px:g} px"
     yield Point(file.rms_px <= file.rms_limit_px, f"{words}; a flat, sharp, still board gives 0.1 to 0.3 px.")
-    if fitted.focal_se_px is None:
-        yield Point(False, f"The board is held in {fitted.ways} ways: too few to say how precisely the lens is known.")
+    if file.focal_se_px is None:
+        yield Point(False, f"The board is held in {file.ways} ways: too few to say how precisely the lens is known.")
     for warning in file.warnings:
         yield Point(False, f"{warning[0].upper()}{warning[1:]}.")
     for advice in file.guidance:
@@ -152,7 +151,7 @@ def _short(name: str) -> str:
 def _bend(lens: Lens) -> str:
     """How far the lens moves a point, from the middle to the farthest corner of the image."""
     width, height = lens.size_px
-    centre = lens.matrix[:2, 2]
+    centre = np.array(lens.matrix[2:])
     corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
     far = corners[np.argmax(np.linalg.norm(corners - centre, axis=1))]
     share = np.linspace(0.0, 1.0, CURVE_POINTS)[:, None]
@@ -170,14 +169,14 @@ def _bend(lens: Lens) -> str:
 
 
 def _photographs(
-    file: LensFile, fitted: Fitted, views: Mapping[str, BoardView], thumbnails: Mapping[str, Thumbnail]
+    file: LensFile, views: Mapping[str, BoardView], thumbnails: Mapping[str, Thumbnail]
 ) -> Iterator[dict[str, Any]]:
     for name in list(file.photographs)[:MAX_THUMBNAILS]:
         small = thumbnails.get(name)
         if small is None:
             continue
         if name in file.residuals_px:
-            words = f"{file.residuals_px[name]:.2f} px, slanted by {fitted.slants_deg[name]:.0f}°"
+            words = f"{file.residuals_px[name]:.2f} px, slanted by {file.slants_deg[name]:.0f}°"
         elif name in file.dropped:
             words = f"left out: {file.dropped[name]:.2f} px"
         else:
@@ -196,11 +195,11 @@ def _photographs(
 
 
 def _facts(file: LensFile, path: Path) -> Iterator[tuple[str, str]]:
-    width, height = file.size_px
+    width, height = file.lens.size_px
     yield "photographs", f"{len(file.photographs)}, {width} × {height} px"
     yield "board", file.board
-    fx, fy, cx, cy = file.matrix
+    fx, fy, cx, cy = file.lens.matrix
     yield "fx, fy, cx, cy", f"{fx:.2f}, {fy:.2f}, {cx:.2f}, {cy:.2f} px"
-    yield "k1, k2, p1, p2, k3", ", ".join(f"{value:+.4f}" for value in file.distortion)
+    yield "k1, k2, p1, p2, k3", ", ".join(f"{value:+.4f}" for value in file.lens.distortion)
     yield "fitted with", file.software
     yield "artefact", path.name

@@ -32,7 +32,7 @@ from brushloop.sessions.records import (
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-    from brushloop.calibrate.board.lens import LensUsed
+    from brushloop.calibrate.board.lens import Lens
 
 POSE_HZ = 100.0
 """Rate at which the driver asks the arm for its pose."""
@@ -98,10 +98,10 @@ class Recorder:
         message = transform_message(now_ns, "base", "paper", origin_mm, quaternion)
         self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, message)
 
-    def optics(self, used: LensUsed) -> None:
+    def optics(self, used: Lens) -> None:
         """Record the lens with which photographs are undistorted before they are judged."""
         now_ns = self._clock.now_ns()
-        message = calibration_message(now_ns, used.size_px, used.lens().matrix.tolist(), used.distortion)
+        message = calibration_message(now_ns, used.size_px, used.camera.tolist(), used.distortion)
         self._put(Topic.CALIBRATION, now_ns, now_ns, 0, message)
 
     def quality(self, quality: Quality, number: int) -> None:

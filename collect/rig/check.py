@@ -62,7 +62,7 @@ def _camera(camera: CameraConfig) -> Iterator[Check]:
         remedy = "brushloop camera intrinsics makes camera.lens_file."
         yield unmeasured("lens", "not calibrated", remedy)
         return
-    size, set_to = camera.optics.lens().size_px, (locked.width, locked.height)
+    size, set_to = camera.optics.size_px, (locked.width, locked.height)
     agrees = set_to == (None, None) or set_to == size
     remedy = "" if agrees else "Calibrate the lens at the size that camera.locked asks for."
     verdict = "plausible" if agrees else "contradicts"

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.lens import Lens
 from brushloop.collect.rig.config_file import Config, Finite, Positive, Range
 from brushloop.drivers.camera import Locked
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
@@ -100,7 +100,7 @@ class CameraConfig(Config):
     """Name of the lens, for the record."""
     lens_file: Path | None = None
     """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is removed before anything is measured."""
-    optics: LensUsed | None = None
+    optics: Lens | None = None
     """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
     locked: Locked = Locked()
 

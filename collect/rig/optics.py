@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.artefact import read_lens
+from brushloop.calibrate.board.intrinsics import read_lens
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError, StepError
@@ -30,7 +30,7 @@ def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:
 
 def lens_of(camera: CameraConfig) -> Lens | None:
     """The calibrated lens; None for a camera without one, whose pictures are taken to be undistorted."""
-    return None if camera.optics is None else camera.optics.lens()
+    return camera.optics
 
 
 def gray(image: NDArray[np.uint8]) -> Gray:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from brushloop.calibrate.board.rig_file import free_name
+from brushloop.calibrate.board.register import free_name
 from brushloop.calibrate.files import write_whole
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_file import refusal

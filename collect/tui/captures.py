@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.board.session import board_of
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.board.view import board_of, see_board
 from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
@@ -91,8 +90,7 @@ class Review:
         self._lens: Lens | None = None
         try:
             # As the session recorded them: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
-            lens = lens_in_use(folder)
-            self._lens = None if lens is None else lens.lens()
+            self._lens = lens_in_use(folder)
             self._board = board_of(folder)
         except CalibrationError as error:
             self.not_compared = str(error)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.sessions.events import BoardResult, CaptureResult, Condition, Press, StepResult
 from brushloop.sessions.mcap_writer import Outgoing
@@ -34,7 +34,7 @@ class Photographed(Protocol):
         boards: Sequence[Gray],
         presses: Sequence[tuple[Stroke, Gray]] = (),
         *,
-        optics: LensUsed | None = None,
+        optics: Lens | None = None,
         sheet_mm: tuple[float, float] | None = None,
     ) -> Path: ...
 
@@ -51,7 +51,7 @@ def _photographed(
     boards: Sequence[Gray],
     presses: Sequence[tuple[Stroke, Gray]] = (),
     *,
-    optics: LensUsed | None = None,
+    optics: Lens | None = None,
     sheet_mm: tuple[float, float] | None = None,
 ) -> Path:
     rig: dict[str, Any] = {

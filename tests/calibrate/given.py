@@ -1,8 +1,11 @@
-"""What several tests are given: a camera straight above the paper, and how a plan was made."""
+"""What several tests are given: a camera straight above the paper, a lens file, and how a plan was made."""
 
 from __future__ import annotations
 
-from brushloop.calibrate.board.lens import LensUsed, unknown_lens
+from pathlib import Path
+
+from brushloop.calibrate.board.intrinsics import LensFile
+from brushloop.calibrate.board.lens import Lens, unknown_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.writing.plan_record import PlannedBy
@@ -21,7 +24,7 @@ CALIBRATION = Calibration(
     corners=24,
     corners_dropped=0,
     preprocess={},
-    lens=LensUsed.of(unknown_lens((1000, 800)), "test"),
+    lens=unknown_lens((1000, 800)),
     middle_px=(0.0, 0.0),
     board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
     still_sha256="",
@@ -36,3 +39,31 @@ BY = PlannedBy(
     turn_deg_mm=12.0,
     speed_mm_s=15.0,
 )
+
+
+def kept_lens(
+    folder: Path,
+    size_px: tuple[int, int],
+    k1: float,
+    focal_px: float = 1024.0,
+    centre_off_px: tuple[float, float] = (0, 0),
+) -> Path:
+    """A lens file as `camera intrinsics` would write it."""
+    centre = ((side - 1) / 2 + off for side, off in zip(size_px, centre_off_px, strict=True))
+    lens = Lens(size_px=size_px, matrix=(focal_px, focal_px, *centre), distortion=(k1, 0.0, 0.0, 0.0, 0.0))
+    return LensFile(
+        software="brushloop test",
+        photographs={"0.png": "ab" * 32},
+        board="a board",
+        lens=lens,
+        focal_se_px=(1.0, 1.0),
+        ways=6,
+        rms_px=0.2,
+        rms_limit_px=0.5,
+        residuals_px={"0.png": 0.2},
+        dropped={},
+        unusable={},
+        slants_deg={"0.png": 20.0},
+        guidance=(),
+        warnings=(),
+    ).save(folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from brushloop.calibrate.artefact import current, load_artefact, put_to_use
-from brushloop.calibrate.board.lens import LensUsed, unknown_lens
+from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
@@ -26,7 +26,7 @@ MADE = Calibration(
     corners=159,
     corners_dropped=0,
     preprocess={"contrast_gate": 0.25},
-    lens=LensUsed.of(unknown_lens((640, 480)), "test"),
+    lens=unknown_lens((640, 480)),
     middle_px=(0.0, 0.0),
     board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
     still_sha256="",

@@ -13,10 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.board.artefact import lens_file
 from brushloop.calibrate.board.detect import BoardView
-from brushloop.calibrate.board.intrinsics import fit_lens
-from brushloop.calibrate.board.lens import Gray, lens_of
+from brushloop.calibrate.board.intrinsics import fit_lens, lens_file
+from brushloop.calibrate.board.lens import Gray, Lens
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Field, Tone
 from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison
@@ -79,7 +78,7 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
 
 def _lens(folder: Path) -> str:
     """The page of a lens from six views of a board in the left half of the image, and one photograph of nothing."""
-    true = lens_of((800.0, 805.0, 322.0, 236.0), (-0.2, 0.05, 0.0, 0.0, 0.0), (640, 480))
+    true = Lens(size_px=(640, 480), matrix=(800.0, 805.0, 322.0, 236.0), distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
     ids = np.arange(54)
     board_mm = np.column_stack([ids % 9 + 1.0, ids // 9 + 1.0]) * 10.0
     views: list[BoardView] = []
@@ -88,13 +87,13 @@ def _lens(folder: Path) -> str:
     ):
         place = np.array([-150.0, -60.0 + 10.0 * number, 480.0])
         flat = np.column_stack([board_mm, np.zeros(54)])
-        seen, _ = cv2.projectPoints(flat, np.array(turn, np.float64), place, true.matrix, true.distortion)
+        seen, _ = cv2.projectPoints(flat, np.array(turn, np.float64), place, true.camera, true.coefficients)
         noise = np.random.default_rng(number).normal(0.0, 0.1, (54, 2))
         views.append(BoardView(f"{number}<u>.png", (640, 480), seen.reshape(-1, 2) + noise, board_mm, ids))
     fitted = fit_lens(views, unusable={"7.png": "is blank"})
     file = lens_file(fitted, "a board", {f"{n}<u>.png": "ab" for n in range(6)} | {"7.png": "cd"}, 0.5, "test")
     small = {"0<u>.png": thumbnail(board()), "7.png": thumbnail(board())}
-    return write_lens_page(file.save(folder), file, fitted, views, small).read_text(encoding="utf-8")
+    return write_lens_page(file.save(folder), file, views, small).read_text(encoding="utf-8")
 
 
 def _loop(folder: Path) -> str:

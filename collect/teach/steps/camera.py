@@ -12,17 +12,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from brushloop.calibrate.board.artefact import lens_file
 from brushloop.calibrate.board.detect import BoardView, find_board
 from brushloop.calibrate.board.intrinsics import (
     GOOD_VIEWS,
     GRID,
     RMS_LIMIT_PX,
-    Fitted,
+    LensFit,
     distinct_views,
     fit_lens,
     guidance,
     held,
+    lens_file,
     nominal_normals,
 )
 from brushloop.calibrate.board.spec import BoardSpec, describe
@@ -201,7 +201,7 @@ class CameraStep(Step):
     def _forget_print(self, day: Day) -> None:
         day.save(day.notebook.without("board."))
 
-    async def _lens(self, day: Day, folder: Path, take: Take) -> Fitted | None:
+    async def _lens(self, day: Day, folder: Path, take: Take) -> LensFit | None:
         """Have the board held before the camera until the lens is known and its picture covered.
 
         None if the person skips it from the start: a lens without distortion needs no file.
@@ -247,7 +247,7 @@ class CameraStep(Step):
         views.append(view)
         return True
 
-    async def _keep_lens(self, day: Day, folder: Path, fitted: Fitted) -> None:
+    async def _keep_lens(self, day: Day, folder: Path, fitted: LensFit) -> None:
         digests = {name: digest(folder / name) for name in taken(day.notebook, folder)}
         software = f"brushloop {version('brushloop')}"
         file = lens_file(fitted, describe(board_of(day.notebook)), digests, RMS_LIMIT_PX, software)

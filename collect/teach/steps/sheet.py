@@ -8,8 +8,8 @@ from collections import defaultdict
 
 import numpy as np
 
-from brushloop.calibrate.board.artefact import read_lens
 from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.intrinsics import read_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
@@ -144,7 +144,7 @@ async def _compared(day: Day) -> str:
         async with taught_camera(day.notebook, day.clock) as camera:
             picture = await still(camera, day.clock)
         if (file := day.notebook.get("camera.lens_file")) is not None:
-            lens = read_lens(day.rig_path.parent / str(file)).lens()
+            lens = read_lens(day.rig_path.parent / str(file))
             lens.check_size(picture, "camera")
             picture = lens.undistort(picture)
         view = await asyncio.to_thread(find_board, picture, spec, "camera")

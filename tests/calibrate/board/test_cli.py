@@ -15,11 +15,11 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from brushloop.__main__ import app
-from brushloop.calibrate.board.artefact import LensFile
 from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.pix2len import apply
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.errors import CalibrationError
+from tests.calibrate.given import kept_lens
 
 if TYPE_CHECKING:
     from conftest import Photographed
@@ -81,23 +81,7 @@ def refused(ran: Result, message: str) -> None:
 
 
 def a_lens(folder: Path, size_px: tuple[int, int] = (1024, 800), k1: float = 0.0) -> Path:
-    width, height = size_px
-    return LensFile(
-        software="test",
-        photographs={},
-        board="a board",
-        size_px=size_px,
-        matrix=(1024.0, 1024.0, (width - 1) / 2, (height - 1) / 2),
-        distortion=(k1, 0.0, 0.0, 0.0, 0.0),
-        focal_se_px=(1.0, 1.0),
-        rms_px=0.2,
-        rms_limit_px=0.5,
-        residuals_px={},
-        dropped={},
-        unusable={},
-        guidance=(),
-        warnings=(),
-    ).save(folder)
+    return kept_lens(folder, size_px, k1)
 
 
 # What no command can measure by: the photograph, the options for the board, and the words.

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.session import drift
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
-from brushloop.calibrate.board.view import preflight, see_board_and_lens
+from brushloop.calibrate.board.view import drift, preflight, see_board_and_lens
 from brushloop.calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=14.0, dictionary="DICT_5X5_100", origin_mm=(-10.0, 5.0))

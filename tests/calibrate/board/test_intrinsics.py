@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.board.artefact import LensFile, lens_file
 from brushloop.calibrate.board.detect import BoardView, find_board
-from brushloop.calibrate.board.intrinsics import fit_lens, guidance
-from brushloop.calibrate.board.lens import Lens, lens_of
+from brushloop.calibrate.board.intrinsics import LensFile, fit_lens, guidance, lens_file
+from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.spec import BoardSpec, Checkerboard, charuco_board
 from brushloop.calibrate.errors import CalibrationError
 
@@ -22,11 +21,7 @@ DATA = Path(__file__).parents[4] / "shared" / "data" / "opencv_calib"
 real = pytest.mark.skipif(not DATA.is_dir(), reason="OpenCV's real photographs of boards are not here")
 CHECKERS = Checkerboard(inner_corners=(9, 6), square_mm=25.0)
 CHARUCO = BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, dictionary="DICT_6X6_250", origin_mm=(0.0, 0.0))
-TRUE = Lens(
-    np.array([[800.0, 0.0, 322.0], [0.0, 805.0, 236.0], [0.0, 0.0, 1.0]]),
-    np.array([-0.21, 0.06, 0.001, -0.0005, 0.0]),
-    (640, 480),
-)
+TRUE = Lens(size_px=(640, 480), matrix=(800.0, 805.0, 322.0, 236.0), distortion=(-0.21, 0.06, 0.001, -0.0005, 0.0))
 
 
 def checkers(square_px: int = 40, inner: tuple[int, int] = (9, 6)) -> np.ndarray:
@@ -51,7 +46,7 @@ def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -
         turn = np.array([rng.uniform(-0.6, 0.6), rng.uniform(-0.6, 0.6), rng.uniform(-3, 3)])
         place = np.array([rng.uniform(-220, 40), rng.uniform(-180, 40), rng.uniform(420, 700)])
         flat = np.column_stack([board, np.zeros(54)])
-        pixels, _ = cv2.projectPoints(flat, turn, place, lens.matrix, lens.distortion)
+        pixels, _ = cv2.projectPoints(flat, turn, place, lens.camera, lens.coefficients)
         pixels = pixels.reshape(-1, 2)
         if pixels.min() > 0 and (pixels < TRUE.size_px).all():
             noisy = pixels + rng.normal(0, noise_px, pixels.shape)
@@ -82,7 +77,7 @@ def test_opencvs_own_photographs_give_its_own_lens(opencv: list[BoardView]) -> N
     assert fitted.focal_reach_px[0] < 3.0
     assert len(fitted.residuals_px) == 13
     assert fitted.rms_px <= 0.20
-    assert fitted.lens.matrix[0, 0] == pytest.approx(535.92, rel=0.01)
+    assert fitted.lens.matrix[0] == pytest.approx(535.92, rel=0.01)
     assert (fitted.dropped, fitted.warnings) == ({}, ())
 
 
@@ -120,7 +115,7 @@ def test_a_board_that_is_always_held_alike_gives_no_lens(slant: float) -> None:
         turn = np.array([slant, 0.0, 0.0]) + rng.normal(0, 0.01, 3)
         place = np.array([rng.uniform(-180, 0), rng.uniform(-150, 0), rng.uniform(450, 650)])
         flat = np.column_stack([view.board_mm, np.zeros(54)])
-        pixels, _ = cv2.projectPoints(flat, turn, place, TRUE.matrix, TRUE.distortion)
+        pixels, _ = cv2.projectPoints(flat, turn, place, TRUE.camera, TRUE.coefficients)
         made.append(dataclasses.replace(view, pixels=pixels.reshape(-1, 2) + rng.normal(0, 0.1, (54, 2))))
     with pytest.raises(CalibrationError, match=r"10 usable views, but the board is held in \d ways, at least 4 needed"):
         fit_lens(made)
@@ -135,14 +130,14 @@ def test_an_interval_is_given_where_the_views_allow_it_and_then_holds_the_truth(
     for seed in range(6):
         fitted = fit_lens(views(7, seed=seed))
         assert fitted.focal_reach_px is not None
-        held += abs(fitted.lens.matrix[0, 0] - TRUE.matrix[0, 0]) <= fitted.focal_reach_px[0]
+        held += abs(fitted.lens.matrix[0] - TRUE.matrix[0]) <= fitted.focal_reach_px[0]
     assert held >= 5
 
 
 def other_camera(f: float, x_px: float, y_px: float) -> Lens:
     """One like TRUE, its focal length f times as long, its axis this many px away."""
-    (fx, _, cx), (_, fy, cy), _ = TRUE.matrix
-    return lens_of((f * fx, f * fy, cx + x_px, cy + y_px), (-0.21, 0.06, 0.001, -0.0005, 0.0), TRUE.size_px)
+    fx, fy, cx, cy = TRUE.matrix
+    return TRUE.model_copy(update={"matrix": (f * fx, f * fy, cx + x_px, cy + y_px)})
 
 
 def test_photographs_of_two_cameras_that_differ_much_leave_a_residual_that_says_so() -> None:
@@ -156,7 +151,7 @@ def test_a_known_lens_is_found_within_its_standard_errors() -> None:
     fitted = fit_lens(views(12))
     assert fitted.focal_se_px is not None
     for k in (0, 1):
-        assert abs(fitted.lens.matrix[k, k] - TRUE.matrix[k, k]) < 4 * fitted.focal_se_px[k]
+        assert abs(fitted.lens.matrix[k] - TRUE.matrix[k]) < 4 * fitted.focal_se_px[k]
     assert fitted.rms_px == pytest.approx(0.1 * 2**0.5, rel=0.1)
     corners = np.array([[10.0, 10.0], [630.0, 10.0], [320.0, 470.0]])
     assert fitted.lens.undistorted(corners) == pytest.approx(TRUE.undistorted(corners), abs=1.5)
@@ -170,7 +165,7 @@ def test_a_view_that_does_not_fit_is_dropped_by_name() -> None:
     fitted = fit_lens(seen)
     assert list(fitted.dropped) == ["bent.png"]
     assert "bent.png" not in fitted.residuals_px
-    assert fitted.lens.matrix[0, 0] == pytest.approx(800.0, rel=0.005)
+    assert fitted.lens.matrix[0] == pytest.approx(800.0, rel=0.005)
 
 
 def test_bad_residuals_warn_before_a_session_begins() -> None:
@@ -232,7 +227,7 @@ def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
 
 def test_a_lens_file_cannot_be_edited(tmp_path: Path) -> None:
     path = lens_file(fit_lens(views(8)), "a board", {"0.png": "ab"}, 0.5, "test").save(tmp_path)
-    assert load_artefact(path, LensFile).lens().matrix[0, 0] == pytest.approx(800.0, rel=0.01)
+    assert load_artefact(path, LensFile).lens.matrix[0] == pytest.approx(800.0, rel=0.01)
     path.write_text(path.read_text().replace('"a board"', '"another"'))
     with pytest.raises(CalibrationError, match="was edited"):
         load_artefact(path, LensFile)

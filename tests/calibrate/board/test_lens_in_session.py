@@ -15,10 +15,9 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.board.artefact import LensFile, lens_file, read_lens
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.intrinsics import fit_lens
-from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.intrinsics import fit_lens, lens_file, read_lens
+from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.view import see_board
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import Field, Tone, captured_mm, prepare_press
@@ -28,6 +27,7 @@ from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Stroke
+from tests.calibrate.given import kept_lens
 from tests.calibrate.simulated_rigs import CAMERAS, Shot, lens_views, sheet, true_mask, true_scale
 
 if TYPE_CHECKING:
@@ -38,25 +38,9 @@ WORST_SCALE = 2e-4
 WORST_ANCHOR_MM = 0.1
 
 
-def kept_lens(folder: Path, k1: float, size_px: tuple[int, int] = (2048, 1536)) -> Path:
-    """A lens file as `camera intrinsics` would write it for a rig's camera, a little off in focus and centre."""
-    width, height = size_px
-    return LensFile(
-        software="brushloop test",
-        photographs={"0.png": "ab" * 32},
-        board="a board",
-        size_px=size_px,
-        matrix=(width + 1.0, width + 1.0, (width - 1) / 2 + 0.5, (height - 1) / 2 - 0.5),
-        distortion=(k1 + 0.002, 0.0, 0.0, 0.0, 0.0),
-        focal_se_px=(1.0, 1.0),
-        rms_px=0.1,
-        rms_limit_px=0.5,
-        residuals_px={"0.png": 0.1},
-        dropped={},
-        unusable={},
-        guidance=(),
-        warnings=(),
-    ).save(folder)
+def rig_lens(folder: Path, k1: float, size_px: tuple[int, int] = (2048, 1536)) -> Path:
+    """A lens file for a rig's camera, a little off in focus and centre."""
+    return kept_lens(folder, size_px, k1 + 0.002, size_px[0] + 1.0, (0.5, -0.5))
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +50,10 @@ def shot() -> Shot:
 
 @pytest.fixture(scope="module")
 def lens(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return kept_lens(tmp_path_factory.mktemp("lens"), CAMERAS[BARREL].k1)
+    return rig_lens(tmp_path_factory.mktemp("lens"), CAMERAS[BARREL].k1)
 
 
-def collected(photographed: Photographed, folder: Path, shot: Shot, optics: LensUsed | None = None) -> Path:
+def collected(photographed: Photographed, folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
     strokes = [
         Stroke(
             stroke_id=f"s{k}",
@@ -143,10 +127,10 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
     made = calibrate_session(session, progress=lambda _what, done, _of: steps.append(done))
     assert steps == [0, 1, 2, 3]
     holds(load_artefact(made, Calibration), shot)
-    wrong = kept_lens(tmp_path / "wrong", 0.08)
+    wrong = rig_lens(tmp_path / "wrong", 0.08)
     with pytest.raises(CalibrationError, match=r"bent by .* of another camera, or of another focus"):
         calibrate_session(session, wrong)
-    small = kept_lens(tmp_path / "small", -0.15, (1024, 768))
+    small = rig_lens(tmp_path / "small", -0.15, (1024, 768))
     with pytest.raises(CalibrationError, match=r"is 2048 x 1536 px, the lens was calibrated at 1024 x 768 px"):
         calibrate_session(session, small)
     with pytest.raises(CalibrationError, match="no such file"):
@@ -156,7 +140,7 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
 def test_lens_a_then_b_then_a_leaves_a_in_use(
     photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
 ) -> None:
-    session, other = collected(photographed, tmp_path / "s", shot), kept_lens(tmp_path, CAMERAS[BARREL].k1 + 0.004)
+    session, other = collected(photographed, tmp_path / "s", shot), rig_lens(tmp_path, CAMERAS[BARREL].k1 + 0.004)
     made = [calibrate_session(session, one) for one in (lens, other, lens)]
     assert made[0] == made[2] != made[1]
     assert current(session) == made[0]
@@ -175,10 +159,10 @@ def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: P
 def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, lens: Path) -> None:
     with pytest.raises(CalibrationError, match="the lens bends straight lines: calibrate it with `brushloop camera"):
         see_board(shot.image, shot.board)
-    wrong = read_lens(kept_lens(tmp_path, 0.08)).lens()
+    wrong = read_lens(rig_lens(tmp_path, 0.08))
     with pytest.raises(CalibrationError, match="of another camera, or of another focus"):
         see_board(shot.image, shot.board, lens=wrong)
-    known = read_lens(lens).lens()
+    known = read_lens(lens)
     plane = see_board(shot.image, shot.board, lens=known)
     again = see_board(known.undistort(shot.image), shot.board)
     assert plane.rms_px < 0.3

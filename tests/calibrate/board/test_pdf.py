@@ -10,8 +10,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.pdf import MM_PER_INCH, drawn, write_pdf
-from brushloop.calibrate.board.spec import Board, BoardSpec, Checkerboard
+from brushloop.calibrate.board.spec import MM_PER_INCH, Board, BoardSpec, Checkerboard, drawn, write_pdf
 from brushloop.calibrate.errors import CalibrationError
 
 BOARD = BoardSpec(squares=(7, 5), square_mm=25.0, marker_mm=18.0, dictionary="DICT_5X5_50", origin_mm=(0.0, 0.0))

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.artefact import registration_file
-from brushloop.calibrate.board.register import read_points, register
+from brushloop.calibrate.board.register import RegistrationFile, read_points, register
 from brushloop.calibrate.errors import CalibrationError
 
 ROBOT = np.array([[460.0, -110.0], [460.0, 100.0], [310.0, 100.0], [310.0, -110.0], [380.0, 0.0], [420.0, 50.0]])
@@ -26,15 +25,17 @@ def test_turn_and_place_are_found_and_every_point_shows_its_residual() -> None:
     assert found.yaw_deg == pytest.approx(90.0, abs=0.05)
     assert found.rms_mm < 0.1
     assert found.rms_mm < found.left_out_rms_mm < 0.2
-    assert found.to_robot(found.to_paper(ROBOT)) == pytest.approx(ROBOT)
+    on_paper = np.column_stack([ROBOT, np.ones(6)]) @ found.matrix.T
+    assert on_paper == pytest.approx(seen(), abs=0.3)
+    assert np.append(found.origin_mm, 1.0) @ found.matrix.T == pytest.approx([0.0, 0.0])
 
 
 def test_a_point_that_slipped_is_dropped_by_name_and_does_not_pull() -> None:
     marks = seen()
     marks[3] += (4.0, -2.0)
     found = register(NAMES, ROBOT, marks)
-    assert found.dropped == ("touch 3",)
-    assert found.residuals_mm[3] == pytest.approx([4.0, -2.0], abs=0.3)
+    assert list(found.dropped) == ["touch 3"]
+    assert found.dropped["touch 3"] == pytest.approx([4.0, -2.0], abs=0.3)
     assert found.yaw_deg == pytest.approx(90.0, abs=0.05)
 
 
@@ -67,6 +68,7 @@ def test_the_table_of_points_is_read_and_its_faults_are_named(tmp_path: Path) ->
 
 
 def test_a_registration_becomes_a_file_named_after_its_contents(tmp_path: Path) -> None:
-    file = registration_file(register(NAMES, ROBOT, seen()), (-34.0, -34.0), "points.csv", "test")
+    about = {"board_origin_mm": (-34.0, -34.0), "source": "points.csv", "software": "test"}
+    file = RegistrationFile(**dict(register(NAMES, ROBOT, seen())), **about)
     assert file.save(tmp_path).stem == file.digest
     assert file.robot_to_paper[2] == pytest.approx(110.0, abs=0.5)

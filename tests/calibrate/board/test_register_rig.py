@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from brushloop.__main__ import app
-from brushloop.calibrate.board.rig_file import PaperLines, read_rig
+from brushloop.calibrate.board.register import PaperLines, read_rig
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PaperConfig, RigConfig, load_rig
 from brushloop.collect.rig.paper import to_base

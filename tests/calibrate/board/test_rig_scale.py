@@ -54,8 +54,9 @@ def test_slanted_boards_give_back_the_lens(rig: int) -> None:
     view = CAMERAS[rig]
     fitted = fit_lens([find_board(image, BOARD, f"{k}") for k, image in enumerate(lens_views(rig, 12))])
     assert fitted.rms_px < 0.2
-    assert fitted.lens.matrix[0, 0] == pytest.approx(view.width_px, rel=1e-3)
+    assert fitted.lens.matrix[0] == pytest.approx(view.width_px, rel=1e-3)
     # Where it matters: pixels of the corners of the image, straightened.
     corners = np.array([[20.0, 20.0], [view.width_px - 20.0, 20.0], [view.width_px / 2, view.height_px - 20.0]])
-    truth = Lens(Optics(view, 1).camera_matrix, np.append(Optics(view, 1).distortion, 0.0), fitted.lens.size_px)
+    optics = Optics(view, 1)
+    truth = Lens.of_opencv(optics.camera_matrix, np.append(optics.distortion, 0.0), fitted.lens.size_px)
     assert fitted.lens.undistorted(corners) == pytest.approx(truth.undistorted(corners), abs=1.0)

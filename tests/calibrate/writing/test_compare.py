@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.lens import LensUsed
+from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
@@ -84,7 +84,7 @@ def test_ink_on_the_edge_of_the_cell_is_reported_and_other_cells_are_refused() -
 
 
 def test_a_character_is_seen_through_the_lens_of_the_calibration() -> None:
-    lens = LensUsed(
+    lens = Lens(
         source="lens file a", size_px=(1000, 800), matrix=(1200.0, 1200.0, 500.0, 400.0), distortion=(-0.3, 0, 0, 0, 0)
     )
     image = page((250, 600, 750, 640))

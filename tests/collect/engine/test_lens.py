@@ -9,7 +9,6 @@ import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
 from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.board.artefact import LensFile
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.session import calibrate_session
 from brushloop.collect.engine.control import State
@@ -20,6 +19,7 @@ from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_file import open_mcap
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
+from tests.calibrate.given import kept_lens
 from tests.collect.until import wait_for_end
 from tests.journal_lines import read_lines
 
@@ -30,22 +30,7 @@ K1 = -0.08
 
 
 def lens_file(folder: Path, k1: float = K1) -> Path:
-    return LensFile(
-        software="brushloop test",
-        photographs={},
-        board="a board",
-        size_px=(1024, 768),
-        matrix=(1024.0, 1024.0, 511.5, 383.5),
-        distortion=(k1, 0.0, 0.0, 0.0, 0.0),
-        focal_se_px=(1.0, 1.0),
-        rms_px=0.1,
-        rms_limit_px=0.5,
-        residuals_px={},
-        dropped={},
-        unusable={},
-        guidance=(),
-        warnings=(),
-    ).save(folder)
+    return kept_lens(folder, (1024, 768), k1)
 
 
 def named(lab: Lab, path: Path, also: str = "") -> Path:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.board.rig_file import read_rig
+from brushloop.calibrate.board.register import read_rig
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
