@@ -24,8 +24,7 @@ from bench.brushes import (
     BRISTLE_SETS,
     CELLS,
     DESIGN,
-    FROZEN,
-    Condition,
+    NAMED,
     at_hand,
     bristle_session,
     brush_toml,
@@ -46,6 +45,7 @@ from brushloop.drivers.sim.brush_file import PAPER, load_brush
 from brushloop.model.train import SHIPPED_GENERATOR
 from brushloop.twin.run import TWIN, fit_twin, workers
 
+BRUSHES = (*NAMED, *BRISTLE_SETS)
 POINTS = "CSIM points"
 REPEATS = 4
 """Presses of each of the paper's 15 conditions."""
@@ -99,23 +99,19 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 def _pressed(n: int | None, seed: int) -> Iterator[tuple[str, Captures, Prior]]:
     """The presses of the first `n` brushes, and the prior that does not know their family."""
-    brushes = [(f"frozen-{k}", learned()) for k in range(1, len(FROZEN) + 1)]
-    brushes += [(name, learned((BRISTLE,))) for name in BRISTLE_SETS]
-    for name, prior in brushes[: rounds_of(n, len(brushes))]:
+    for name in BRUSHES[: rounds_of(n, len(BRUSHES))]:
+        prior = learned((BRISTLE,)) if name in BRISTLE_SETS else learned()
         with tempfile.TemporaryDirectory() as folder:
-            if session := _session(Path(folder) / name, name, REPEATS, seed):
-                yield name, read_presses(session, Field()), prior
-
-
-def _session(out: Path, name: str, repeats: int, seed: int, cells: Sequence[Condition] = CELLS) -> Path | None:
-    """Presses of a frozen brush, or a bristle set; None, and a line on stderr, where that is not at hand."""
-    if name in BRISTLE_SETS:
-        try:
-            return bristle_session(out, name)
-        except BenchError as error:
-            sys.stderr.write(f"left out: {error}\n")
-            return None
-    return press_session(out, FROZEN[int(name.removeprefix("frozen-")) - 1], repeats * tuple(cells), seed)
+            try:
+                session = Path(folder) / name
+                if name in NAMED:
+                    press_session(session, NAMED[name], REPEATS * CELLS, seed)
+                else:
+                    bristle_session(session, name)
+            except BenchError as error:
+                sys.stderr.write(f"left out: {error}\n")
+                continue
+            yield name, read_presses(session, Field()), prior
 
 
 def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
@@ -123,7 +119,7 @@ def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     to nine conditions of the fixed design, on presses of the other six. 90 to 99 % is asked."""
     rows: dict[str, list[dict[str, str]]] = {}
     fitted = {f"{depth:g} {tilt:g}" for depth, tilt in DESIGN[:FITTED_CELLS]}
-    for number, spec in enumerate(FROZEN[: rounds_of(n, len(FROZEN))], 1):
+    for name, spec in list(NAMED.items())[: rounds_of(n, len(NAMED))]:
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch)
             known = press_session(folder / "known", spec, REPEATS * DESIGN[:FITTED_CELLS], seed + 1000)
@@ -133,7 +129,7 @@ def intervals(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
             brushloop("invert", every, "--fit", fit_file, "--out", folder / "recovered.csv")
             found = _table(folder / "recovered.csv")
         where = "{commanded_depth_mm} {commanded_tilt_deg}"
-        rows[f"frozen-{number}"] = [row for row in found if where.format(**row) not in fitted]
+        rows[name] = [row for row in found if where.format(**row) not in fitted]
     rows["every-brush"] = [row for found in rows.values() for row in found]
     return [
         _held(name, letter, parameter, found, seed)
@@ -162,18 +158,18 @@ def loop(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     tones, CSIM and SSIM); 27 presses, and 27 again.
     """
     results: list[Result] = []
-    for number, spec in enumerate(FROZEN[: rounds_of(n, 2)], 1):
+    for name, spec in list(NAMED.items())[: rounds_of(n, 2)]:
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch)
-            brush = brush_toml(folder / "brush.toml", spec, f"frozen brush {number}")
+            brush = brush_toml(folder / "brush.toml", spec, name)
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 session = collect_grid(folder, rig, LOOP_DEPTHS_MM, LOOP_TILTS_DEG, LOOP_REPEATS, seed)
                 rig.run("loop", session, "--seed", str(seed))
             outcome: dict[str, Any] = json.loads((session / "loop" / "loop.json").read_text(encoding="utf-8"))
         lost = [-verdict["difference"] for verdict in outcome["verdicts"]]
         where = f"{outcome['source']}, {outcome['pairs']} pairs, {len(outcome['refused'])} not compared; {machine()}"
-        for name, points in (("worst of 8", max(lost)), ("mean of 8", statistics.fmean(lost))):
-            label = f"loop.{name}.frozen-{number}"
+        for what, points in (("worst of 8", max(lost)), ("mean of 8", statistics.fmean(lost))):
+            label = f"loop.{what}.{name}"
             results.append(at_most(label, points, "points lost", LOOP_POINTS, outcome["pairs"], seed, where))
     return results
 
@@ -185,11 +181,11 @@ def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     CSIM of the round before anything was learned, over 100 less the value.
     """
     results: list[Result] = []
-    brushes = [PAPER, *(f"frozen-{k}" for k in range(1, len(FROZEN) + 1))]
+    brushes = [PAPER, *NAMED]
     for name in brushes[: rounds_of(n, len(brushes))]:
         with tempfile.TemporaryDirectory() as scratch:
             folder, out = Path(scratch), Path(scratch) / "written"
-            brush = PAPER if name == PAPER else _frozen_toml(folder, name)
+            brush = PAPER if name == PAPER else brush_toml(folder / "brush.toml", NAMED[name], name)
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 words = ("--out", out, "--sessions", folder / "sessions", "--count", str(WRITINGS))
                 rig.run("write", CHARACTERS, *words, "--practice", "--learn", str(ROUNDS))
@@ -207,10 +203,6 @@ def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
     return results
 
 
-def _frozen_toml(folder: Path, name: str) -> Path:
-    return brush_toml(folder / "brush.toml", FROZEN[int(name.removeprefix("frozen-")) - 1], name)
-
-
 def _table_3(folder: Path) -> dict[tuple[str, str], Any]:
     """The headline rows of a report by character and pair."""
     rows = read_written(folder).table_3
@@ -221,13 +213,7 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """A twin fitted to 45 presses of each of `n` brushes (seven): points below the ceiling on conditions left out, how
     well it repeats itself, and for frozen brushes the share of the intervals that hold the constant."""
     results: list[Result] = []
-    names = (*(f"frozen-{k}" for k in range(1, len(FROZEN) + 1)), *BRISTLE_SETS)
-    for name in names[: rounds_of(n, len(names))]:
-        with tempfile.TemporaryDirectory() as folder:
-            session = _session(Path(folder) / name, name, TWIN_REPEATS, seed)
-            if session is None:
-                continue
-            captures = read_presses(session, Field())
+    for name, captures, _ in _pressed(n, seed):
         strokes = [press for group in by_cell(captures.strokes).values() for press in group[:TWIN_REPEATS]]
         with workers() as pool:
             fitted = fit_twin(strokes, captures.grid, captures.radius_mm, captures.length_mm, pool)
@@ -238,11 +224,10 @@ def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
         if spread := fitted.spread:
             off, label = abs(spread.captured_percent - spread.twin_percent), f"twin.repeats.{name}"
             results.append(at_most(label, off, POINTS, TWIN_REPEAT_POINTS, len(strokes), seed, where))
-        if name not in BRISTLE_SETS:
-            truth = FROZEN[int(name.removeprefix("frozen-")) - 1]
+        if name in NAMED:
             # A brush bows by bow_mm times a draw of its individual, which the twin does not have.
             known = [one for one in fitted.estimates if one.determined and one.constant.name != "bow_mm"]
-            held = [one.low <= getattr(truth, one.constant.name) <= one.high for one in known]
+            held = [one.low <= getattr(NAMED[name], one.constant.name) <= one.high for one in known]
             share = 100.0 * statistics.fmean(held)
             label = f"twin.intervals.{name}"
             results.append(Result(label, share, "%", "the nominal 95 %", share / 95.0, len(held), seed, where))

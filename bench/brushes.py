@@ -57,6 +57,7 @@ FROZEN: tuple[BrushSpec, ...] = (
     ),
     BrushSpec(length_mm=50.0, stiffness_n_mm2=120.0, suction_n_per_mm2=0.002, friction=0.3, set_deg=12.0, seed=15),
 )
+NAMED = {f"frozen-{k}": spec for k, spec in enumerate(FROZEN, 1)}
 DEVELOPMENT: tuple[BrushSpec, ...] = (
     BrushSpec(seed=1),
     BrushSpec(radius_mm=5.5, length_mm=46.0, stiffness_n_mm2=240.0, friction=0.2, seed=2),

@@ -6,18 +6,16 @@ Each figure is that of a whole command in a process of its own. Ink and photogra
 from __future__ import annotations
 
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bench.brushes import DEPTHS_MM, DESIGN, TILTS_DEG, collect_grid, press_session, simulated_rig
-from bench.harness import BRUSHLOOP, BenchError, Result, Used, at_most, interleave, machine, measure, rounds_of
+from bench.harness import BRUSHLOOP, Result, Used, at_most, interleave, machine, measure, rounds_of
 from brushloop.drivers.sim.brush.brush import BrushSpec
 
-IMPORTED = "import time; began_s = time.perf_counter(); import brushloop; print(time.perf_counter() - began_s)"
-IMPORT_GOAL_S, START_GOAL_S = 0.06, 0.7
+START_GOAL_S = 0.7
 STARTS = {
     "collect": "collect --config no.toml --protocol no.toml --no-tui",
     "collect plan": "collect plan --config no.toml --protocol no.toml",
@@ -43,18 +41,15 @@ RATE = 60.0
 def startup(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Wall seconds of `python -m brushloop --help` beside `python -c "import typer"`, and CPU seconds of each command.
 
-    `startup.import` is what `import brushloop` adds to a notebook, in wall seconds within Python. ratio = the peer's
-    time over ours, at most about 1 for `--help`: the front door imports typer as well. `n` rounds, 10 by default, a
-    third of them for the commands. Nothing is drawn, so the seed changes nothing.
+    ratio = the peer's time over ours, at most about 1 for `--help`: the front door imports typer as well. `n` rounds,
+    10 by default, a third of them for the commands. Nothing is drawn, so the seed changes nothing.
     """
     rounds = rounds_of(n, 10)
     ours, peer = (*BRUSHLOOP, "--help"), (sys.executable, "-c", "import typer")
-    turns = interleave(lambda: _printed(*ours), lambda: _printed(*peer), rounds)
+    turns = interleave(lambda: measure(*ours), lambda: measure(*peer), rounds)
     ours_s, peer_s = turns.median_s
-    import_s = statistics.median(float(_printed(sys.executable, "-c", IMPORTED)) for _ in range(rounds))
     return [
-        Result("startup", ours_s, "s", "import typer", peer_s / ours_s, rounds, seed, machine(), **turns.ratios()),
-        at_most("startup.import", import_s, "s", IMPORT_GOAL_S, rounds, seed),
+        Result("startup", ours_s, "s", "import typer", peer_s / ours_s, rounds, seed, machine(), *turns.ratios()),
         *_starts(max(1, rounds // 3), seed),
     ]
 
@@ -67,14 +62,6 @@ def _starts(rounds: int, seed: int) -> Iterator[Result]:
             measure(*command, code=2, cwd=Path(folder))  # unmeasured: compiles what it imports, as after the first use
             cpu_s = statistics.median(measure(*command, code=2, cwd=Path(folder)).cpu_s for _ in range(rounds))
             yield at_most(f"startup.{name}", cpu_s, "CPU-s", START_GOAL_S, rounds, seed, where)
-
-
-def _printed(*command: str) -> str:
-    """What a command prints. Raises BenchError with its last words when it fails."""
-    ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    if ran.returncode != 0:
-        raise BenchError(f"`{' '.join(command)}` ended with {ran.returncode}: {ran.stderr.strip()[-300:]}")
-    return ran.stdout
 
 
 def analysis(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:

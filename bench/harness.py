@@ -11,10 +11,9 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol, TypedDict
 
 ROOT = Path(__file__).resolve().parent.parent
 BRUSHLOOP = (sys.executable, "-m", "brushloop")
@@ -69,14 +68,6 @@ class Result:
         )
 
 
-class Bench(Protocol):
-    """A benchmark: measures `n` rounds (its own default when None) on inputs drawn with `seed`."""
-
-    def __call__(self, *, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-        """Measure. Raises BenchError where that is not possible, ValueError for n < 1."""
-        ...
-
-
 def rounds_of(n: int | None, default: int) -> int:
     """The number of rounds. Raises ValueError for n < 1."""
     if n is not None and n < 1:
@@ -94,21 +85,6 @@ def machine() -> str:
     """What a figure of time depends on and a reader cannot know."""
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return f"Python {platform.python_version()}, {os.cpu_count()} cores{load}"
-
-
-def percentile(values: Sequence[float], percent: float) -> float:
-    """The value that `percent` of the values do not exceed (nearest rank). Raises ValueError where there are none."""
-    if not values:
-        raise ValueError("no values")
-    ranked = sorted(values)
-    return ranked[max(0, min(len(ranked) - 1, -(-round(percent * len(ranked)) // 100) - 1))]
-
-
-class Ratios(TypedDict):
-    """Two fields of a `Result`."""
-
-    quickest: float
-    median: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +105,10 @@ class Turns:
         """The median of each."""
         return statistics.median(self.ours_s), statistics.median(self.peer_s)
 
-    def ratios(self, share: float = 1.0) -> Ratios:
+    def ratios(self, share: float = 1.0) -> tuple[float, float]:
         """`quickest` and `median` of a `Result`: the peer's time over ours, times `share`, by either."""
         (a, b), (c, d) = self.quickest_s, self.median_s
-        return Ratios(quickest=share * b / a, median=share * d / c)
+        return share * b / a, share * d / c
 
 
 def interleave(

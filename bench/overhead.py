@@ -16,13 +16,13 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import brushloop
 from bench.brushes import DEPTHS_MM
-from bench.harness import BenchError, Process, Result, at_most, lines_of_input, machine, rounds_of, started, tell
+from bench.harness import BenchError, Result, at_most, lines_of_input, machine, rounds_of, started, tell
 
 DWELL_S = 0.2
 GOAL_PERCENT, MOTION_GOAL_S = 2.0, 15.0
@@ -44,35 +44,26 @@ Span = tuple[float, float]
 Spans = dict[str, list[Span]]
 
 
-@dataclass
-class Watch:
-    """What was noted."""
-
-    spans: Spans = field(default_factory=lambda: defaultdict(list))
-    cpu_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    """CPU time by part, where one thread does it."""
-
-
 def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
     """The motion of a stroke, by step; software time of `n` strokes (4) as a share of it, in all and by what it is.
 
-    The conditions of a step's motion list its moves. CPU time is that of the thread that does the part; OpenCV's own
-    threads are not in it. Takes about half a minute a stroke. Raises BenchError where the session fails.
+    The conditions of a step's motion list its moves. Takes about half a minute a stroke.
     """
     strokes = rounds_of(n, 4)
-    watch = Watch()
+    spans: Spans = defaultdict(list)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         with started("bench.overhead", "controller", str(folder / "rig.toml"), str(seed)) as controller:
             _write_protocol(folder / "protocol.toml", strokes, seed)
-            with _watching(watch):
+            with _watching(spans):
                 _collect(folder)
-            watch.spans["motion"] = _motion(controller)
-    return _results(watch, strokes, seed)
+            spans["motion"] = [(begin_s, end_s) for begin_s, end_s in json.loads(controller.ask())]
+    if len(spans["press"]) != strokes:
+        raise BenchError("a press was cut; the figures would cover two attempts")
+    return _results(spans, strokes, seed)
 
 
-def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
-    spans = watch.spans
+def _results(spans: Spans, strokes: int, seed: int) -> list[Result]:
     begin_s = min(begin for begin, _ in spans["dip"])
     end_s = max(end for _, end in spans["capture"])
     took = share_out(spans, begin_s, end_s)
@@ -100,11 +91,8 @@ def _results(watch: Watch, strokes: int, seed: int) -> list[Result]:
         percent("software and waits for devices", all_s),
     ]
     for name, seconds in sorted(took.items(), key=lambda item: -item[1]):
-        unit = "ms a stroke, waited" if name in WAITS else "ms a stroke"
-        if name in watch.cpu_s:
-            unit = f"ms a stroke ({1e3 * watch.cpu_s[name] / strokes:.0f} ms of CPU)"
         if 1e3 * seconds / strokes >= LEAST_MS:
-            results.append(part(name, seconds / strokes, unit))
+            results.append(part(name, seconds / strokes, f"ms a stroke{', waited' if name in WAITS else ''}"))
     if 1e3 * once_s >= LEAST_MS:
         results.append(part(BLANK, once_s, "ms a sheet"))
     return results
@@ -153,24 +141,14 @@ def _around(move: Span, motion: list[Span]) -> tuple[Span, Span]:
 
 
 def _collect(folder: Path) -> None:
-    from brushloop.collect.engine.engine import Engine
-    from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
-    from brushloop.drivers.clock import HostClock
-
-    opening = Opening.load(folder / "sessions", folder / "rig.toml", folder / "protocol.toml")
-    resume, clock = find_resumable(opening), HostClock()
-    engine = Engine(opening.rig, opening.protocol, lambda rig: open_store(opening, resume, rig, clock), clock)
-    engine.start()
     try:
-        engine.join()
-    except Exception as error:
+        brushloop.collect_session(folder / "rig.toml", folder / "protocol.toml", folder / "sessions")
+    except brushloop.CollectAborted as error:
         raise BenchError(f"the session failed: {error}") from error
-    if engine.snapshot().voids:
-        raise BenchError("a step was cut; the figures would cover two attempts")
 
 
 @contextlib.contextmanager
-def _watching(watch: Watch) -> Iterator[None]:
+def _watching(spans: Spans) -> Iterator[None]:
     """Note when each part begins and ends."""
     from brushloop.collect.engine.perform import Performer
     from brushloop.collect.engine.recorder import Recorder
@@ -186,16 +164,15 @@ def _watching(watch: Watch) -> Iterator[None]:
             try:
                 return await function(*arguments, **options)
             finally:
-                watch.spans[part or str(arguments[1].kind)].append((begin_s, time.monotonic()))
+                spans[part or str(arguments[1].kind)].append((begin_s, time.monotonic()))
 
         def at_once(*arguments: Any, **options: Any) -> Any:
-            begin_s, cpu_s = time.monotonic(), time.thread_time()
+            begin_s = time.monotonic()
             try:
                 return function(*arguments, **options)
             finally:
                 assert part is not None
-                watch.spans[part].append((begin_s, time.monotonic()))
-                watch.cpu_s[part] += time.thread_time() - cpu_s
+                spans[part].append((begin_s, time.monotonic()))
 
         return later if asyncio.iscoroutinefunction(function) else at_once
 
@@ -224,10 +201,6 @@ def _write_protocol(path: Path, strokes: int, seed: int) -> None:
         raise ValueError(f"n = {strokes}: up to {len(DEPTHS_MM)}, or a multiple of it")
     text = f'kind = "grid"\ndepths_mm = {depths_mm}\ntilts_deg = [5.0]\nrepeats = {repeats}\n'
     path.write_text(f"{text}dwell_s = {DWELL_S}\nseed = {seed}\n", encoding="utf-8")
-
-
-def _motion(controller: Process) -> list[Span]:
-    return [(begin_s, end_s) for begin_s, end_s in json.loads(controller.ask())]
 
 
 async def _controller(path: Path, seed: int) -> None:

@@ -20,12 +20,12 @@ import typer
 from mkdocs.structure.files import File, Files
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from typer.cli import get_docs_for_click
 
 from brushloop.__main__ import EXIT_CODES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "exit-codes.md"
-PACKAGES = ("calibrate", "collect", "drivers", "model", "sessions", "twin")
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "SECURITY.md": "security.md"}
 """Pages of the repository's root, and their names on the site."""
 LINK = re.compile(r"\[([^\]]*)\]\((?!\w+:|#)([^)#\s]*)(#[^)\s]*)?\)")
@@ -64,14 +64,11 @@ def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str
 
 
 def commands() -> str:
-    """Page with every command, its arguments and its options."""
+    """Page with every command, its arguments and its options, as typer writes it."""
     import brushloop.__main__
 
-    root = typer.main.get_command(brushloop.__main__.app)
-    intro = (
-        "Made from the code: what `--help` says of each command. Exit codes are on [their own page](../exit-codes.md)."
-    )
-    return "\n\n".join(["# Commands", intro, *_command(root, "brushloop")]) + "\n"
+    root: Any = typer.main.get_command(brushloop.__main__.app)
+    return _safe(get_docs_for_click(obj=root, ctx=typer.Context(root), name="brushloop", title="Commands"))
 
 
 def rig() -> str:
@@ -93,33 +90,6 @@ def protocol() -> str:
 
 def _kind(model: type[BaseModel]) -> str:
     return str(get_args(model.model_fields["kind"].annotation)[0])
-
-
-def _command(command: Any, path: str) -> Iterator[str]:
-    yield f"## {path}"
-    yield _safe(inspect.cleandoc(command.help or ""))
-    rows = [_option(one) for one in command.params if not getattr(one, "hidden", False) and one.name != "help"]
-    rows = [row for row in rows if "completion" not in row]
-    if rows:
-        yield "\n".join(["| name | values | default | meaning |", "|---|---|---|---|", *rows])
-    for name, sub in getattr(command, "commands", {}).items():
-        if not sub.hidden:
-            yield from _command(sub, f"{path} {name}")
-
-
-def _option(one: Any) -> str:
-    is_argument = not any(word.startswith("-") for word in one.opts)
-    name = (one.name or "").upper() if is_argument else ", ".join(one.opts + one.secondary_opts)
-    kind = one.type_descriptor.annotation
-    values = getattr(kind, "__name__", str(kind)).lower()
-    if one.min is not None or one.max is not None:
-        values += f" {_end(one.min)} to {_end(one.max)}"
-    default = "required" if one.required else "" if one.default is None or callable(one.default) else str(one.default)
-    return _row(f"`{name}`", values, default, getattr(one, "help", "") or "")
-
-
-def _end(value: float | None) -> str:
-    return "any" if value is None else f"{value:g}"
 
 
 def _model(model: type[BaseModel], name: str) -> Iterator[str]:
@@ -201,47 +171,14 @@ def _safe(text: str) -> str:
 
 
 def exit_codes() -> str:
-    """The page about exit codes, as Markdown."""
+    """The page about exit codes."""
     codes = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
-    errors = [f"| {code} | `{name}` | {text} |" for code, name, text in sorted(raised())]
-    return "\n".join(
-        [
-            "# Exit codes\n",
-            "Every command ends with one of these codes. An error is reported in one line that names the file, the "
-            "field and the allowed range.",
-            "This page is generated from the code by `python -m bench.pages`.\n",
-            "| code | meaning |",
-            "|---|---|",
-            *codes,
-            "\n## Errors in Python",
-            "Each error class has its code in `exit_code`; classes derived from these have the same one.\n",
-            "| code | class | meaning |",
-            "|---|---|---|",
-            *errors,
-            "",
-        ]
+    intro = (
+        "Every command ends with one of these codes. An error is reported in one line that names the file, the field "
+        "and the allowed range. The classes of errors [in Python](python.md#errors) have their code in `exit_code`. "
+        "This page is written by `python -m bench.pages`."
     )
-
-
-def raised() -> Iterator[tuple[int, str, str]]:
-    """Code, full name and first line of the docstring of each class in the code that sets an exit code of its own."""
-    for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
-        source = path.read_text(encoding="utf-8")
-        if "exit_code" not in source:
-            continue
-        for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.ClassDef) and (code := _code(node)) is not None:
-                module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-                yield code, f"{module}.{node.name}", inspect.cleandoc(ast.get_docstring(node) or "").split("\n")[0]
-
-
-def _code(node: ast.ClassDef) -> int | None:
-    for line in node.body:
-        targets = [line.target] if isinstance(line, ast.AnnAssign) else getattr(line, "targets", [])
-        named = any(isinstance(target, ast.Name) and target.id == "exit_code" for target in targets)
-        if named and isinstance(value := getattr(line, "value", None), ast.Constant):
-            return int(str(value.value))
-    return None
+    return "\n".join(["# Exit codes", intro, "", "| code | meaning |", "|---|---|", *codes, ""])
 
 
 if __name__ == "__main__":

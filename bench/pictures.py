@@ -38,7 +38,6 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.end_screen import EndScreen
-from brushloop.collect.tui.finish_screen import FinishScreen
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.start_screen import StartScreen
@@ -55,7 +54,7 @@ REPORT = ROOT / "docs" / "report.png"
 DEMO_REPORT = ROOT / "demo-run" / "report" / "report.html"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WINDOW_PX, MOST_S = (900, 1150), 120.0
-SIZE, SMALL = (120, 40), (80, 24)
+SIZE = (120, 40)
 RATE, WAIT_S = 20.0, 120.0
 PROTOCOL = 'kind = "grid"\ndepths_mm = [11.0, 13.0, 15.0]\ntilts_deg = [0.0, 10.0]\nrepeats = 2\nseed = 1\n'
 DAY_SIZE, DAY_SEED, DAY_RATE = (120, 34), 3, 4.0
@@ -224,20 +223,12 @@ async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
         before = tour.strokes()
         await tour.until(lambda: tour.strokes() > before + 3)
         await tour.take("run")
-        await pilot.resize_terminal(*SMALL)
-        await tour.take("run-80x24")
-        await pilot.press("tab")
-        await tour.take("capture-80x24")
-        await pilot.press("question_mark")
-        await tour.take("help-80x24")
-        await pilot.press("escape")
-        await pilot.resize_terminal(*SIZE)
         await tour.until(lambda: app.engine is not None and app.engine.snapshot().state is State.DONE)
         await tour.until(lambda: isinstance(app.screen, EndScreen))
         await app.workers.wait_for_complete()
         await tour.take("end")
         await pilot.press("escape")
-        await tour.take("done")
+        await pilot.pause(0.3)
         await pilot.press("enter")
         await tour.until(lambda: isinstance(app.screen, CaptureScreen))
         await tour.take("capture")
@@ -247,11 +238,7 @@ async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
         await pilot.pause(1.0)
         await app.workers.wait_for_complete()
         await tour.take("review")
-        await pilot.press("f")
-        await tour.until(lambda: isinstance(app.screen, FinishScreen))
-        await app.workers.wait_for_complete()
-        await tour.take("finish")
-        await pilot.press("escape", "escape", "q")
+        await pilot.press("escape", "q")
         await tour.until(lambda: isinstance(app.screen, StartScreen))
         await tour.take("start-after")
         await pilot.press("q")
@@ -344,10 +331,6 @@ async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
                 _save(app, f"first-day-{name}", f"brushloop rig new, loopback rig: {name}")
             sys.stdout.write(f"{question.text}\n")
             await person.answer(question)
-        await pilot.pause(0.5)
-        _save(app, "first-day-ready", "brushloop rig new, loopback rig: ready")
-        for shown in app.teaching.guide.view.findings[-8:]:
-            sys.stdout.write("\n".join(shown.lines) + "\n")
     app.teaching.join()
 
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.harness import BenchError, Result, at_most, percentile, rounds_of
+from bench.harness import BenchError, Result, at_most, rounds_of
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import see_board
@@ -52,6 +52,15 @@ SPOTLESS_MM2 = 0.2
 """Ink up to which a patch is labelled blank; between the two it has no label."""
 DRIP_MM = 3.5
 """Drops closer to the stroke than this are not drawn: they may as well be taken for a part of it."""
+FLAWS: dict[Failure | None, tuple[Flaw, float]] = {
+    Failure.FAINT: (Flaw.FAINT, 0.5),
+    Failure.DRY: (Flaw.DRY, 0.9),
+    Failure.SPLIT: (Flaw.SPLIT, 0.4),
+    Failure.BENT: (Flaw.BENT, 0.5),
+}
+"""What the brush has, and from which severity on, up to 1."""
+LOADS: dict[Failure | None, tuple[float, float]] = {Failure.FAINT: (0.4, 0.5), Failure.DRY: (0.06, 0.22)}
+"""Or how little ink it has, in two fifths of these captures."""
 HIDDEN_MM = 1.5
 """Length of a stroke that the frame must hide for the label `cut`."""
 
@@ -62,15 +71,12 @@ class Sample:
 
     label: Failure | None
     """None = sound."""
-    severity: float
-    """Of a brush flaw 0 .. 1, of a place mm, of a blur mm; 0 where there is no measure."""
     image: Gray
     before: Gray
     """The still before this press."""
     plane: Plane
     patch: Patch
     depth_mm: float
-    tilt_deg: float
     sheet_mm: tuple[float, float]
 
 
@@ -126,35 +132,28 @@ class Bench:
         """Press on the patch and photograph it with that failure; None where this draw did not bring it about."""
         rng = self.rng
         depth_mm, tilt_deg = round(rng.uniform(11.0, 20.0), 1), round(rng.uniform(0.0, 10.0), 1)
-        load, flaw, severity = rng.uniform(0.8, 1.0), None, 0.0
+        load, flaw, severity = rng.uniform(0.8, 1.0), None, 1.0
         aside_mm = off_mm = np.array(patch.anchor_mm) + np.clip(rng.normal(0.0, 0.2, 2), -0.5, 0.5)
         pressed = True
+        if label in LOADS and rng.random() < 0.4:
+            load = rng.uniform(*LOADS[label])
+        elif label in FLAWS:
+            flaw, least = FLAWS[label]
+            severity = rng.uniform(least, 1.0)
         match label:
             case Failure.BLANK:
                 pressed = rng.random() < 0.5
-                flaw, severity = Flaw.BLANK, 1.0
-            case Failure.FAINT if rng.random() < 0.4:
-                load = rng.uniform(0.4, 0.5)
-            case Failure.FAINT:
-                flaw, severity = Flaw.FAINT, rng.uniform(0.5, 1.0)
-            case Failure.DRY if rng.random() < 0.4:
-                load = rng.uniform(0.06, 0.22)
-            case Failure.DRY:
-                flaw, severity = Flaw.DRY, rng.uniform(0.9, 1.0)
-            case Failure.SPLIT:
-                flaw, severity = Flaw.SPLIT, rng.uniform(0.4, 1.0)
-            case Failure.BENT:
-                flaw, severity = Flaw.BENT, rng.uniform(0.5, 1.0)
+                flaw = Flaw.BLANK
             case Failure.MISPLACED:
-                severity = rng.uniform(3.0, 10.0) if rng.random() < 0.75 else rng.uniform(10.0, 40.0)
+                away_mm = rng.uniform(3.0, 10.0) if rng.random() < 0.75 else rng.uniform(10.0, 40.0)
                 turn = rng.uniform(0.0, 2.0 * math.pi)
-                off_mm = off_mm + severity * np.array([math.cos(turn), math.sin(turn)])
+                off_mm = off_mm + away_mm * np.array([math.cos(turn), math.sin(turn)])
                 if not self._on_sheet(off_mm):
                     return None
             case Failure.SMEARED:
-                severity = rng.uniform(15.0, 40.0)
+                away_mm = rng.uniform(15.0, 40.0)
                 turn = math.radians(rng.uniform(50.0, 130.0)) * rng.choice([-1.0, 1.0])
-                aside_mm = off_mm + severity * np.array([math.cos(turn), math.sin(turn)])
+                aside_mm = off_mm + away_mm * np.array([math.cos(turn), math.sin(turn)])
                 if not self._on_sheet(aside_mm):
                     return None
             case Failure.NEIGHBOUR if rng.random() < 0.5:
@@ -170,40 +169,40 @@ class Bench:
             mark = self.world.brush.drag(path, tilt_deg, 0.0, ink_load=load, press_seed=self._next_seed())
             self.world.paper.lay(mark, deep.x_mm, deep.y_mm, 0.0)
         elif pressed:
-            mark = self._press(depth_mm, tilt_deg, load, flaw, severity if flaw else 1.0)
+            mark = self._press(depth_mm, tilt_deg, load, flaw, severity)
             self.world.paper.lay(mark, float(off_mm[0]), float(off_mm[1]), 0.0)
         own = self.world.paper.density - already
         if label is Failure.NEIGHBOUR and self._foreign(patch, already) < FOREIGN_MM2 and not self._drip(patch, own):
             label = None
         before, self.still = self.still, self._render()
-        sample = Sample(label, severity, self.still, before, self.plane, patch, depth_mm, tilt_deg, self.table.sheet_mm)
+        sample = Sample(label, self.still, before, self.plane, patch, depth_mm, self.table.sheet_mm)
         return self._photographed(sample, own, already)
 
     def ink_mm2(self, patch: Patch) -> float:
         """How much of the patch is inked, by the sheet itself."""
         return self._foreign(patch, self.world.paper.density)
 
-    def _photographed(self, sample: Sample, own: NDArray[np.float32], already: NDArray[np.float32]) -> Sample | None:
+    def _photographed(self, sample: Sample, own: NDArray[np.float32], already: NDArray[np.float32]) -> Sample:
         """The same capture with the camera at fault, where the label says so."""
         rng, view = self.rng, self.world.config.view
         match sample.label:
             case Failure.BLURRED:
                 sigma_px = rng.uniform(2.2, 6.0)
                 image = self._render(dataclasses.replace(view, blur_px=sigma_px))
-                return dataclasses.replace(sample, image=image, severity=sigma_px / view.px_per_mm)
+                return dataclasses.replace(sample, image=image)
             case Failure.GLARE:
                 x, y, width, height = self._span_mm(own)
                 place = (x + width * rng.random(), y + height * rng.random())
                 peak, sigma_mm = rng.uniform(90.0, 260.0), rng.uniform(2.5, 10.0)
                 image = self._render(dataclasses.replace(view, glare=peak, glare_mm=place, glare_sigma_mm=sigma_mm))
-                return dataclasses.replace(sample, image=image, severity=peak / 255.0)
+                return dataclasses.replace(sample, image=image)
             case Failure.EXPOSURE:
                 sheet = self._scene.paper_to_image @ np.array([*np.array(self.table.sheet_mm) / 2, 1.0])
                 u, v = (round(float(q)) for q in sheet[:2] / sheet[2])
                 paper = float(np.median(self.still[v - 300 : v + 300, u - 400 : u + 400]))
                 wanted = rng.uniform(15.0, 60.0) if rng.random() < 0.5 else rng.uniform(290.0, 450.0)
                 image = np.clip(sample.image * (wanted / paper), 0.0, 255.0).astype(np.uint8)
-                return dataclasses.replace(sample, image=image, severity=wanted / 255.0)
+                return dataclasses.replace(sample, image=image)
             case Failure.CUT:
                 return self._cut(sample, own, already)
             case _:
@@ -216,19 +215,12 @@ class Bench:
         half_w, half_h = view.width_px / view.px_per_mm / 2, view.height_px / view.px_per_mm / 2
         x, y = left + width / 2 + rng.uniform(-60.0, 60.0), bottom + height / 2 + rng.uniform(-40.0, 40.0)
         share = rng.uniform(0.2, 0.67)
-        match int(rng.integers(4)):
-            case 0:
-                hidden_mm = max(HIDDEN_MM, share * width)
-                x = left + hidden_mm + half_w
-            case 1:
-                hidden_mm = max(HIDDEN_MM, share * width)
-                x = left + width - hidden_mm - half_w
-            case 2:
-                hidden_mm = max(HIDDEN_MM, share * height)
-                y = bottom + hidden_mm + half_h
-            case _:
-                hidden_mm = max(HIDDEN_MM, share * height)
-                y = bottom + height - hidden_mm - half_h
+        side = int(rng.integers(4))
+        hidden_mm = max(HIDDEN_MM, share * (width if side < 2 else height))
+        if side < 2:
+            x = left + hidden_mm + half_w if side == 0 else left + width - hidden_mm - half_w
+        else:
+            y = bottom + hidden_mm + half_h if side == 2 else bottom + height - hidden_mm - half_h
         aimed = dataclasses.replace(view, centre_mm=(x, y), turn_deg=0.0, keystone=0.0)
         image = self._render(aimed)
         # The plane as it was taken with the camera like this: nothing moved since, the stroke never was in view.
@@ -237,7 +229,7 @@ class Bench:
         before = self._render(aimed)
         self.world.paper.density = now
         self.world.version += 1
-        return dataclasses.replace(sample, image=image, before=before, plane=plane, severity=hidden_mm)
+        return dataclasses.replace(sample, image=image, before=before, plane=plane)
 
     def _span_mm(self, own: NDArray[np.float32]) -> tuple[float, float, float, float]:
         """x, y, width, height of the ink of a press, in the paper frame."""
@@ -425,7 +417,7 @@ def run(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     results.append(
         at_most("quality.false-alarms", scores.false_alarms, "of 1", FALSE_ALARMS_GOAL, captures, seed, where)
     )
-    slow_s = percentile(scores.seconds, 95.0)
+    slow_s = float(np.percentile(scores.seconds, 95))
     results.append(at_most("quality.seconds", slow_s, "s (95 %)", SECONDS_GOAL, captures, seed))
     return results
 

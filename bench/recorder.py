@@ -1,6 +1,6 @@
 """The recorder under a rig's load: poses at 100 Hz, forces at 1 kHz, a photograph now and then.
 
-Two questions. How fast can it write, beside foxglove-sdk and beside a plain file? And how much does it take from the
+Two questions. How fast can it write, beside foxglove-sdk? And how much does it take from the
 program that records: CPU, and the longest time that one `write` holds up the caller?
 """
 
@@ -37,30 +37,29 @@ Contestant = Callable[[Path], AbstractContextManager[Write]]
 
 
 def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
-    """Write rate beside foxglove-sdk and a plain file; CPU and worst hold-up at the real pace, beside foxglove-sdk.
+    """Write rate, and CPU and worst hold-up at the real pace, beside foxglove-sdk; rounds take turns.
 
-    Rounds take turns. The plain file takes the same bytes, encoded in the same way, and knows no index, no CRC and no
-    compression. Raises BenchError without foxglove-sdk (`pip install foxglove-sdk`), ValueError for n < 1.
+    Raises BenchError without foxglove-sdk (`pip install foxglove-sdk`), ValueError for n < 1.
     """
     rounds = rounds_of(n, 3)
     load = list(_load(seed, LOAD_S))
     megabytes = sum(len(encoded(outgoing.message)) for outgoing in load) / 1e6
     paced = list(_load(seed, PACED_S))
-    contestants = (_ours, _foxglove, _plain)
+    contestants = (_ours, _foxglove)
     rates: dict[str, list[float]] = {c.__name__: [] for c in contestants}
-    shares: dict[str, list[float]] = {c.__name__: [] for c in (_ours, _foxglove)}
-    worst: dict[str, list[float]] = {c.__name__: [] for c in (_ours, _foxglove)}
+    shares: dict[str, list[float]] = {c.__name__: [] for c in contestants}
+    worst: dict[str, list[float]] = {c.__name__: [] for c in contestants}
     with tempfile.TemporaryDirectory() as scratch:
         for _ in range(rounds):
             for contestant in contestants * FLAT_RUNS:
                 rates[contestant.__name__].append(megabytes / _flat_out(contestant, Path(scratch), load))
-            for contestant in (_ours, _foxglove):
+            for contestant in contestants:
                 share, held_ms = _at_pace(contestant, Path(scratch), paced)
                 shares[contestant.__name__].append(share)
                 worst[contestant.__name__].append(held_ms)
-    ours, foxglove, plain = (median(rates[c.__name__]) for c in contestants)
-    cpu, cpu_foxglove = (median(shares[c.__name__]) for c in (_ours, _foxglove))
-    held, held_foxglove = (max(worst[c.__name__]) for c in (_ours, _foxglove))
+    ours, foxglove = (median(rates[c.__name__]) for c in contestants)
+    cpu, cpu_foxglove = (median(shares[c.__name__]) for c in contestants)
+    held, held_foxglove = (max(worst[c.__name__]) for c in contestants)
     still_mb = len(encoded(paced[0].message)) / 1e6
     conditions = (
         f"{POSE_HZ} Hz poses, {FORCE_HZ} Hz forces as JSON, a {still_mb:.1f} MB still "
@@ -72,7 +71,6 @@ def run(*, n: int | None = None, seed: int = 0) -> list[Result]:
 
     return [
         result("write rate", ours, "MB/s", f"foxglove-sdk ({foxglove:.0f} MB/s)", ours / foxglove),
-        result("write rate, plain", ours, "MB/s", f"a plain file ({plain:.0f} MB/s)", ours / plain),
         result("CPU", 100 * cpu, "% of one core", f"foxglove-sdk ({100 * cpu_foxglove:.1f} %)", cpu_foxglove / cpu),
         result("worst hold-up", held, "ms", f"foxglove-sdk ({held_foxglove:.2f} ms)", held_foxglove / held),
     ]
@@ -170,18 +168,6 @@ def _foxglove_channel(foxglove, outgoing: Outgoing, context):  # type: ignore[no
     described = build_file_descriptor_set(type(message)).SerializeToString()
     schema = foxglove.Schema(name=message.DESCRIPTOR.full_name, encoding="protobuf", data=described)
     return foxglove.Channel(str(outgoing.topic), schema=schema, message_encoding="protobuf", context=context)
-
-
-@contextmanager
-def _plain(folder: Path) -> Iterator[Write]:
-    with (folder / "plain.bin").open("xb") as file:
-
-        def write(outgoing: Outgoing) -> None:
-            file.write(encoded(outgoing.message))
-
-        yield write
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _sync(path: Path) -> None:

@@ -39,21 +39,21 @@ def test_ratios_are_of_the_quickest_tenth_and_of_the_medians() -> None:
     turns = interleave(list, list, 20, clock=lambda: next(ticks))
     assert turns.quickest_s == (1.5, 5.5)
     assert turns.median_s == (10.5, 32.5)
-    assert turns.ratios(2.0) == {"quickest": 2 * 5.5 / 1.5, "median": 2 * 32.5 / 10.5}
+    assert turns.ratios(2.0) == (2 * 5.5 / 1.5, 2 * 32.5 / 10.5)
 
 
 def test_the_page_keeps_what_was_not_measured_and_names_missed_goals(tmp_path: Path) -> None:
     path = tmp_path / "results.md"
     fast = Result("raster-press", 5e5, "images/s", "cv2", 41.0, 60, 0, "quiet", quickest=41.0, median=39.5)
     front.renew("raster", [fast], path)
-    front.renew("startup", [at_most("startup.import", 0.02, "s", 0.06, 10, 3, "quiet")], path)
+    front.renew("startup", [at_most("startup.collect", 0.02, "s", 0.06, 10, 3, "quiet")], path)
     front.renew("raster", [replace(fast, ratio=12.0)], path)
     text, today = path.read_text(), dt.date.today()
     assert [line for line in text.splitlines() if line.startswith("## ")] == ["## startup", "## raster"]
     assert "**Goals that are missed:** `raster-press`." in text
     raster = "12.00 (quickest tenth 41.00, median 39.50) | cv2 | 40, **missed** | 60 | 0"
     assert f"| `raster-press` | 500,000 images/s | {raster} | quiet | {today} |" in text
-    assert f"| `startup.import` | 0.02 s | 3.00 | goal 0.06 s at most | 1 | 10 | 3 | quiet | {today} |" in text
+    assert f"| `startup.collect` | 0.02 s | 3.00 | goal 0.06 s at most | 1 | 10 | 3 | quiet | {today} |" in text
 
 
 def test_every_bench_is_there() -> None:
