@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from brushloop.collect.errors import CollectAborted, ConfigError
     from brushloop.collect.start import collect_session
     from brushloop.drivers.loopback import LoopbackRig, simulate
-    from brushloop.model.brush import Brush, DomainError
+    from brushloop.model.ccdbsm import Brush, DomainError
     from brushloop.sessions.errors import SessionDamaged, SessionError
     from brushloop.sessions.records import Condition
 
@@ -43,7 +43,7 @@ _NAMES = {
     "brushloop.collect.errors": ("CollectAborted", "ConfigError"),
     "brushloop.collect.start": ("collect_session",),
     "brushloop.drivers.loopback": ("LoopbackRig", "simulate"),
-    "brushloop.model.brush": ("Brush", "DomainError"),
+    "brushloop.model.ccdbsm": ("Brush", "DomainError"),
     "brushloop.sessions.records": ("Condition",),
     "brushloop.sessions.errors": ("SessionDamaged", "SessionError"),
 }

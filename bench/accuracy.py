@@ -42,7 +42,7 @@ from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.scores import HEADLINE, REFERENCE, SIMULATED, read_written
 from brushloop.drivers.sim.brush_file import PAPER, load_brush
-from brushloop.model.train import SHIPPED_GENERATOR
+from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.twin.run import TWIN, fit_twin, workers
 
 BRUSHES = (*NAMED, *BRISTLE_SETS)

@@ -10,16 +10,14 @@ from contextlib import contextmanager
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from bench.harness import Result, at_most, interleave, machine, rounds_of
-from brushloop.model.brush import Brush
-from brushloop.model.ccdbsm import ccdbsm
-from brushloop.model.inversion.press import Inverter
-from brushloop.model.press_images import press_images
-from brushloop.model.protocol import Basis
-from brushloop.model.raster.frame import PX_MM, SIZE_PX
+from brushloop.model.ccdbsm import Brush, ccdbsm
+from brushloop.model.inversion import Inverter
+from brushloop.model.raster import PX_MM, SIZE_PX
+from brushloop.model.raster.press import press_images
+from brushloop.model.strokes import stroke_model
 
 BATCH = 64
 BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a training set
@@ -82,16 +80,15 @@ def raster(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 def outlines(depth_mm: Floats, tilt_deg: Floats) -> NDArray[np.int32]:
     """The marks of these presses as polygons in fillPoly's fixed-point pixels at 4x, (B, 2 POINTS, 2)."""
-    mark = ccdbsm(Brush(), torch.from_numpy(depth_mm), torch.from_numpy(tilt_deg))
+    mark = ccdbsm(Brush(), depth_mm, tilt_deg)
     # Points crowd at both ends, where the outline turns fastest.
-    share = 0.5 - 0.5 * torch.cos(torch.linspace(0, torch.pi, POINTS))
+    share = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, POINTS))
     x = mark.x_min_mm[:, None] + share * mark.length_mm[:, None]
     width = mark.half_width(x)
-    middle = 0.5 * (mark.x_min_mm + mark.x_max_mm)[:, None]
-    x, y = torch.cat((x, x.flip(1)), dim=1), torch.cat((width, -width.flip(1)), dim=1)
+    x, y = np.concatenate((x, x[:, ::-1]), axis=1), np.concatenate((width, -width[:, ::-1]), axis=1)
     # fillPoly counts from pixel centres, images from pixel edges.
-    points = torch.stack((x - middle, -y), dim=-1) * SCALE / PX_MM + 0.5 * SCALE * SIZE_PX - 0.5
-    return (points * 2**SHIFT).round().to(torch.int32).numpy()
+    points = np.stack((x - mark.middle_mm[:, None], -y), axis=-1) * SCALE / PX_MM + 0.5 * SCALE * SIZE_PX - 0.5
+    return np.rint(points * 2**SHIFT).astype(np.int32)
 
 
 def fill(polygon: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -113,7 +110,7 @@ def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     origin = anchor + np.column_stack((truth["depth_mm"] * np.tan(np.radians(truth["tilt_deg"])), np.zeros(count)))
     clean = press_images(Brush(), truth["depth_mm"], truth["tilt_deg"], origin_mm=origin, px_mm=INVERTED_PX_MM)
     noisy = (clean + rng.normal(0, SENSOR, clean.shape)).astype(np.float32)
-    inverter = Inverter.of_brush(Basis(Brush()), px_mm=INVERTED_PX_MM)
+    inverter = Inverter(stroke_model("ccd-bsm", Brush()), px_mm=INVERTED_PX_MM)
     with _one_thread():
         inverter(clean[:2], anchor[:2])  # compiles
         began = time.thread_time()
@@ -138,12 +135,10 @@ def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Hold torch and OpenCV to one thread each, and restore what was set before."""
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
+    """Hold OpenCV to one thread, and restore what was set before."""
+    before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
+        cv2.setNumThreads(before)

@@ -39,14 +39,14 @@ from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.validate.main import Request, ValidationOutput, check
 from brushloop.calibrate.validate.main import validate as run_validation
 from brushloop.calibrate.validate.sources import local_path
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.sessions.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Condition, Header
 
 if TYPE_CHECKING:
     from brushloop.calibrate.invert.command import Recovered
-    from brushloop.model.protocol import StrokeModel
+    from brushloop.model.strokes import StrokeModel
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -236,18 +236,18 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
     """
     chosen = _model(brush or Brush(), model)
     image = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())[Alignment.MM, Tone.GRAY]
-    edge = chosen.profile(condition.depth_mm, condition.tilt_deg).outline().polyline()[0]
-    return Prediction(chosen.name, image, np.asarray(edge.detach().double().reshape(-1, 2), np.float64))
+    edge = chosen.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
+    return Prediction(chosen.name, image, edge)
 
 
 def _model(brush: Brush | BrushFit, name: str) -> StrokeModel:
     if isinstance(brush, BrushFit):
-        from brushloop.model.fitted_shape import fitted_model
+        from brushloop.model.fitted import fitted_model
 
         return fitted_model(brush.press())
     if name == GENERATOR:
-        from brushloop.model.train import SHIPPED_GENERATOR
-        from brushloop.model.train.checkpoint import load_generator
+        from brushloop.model.generator import SHIPPED_GENERATOR
+        from brushloop.model.generator.stroke import load_generator
 
         return load_generator(SHIPPED_GENERATOR, brush)
     from brushloop.model.strokes import stroke_model

@@ -18,12 +18,37 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from brushloop.model.brush import Brush, DomainError, require_positive
-from brushloop.model.outline import Outline, loop, safe_sqrt
+from brushloop.model.arrays import Array, as_batch, as_numpy, library, like, safe_sqrt
+from brushloop.model.outline import Outline
+
+
+class DomainError(ValueError):
+    """A parameter outside the domain; carries its `name`, the first bad `value` and the `allowed` range."""
+
+    def __init__(self, name: str, value: float, allowed: str, hint: str = "") -> None:
+        super().__init__(f"{name} = {value:g} is outside {allowed}" + (f"; {hint}" if hint else ""))
+        self.name = name
+        self.value = value
+        self.allowed = allowed
+
+
+@dataclass(frozen=True, slots=True)
+class Brush:
+    """The hair bundle as a cone: largest radius R and length L, mm; both must be positive, else DomainError.
+
+    R and L are floats, or (B,) arrays or tensors for a batch of brushes or gradients with respect to the brush.
+    """
+
+    radius_mm: Array = 6.0
+    length_mm: Array = 48.0
+
+    def __post_init__(self) -> None:
+        _require_positive("radius_mm", self.radius_mm)
+        _require_positive("length_mm", self.length_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,120 +59,110 @@ class CcdBsm:
     -O4O3 <= x < 0.
     """
 
-    o3a_mm: Tensor
-    o3c_mm: Tensor
-    o4o3_mm: Tensor
-    lam: Tensor
+    o3a_mm: Array
+    o3c_mm: Array
+    o4o3_mm: Array
+    lam: Array
 
     @property
-    def x_min_mm(self) -> Tensor:
+    def x_min_mm(self) -> Array:
         """The tip, -O4O3, (B,)."""
         return -self.o4o3_mm
 
     @property
-    def x_max_mm(self) -> Tensor:
+    def x_max_mm(self) -> Array:
         """The end of the heel, O3A, (B,)."""
         return self.o3a_mm
 
     @property
-    def half_width_mm(self) -> Tensor:
+    def middle_mm(self) -> Array:
+        """x of the middle between both ends, (B,)."""
+        return 0.5 * (self.x_min_mm + self.x_max_mm)
+
+    @property
+    def half_width_mm(self) -> Array:
         """The greatest half width, lambda O3C, at x = 0, (B,)."""
         return self.lam * self.o3c_mm
 
     @property
-    def width_mm(self) -> Tensor:
+    def width_mm(self) -> Array:
         """The greatest width, 2 lambda O3C, (B,)."""
         return 2 * self.half_width_mm
 
     @property
-    def length_mm(self) -> Tensor:
+    def length_mm(self) -> Array:
         """The whole length, O3A + O4O3, (B,)."""
         return self.o3a_mm + self.o4o3_mm
 
     @property
-    def area_mm2(self) -> Tensor:
+    def area_mm2(self) -> Array:
         """The area enclosed by Eq. 1, lambda O3C (pi/2 O3A + 4/3 O4O3), (B,)."""
         return self.half_width_mm * (0.5 * math.pi * self.o3a_mm + 4 / 3 * self.o4o3_mm)
 
     def outline(self) -> Outline:
-        """Eq. 1 as two quarters of an ellipse and two parabolas, exactly."""
-        a, t, w = self.o3a_mm, self.o4o3_mm, self.half_width_mm
-        o = torch.zeros_like(a)
-        # The parabola's tangents, level at x = 0 and 2 w / t steep at the tip, meet halfway.
-        return loop(
-            ((a, o, a, w, o, w), math.sqrt(0.5)),
-            ((o, w, -0.5 * t, w, -t, o), 1.0),
-            ((-t, o, -0.5 * t, -w, o, -w), 1.0),
-            ((o, -w, a, -w, a, o), math.sqrt(0.5)),
-        )
+        """Eq. 1 as two quarters of an ellipse and two parabolas, exactly; (B, 4) arcs from the end of the heel."""
+        xp = library(self.o3a_mm)
+        heel, tip, wide = (size[:, None, None] for size in (self.o3a_mm, self.o4o3_mm, self.half_width_mm))
+        # Shares of heel, tip and half width. The parabolas' tangents, level at x = 0 and 2 w / O4O3 steep at the tip,
+        # meet halfway.
+        x = like(((1, 1, 0), (0, -0.5, -1), (-1, -0.5, 0), (0, 1, 1)), heel)
+        y = like(((0, 1, 1), (1, 1, 0), (0, -1, -1), (-1, -1, 0)), heel)
+        quarter = math.sqrt(0.5)
+        weights = xp.ones_like(heel[:, 0]) * like((quarter, 1, 1, quarter), heel)
+        return Outline(xp.stack((xp.where(x > 0, heel, tip) * x, wide * y), -1), weights)
 
-    def half_width(self, x_mm: Tensor) -> Tensor:
+    def half_width(self, x_mm: Array) -> Array:
         """Eq. 1 at x, (B, N) -> (B, N) mm; zero outside the mark."""
-        heel = (x_mm / self.o3a_mm[:, None]).clamp(0, 1)
-        tip = (x_mm / self.o4o3_mm[:, None]).clamp(-1, 0)
-        # The other side's fraction is clamped to 0, so its factor is 1 and one product covers both sides.
+        xp = library(self.o3a_mm)
+        heel = xp.clip(x_mm / self.o3a_mm[:, None], 0, 1)
+        tip = xp.clip(x_mm / self.o4o3_mm[:, None], -1, 0)
+        # The other side's fraction is clipped to 0, so its factor is 1 and one product covers both sides.
         return self.half_width_mm[:, None] * safe_sqrt((1 - heel) * (1 + heel)) * (1 - tip) * (1 + tip)
 
 
-def ccdbsm(
-    brush: Brush,
-    depth_mm: float | Tensor,
-    tilt_deg: float | Tensor,
-    lam: float | Tensor = math.pi,
-    *,
-    dtype: torch.dtype | None = None,
-) -> CcdBsm:
-    """The CCD-BSM mark (Eq. 1-5) of presses to depth H at tilt alpha; scalars or (B,) tensors, broadcast to
-    one (B,).
+def basic_lengths(
+    depth_mm: Array, alpha: Array, radius_mm: Array, length_mm: Array, xp: Any
+) -> tuple[Array, Array, Array]:
+    """O3A, O3C and O4O3 in mm (Eq. 2-5) of presses at alpha in radians, computed by `xp`: numpy, torch or math."""
+    theta = xp.atan(radius_mm / length_mm)
+    o3a = depth_mm * (xp.tan(alpha) - xp.tan(alpha - theta))
+    o3c = depth_mm * (radius_mm / (length_mm * xp.cos(alpha)))
+    return o3a, o3c, depth_mm / xp.cos(alpha - theta) + o3a
 
-    The dtype is `dtype`, else that of the floating-point arguments, else float64. lambda = pi preserves the
-    area of each cross-section. Raises DomainError unless alpha >= 0, alpha + theta < 90 deg, 0 < H <= L cos
-    alpha, lambda > 0.
+
+def ccdbsm(brush: Brush, depth_mm: Array, tilt_deg: Array, lam: Array = math.pi) -> CcdBsm:
+    """The CCD-BSM mark (Eq. 1-5) of presses to depth H at tilt alpha; scalars or (B,), broadcast to one (B,).
+
+    See `model.arrays` for the dtype. lambda = pi preserves the area of each cross-section. Raises DomainError unless
+    alpha >= 0, alpha + theta < 90 deg, 0 < H <= L cos alpha, lambda > 0.
     """
-    require_positive("lam", lam)
-    height, tilt, radius, length, dilation = as_batch(
-        depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam, dtype=dtype
-    )
-    alpha = torch.deg2rad(tilt)
-    theta = torch.atan(radius / length)
-    _check_domain(height.detach(), tilt.detach(), theta.detach(), length.detach())
-    o3a = height * (torch.tan(alpha) - torch.tan(alpha - theta))
-    o3c = height * radius / (length * torch.cos(alpha))
-    o4o3 = height / torch.cos(alpha - theta) + o3a
-    return CcdBsm(o3a_mm=o3a, o3c_mm=o3c, o4o3_mm=o4o3, lam=dilation)
+    _require_positive("lam", lam)
+    depth, tilt, radius, length, dilation = as_batch(depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)
+    _check_domain(*map(as_numpy, (depth, tilt, radius, length)))
+    xp = library(depth)
+    return CcdBsm(*basic_lengths(depth, xp.deg2rad(tilt), radius, length, xp), dilation)
 
 
-def as_batch(*values: float | Tensor, dtype: torch.dtype | None = None) -> tuple[Tensor, ...]:
-    """All values as (B,) tensors of one floating dtype on the device of the first tensor.
-
-    The dtype is `dtype`, else that of the floating-point arguments, else float64. Raises ValueError for a
-    tensor of two or more dimensions.
-    """
-    tensors = [value for value in values if isinstance(value, Tensor)]
-    if dtype is None:
-        floating = [tensor.dtype for tensor in tensors if tensor.is_floating_point()]
-        dtype = floating[0] if floating else torch.float64
-        for other in floating[1:]:
-            dtype = torch.promote_types(dtype, other)
-    device = tensors[0].device if tensors else None
-    batch = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
-    if any(tensor.ndim > 1 for tensor in batch):
-        raise ValueError(f"stroke parameters are scalars or (B,), got shapes {[tuple(t.shape) for t in batch]}")
-    return torch.broadcast_tensors(*(torch.atleast_1d(tensor) for tensor in batch))
+def _require_positive(name: str, value: Array) -> None:
+    """Raise DomainError unless every element is positive and finite."""
+    values = as_numpy(value).reshape(-1)
+    bad = values[~((values > 0) & np.isfinite(values))]
+    if len(bad):
+        raise DomainError(name, float(bad[0]), "(0, inf)")
 
 
-def _check_domain(height: Tensor, tilt: Tensor, theta: Tensor, length: Tensor) -> None:
+def _check_domain(depth: Array, tilt: Array, radius: Array, length: Array) -> None:
     """Raise DomainError for the first press outside the domain; NaN counts as outside."""
-    limit_deg = 90 - torch.rad2deg(theta)
+    limit_deg = 90 - np.degrees(np.arctan(radius / length))
     bad = ~((tilt >= 0) & (tilt < limit_deg))
     if bad.any():
-        index = int(bad.nonzero()[0])
+        first = int(bad.argmax())
         negative = "a negative tilt is |alpha| with the heading + 180 deg"
-        hint = negative if tilt[index] < 0 else "alpha + atan(R / L) stays below 90 deg"
-        raise DomainError("tilt_deg", float(tilt[index]), f"[0, {float(limit_deg[index]):g}) deg", hint)
-    deepest = length * torch.cos(torch.deg2rad(tilt))
-    bad = ~((height > 0) & (height <= deepest))
+        hint = negative if tilt[first] < 0 else "alpha + atan(R / L) stays below 90 deg"
+        raise DomainError("tilt_deg", float(tilt[first]), f"[0, {float(limit_deg[first]):g}) deg", hint)
+    deepest = length * np.cos(np.radians(tilt))
+    bad = ~((depth > 0) & (depth <= deepest))
     if bad.any():
-        index = int(bad.nonzero()[0])
-        allowed = f"(0, {float(deepest[index]):g}] mm"
-        raise DomainError("depth_mm", float(height[index]), allowed, "H is at most L cos(alpha)")
+        first = int(bad.argmax())
+        allowed = f"(0, {float(deepest[first]):g}] mm"
+        raise DomainError("depth_mm", float(depth[first]), allowed, "H is at most L cos(alpha)")

@@ -60,9 +60,9 @@ def descend(
     """Lower a cost from `start` in at most `rounds` trials.
 
     The equations are those of the variables divided by `scale`; no step changes one of them by more than `most`. Stops
-    when a step lowers the cost by less than the share `gain`. `feasible` maps a trial to the nearest vector that is
-    allowed, or to None if there is none, which counts as a failed step. `cost` gives the cost alone where that is
-    cheaper than `equations`.
+    when a step lowers the cost by less than the share `gain` of its size. `feasible` maps a trial to the nearest vector
+    that is allowed, or to None if there is none, which counts as a failed step. `cost` gives the cost alone where that
+    is cheaper than `equations`.
     """
     vector, damped_by = start, damping.first
     at = equations(vector)
@@ -75,10 +75,10 @@ def descend(
             continue
         there = equations(allowed) if cost is None else Equations(cost(allowed), at.square, at.gradient)
         if there.cost < at.cost:
-            gained = (at.cost - there.cost) / at.cost
+            little = at.cost - there.cost < gain * abs(at.cost)
             vector, damped_by = allowed, max(damped_by / damping.shrink, damping.least)
             at = there if cost is None else equations(vector)
-            if gained < gain:
+            if little:
                 break
         else:
             damped_by *= damping.grow

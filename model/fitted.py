@@ -9,7 +9,7 @@ With h = H + h0, c = h / 15 mm, and CCD-BSM's own O3A, O4O3 and O3C at (h, alpha
 The widest place lies at lean H tan(alpha) + origin_mm + origin_gain h from the point where the tip touched, in the
 direction in which the ferrule leans; friction holds the tip back, so lean may be < 1.
 The two ends may differ from these lengths, and the edges from the profile, by what `FittedPress` calls residuals.
-The defaults are CCD-BSM as published. No torch here, so that a rig PC can evaluate it too.
+The defaults are CCD-BSM as published.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.brush import DomainError
-from brushloop.model.loops import Loop, closed
+from brushloop.model.arrays import Array, as_batch, library, like
+from brushloop.model.ccdbsm import DomainError, basic_lengths
+from brushloop.model.outline import Outline, closed
+from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 
@@ -111,10 +113,8 @@ class FittedPress:
             raise DomainError("depth_mm", depth_mm, f"({starts_mm:g}, inf)", "the fitted brush starts to mark there")
         if not 0.0 <= tilt_deg < 80.0:
             raise DomainError("tilt_deg", tilt_deg, "[0, 80)")
-        alpha, theta = math.radians(tilt_deg), math.atan(self.radius_mm / self.length_mm)
-        o3a = h * (math.tan(alpha) - math.tan(alpha - theta))
-        o3c = h * (self.radius_mm / (self.length_mm * math.cos(alpha)))
-        o4o3 = h / math.cos(alpha - theta) + o3a
+        alpha = math.radians(tilt_deg)
+        o3a, o3c, o4o3 = basic_lengths(h, alpha, self.radius_mm, self.length_mm, math)
         share = h / DEPTH_MM
         long = share ** (p["length_power"] - 1.0) * np.maximum(0.05, 1.0 + p["length_tilt"] * tilt_deg)
         wide = share ** (p["width_power"] - 1.0) * np.maximum(0.05, 1.0 + p["width_tilt"] * tilt_deg)
@@ -151,14 +151,14 @@ class FittedPress:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
         return chance_within(self.edges_at(depth_mm, tilt_deg, x_mm), y_mm, spread_mm)
 
-    def outline(self, depth_mm: float, tilt_deg: float, points: int = 97) -> Loop:
+    def outline(self, depth_mm: float, tilt_deg: float, points: int = 97) -> Outline:
         """The boundary through `points` points of each edge (an odd number), x from the point of touch, y upward."""
         s = self.sizes(depth_mm, tilt_deg)
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
         x = s.widest - s.tip + share * (s.tip + s.heel)
         top, bottom = np.maximum(self.edges_at(depth_mm, tilt_deg, x), 0.0)
-        return closed(np.column_stack([x, -bottom]), np.column_stack([x, top])[::-1])
+        return closed(np.column_stack([x, -bottom])[None], np.column_stack([x, top])[None, ::-1])
 
 
 def chance_within(edges_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
@@ -177,3 +177,21 @@ def command_terms(depth_mm: float, tilt_deg: float) -> Floats:
     """The terms of a residual, (TERMS,): 1, depth, tilt, their product and their squares, centred on their middles."""
     h, a = (depth_mm - DEPTH_MM) / DEPTH_SPAN_MM, (tilt_deg - TILT_DEG) / TILT_DEG
     return np.array([1.0, h, a, h * a, h * h, a * a])
+
+
+def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeModel:
+    """The stroke model of a calibrated brush. Its outlines carry no gradient; the fit computes its derivatives itself.
+
+    Their origin is where the brush axis meets the paper, as in every model.
+    """
+
+    def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
+        depth, tilt = as_batch(depth_mm, tilt_deg)
+        marks: list[Floats] = []
+        for h, a in zip(depth.tolist(), tilt.tolist(), strict=True):
+            marks.append(press.outline(h, a).points[0] - [h * math.tan(math.radians(a)), 0.0])
+        points = like(np.array(marks), depth)
+        return Outline(points, library(points).ones_like(points[..., 0, 0]))
+
+    definition = "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes."
+    return StrokeModel(NAME, label, definition, profile, fitted=True)

@@ -1,56 +1,22 @@
-"""Shapes of strokes: the interface that a raster needs, and the outline of a shape, a loop of conic arcs.
+"""The outline of a mark: a closed loop of conic arcs.
 
 A conic arc is a quadratic Bezier curve with a weight w on its middle point (L. Piegl and W. Tiller, "The NURBS
 Book", 2nd ed., ch. 7): w = 1 is a parabola or, with the middle point halfway, a straight line; 0 < w < 1 is an arc
 of an ellipse that spans 2 acos(w) of it. So lines, circles, ellipses and CCD-BSM's parabolas are exact; other
 curves are cut into short parabolas by `through`.
 
-The frame is defined in `model.raster.frame`. All parameters are batched: one shape per row, `(B,)`.
+The frame is defined in `model.raster`. All parameters are batched: one mark per row, `(B,)`. Everything here computes
+in numpy or, with gradients, in torch (`model.arrays`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from typing import Protocol
 
-import torch
-from torch import Tensor
+import numpy as np
 
-
-class Shape(Protocol):
-    """A batch of B shapes in the stroke frame; lengths in mm."""
-
-    @property
-    def x_min_mm(self) -> Tensor:
-        """The end of the shape on the tip side, (B,)."""
-        ...
-
-    @property
-    def x_max_mm(self) -> Tensor:
-        """The end of the shape on the heel side, (B,)."""
-        ...
-
-    @property
-    def width_mm(self) -> Tensor:
-        """The extent along y, (B,)."""
-        ...
-
-    @property
-    def area_mm2(self) -> Tensor:
-        """The area of the whole shape (both halves) in closed form, (B,)."""
-        ...
-
-    def outline(self) -> Outline:
-        """The boundary as a closed loop of conic arcs."""
-        ...
-
-
-def safe_sqrt(value: Tensor) -> Tensor:
-    """The square root of max(value, 0), any shape, with gradient 0 rather than infinity where value <= 0."""
-    positive = value > 0
-    # Both branches of `where` are differentiated, so the unused one has to be finite as well.
-    return torch.where(positive, torch.where(positive, value, torch.ones_like(value)).sqrt(), torch.zeros_like(value))
+from brushloop.model.arrays import Array, library, like, safe_sqrt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,105 +27,128 @@ class Outline:
     loop that crosses itself winds twice around an area, the area is drawn once.
     """
 
-    points: Tensor
-    weights: Tensor
-
-    def outline(self) -> Outline:
-        """Itself: an outline is a shape."""
-        return self
+    points: Array
+    weights: Array
 
     @property
-    def x_min_mm(self) -> Tensor:
-        """The least x, (B,)."""
+    def x_min_mm(self) -> Array:
+        """The least x, the end on the tip side, (B,)."""
         return self._extreme(0, -1)
 
     @property
-    def x_max_mm(self) -> Tensor:
-        """The greatest x, (B,)."""
+    def x_max_mm(self) -> Array:
+        """The greatest x, the end on the heel side, (B,)."""
         return self._extreme(0, 1)
 
     @property
-    def width_mm(self) -> Tensor:
+    def width_mm(self) -> Array:
         """The extent along y, (B,)."""
         return self._extreme(1, 1) - self._extreme(1, -1)
 
     @property
-    def area_mm2(self) -> Tensor:
+    def area_mm2(self) -> Array:
         """The enclosed area by Green's theorem, (B,): the polygon of the arcs' ends plus a segment under each."""
-        start, middle, end = self.points.unbind(2)
+        xp = library(self.points)
+        start, middle, end = _nodes(self.points)
         polygon = 0.5 * cross(start, end)
         # A parabola fills two thirds of its triangle (Archimedes).
         parabola = cross(middle - start, end - start) / 3
         curved = self.weights < 1
-        w = torch.where(curved, self.weights, torch.full_like(self.weights, 0.5))
+        w = xp.where(curved, self.weights, xp.full_like(self.weights, 0.5))
         _, along, across = ellipse_of(self.points, w)
         sine = safe_sqrt((1 - w) * (1 + w))
-        segment = cross(along, across) * (torch.atan2(sine, w) - sine * w)
-        return (polygon + torch.where(curved, segment, parabola)).sum(-1)
+        segment = cross(along, across) * (xp.arctan2(sine, w) - sine * w)
+        return (polygon + xp.where(curved, segment, parabola)).sum(-1)
 
-    def at(self, t: Tensor) -> Tensor:
-        """Evaluate every arc at t in [0, 1]: (N,) -> (B, K, N, 2) mm."""
-        return evaluate(self.points[:, :, None], self.weights[:, :, None], t)
-
-    def polyline(self, per_arc: int = 32) -> Tensor:
+    def polyline(self, per_arc: int = 32) -> Array:
         """Points on the loop in order, per_arc on each arc, (B, K per_arc, 2) mm; the last joins the first."""
         if per_arc < 1:
             raise ValueError(f"per_arc = {per_arc}: expected at least one point per arc")
-        t = torch.arange(per_arc, dtype=self.points.dtype, device=self.points.device) / per_arc
-        return self.at(t).flatten(1, 2)
+        t = like(np.arange(per_arc) / per_arc, self.points)
+        points = evaluate(self.points[:, :, None], self.weights[:, :, None], t)
+        return points.reshape(len(points), -1, 2)
 
-    def _extreme(self, axis: int, sign: int) -> Tensor:
+    def _extreme(self, axis: int, sign: int) -> Array:
         """The greatest of sign * coordinate over each loop, times sign, (B,)."""
-        p0, p1, p2 = (sign * self.points[..., axis]).unbind(2)
-        ends = torch.maximum(p0, p2)
+        xp = library(self.points)
+        p0, p1, p2 = (sign * node[..., axis] for node in _nodes(self.points))
+        ends = xp.maximum(p0, p2)
         # An arc leaves the span of its ends only if its middle point does.
-        w = self.weights
-        curved = w < 1
-        safe = torch.where(curved, w, torch.full_like(w, 0.5))
-        centre, along, across = (sign * part[..., axis] for part in ellipse_of(self.points, safe))
+        curved = self.weights < 1
+        w = xp.where(curved, self.weights, xp.full_like(self.weights, 0.5))
+        centre, along, across = (sign * part[..., axis] for part in ellipse_of(self.points, w))
         ellipse = centre + safe_sqrt(along**2 + across**2)
         bend = p0 - 2 * p1 + p2
-        parabola = p0 - (p0 - p1) ** 2 / torch.where(bend == 0, torch.ones_like(bend), bend)
-        beyond = torch.where(curved, ellipse, parabola)
-        return sign * torch.where(p1 > ends, beyond, ends).amax(-1)
+        parabola = p0 - (p0 - p1) ** 2 / xp.where(bend == 0, xp.ones_like(bend), bend)
+        beyond = xp.where(curved, ellipse, parabola)
+        return sign * xp.amax(xp.where(p1 > ends, beyond, ends), -1)
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
+def cross(a: Array, b: Array) -> Array:
     """The z part of the cross product of plane vectors, (..., 2), (..., 2) -> (...)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def ellipse_of(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def ellipse_of(points: Array, weights: Array) -> tuple[Array, Array, Array]:
     """Centre C and half axes E, F of arcs of ellipses, (..., 3, 2), (...) -> three (..., 2).
 
     The arc is C + E cos u + F sin u for |u| <= acos(w); E points to the middle of the arc. Requires 0 < w < 1.
     """
-    start, middle, end = points.unbind(-2)
-    w = weights.unsqueeze(-1)
+    start, middle, end = _nodes(points)
+    w = weights[..., None]
     chord = 0.5 * (start + end)
     centre = middle + (chord - middle) / ((1 - w) * (1 + w))
     return centre, (chord - centre) / w, 0.5 * (end - start) / safe_sqrt((1 - w) * (1 + w))
 
 
-def evaluate(points: Tensor, weights: Tensor, t: Tensor) -> Tensor:
+def evaluate(points: Array, weights: Array, t: Array) -> Array:
     """Conic arcs at t, broadcast: (..., 3, 2), (...), (...) -> (..., 2)."""
-    b0, b1, b2 = (1 - t) ** 2, 2 * weights * t * (1 - t), t**2
-    shares = torch.stack(torch.broadcast_tensors(b0, b1, b2), dim=-1)
-    shares = shares / shares.sum(-1, keepdim=True)
-    return (shares.unsqueeze(-1) * points).sum(-2)
+    start, middle, end = _nodes(points)
+    b0, b1, b2 = (b[..., None] for b in ((1 - t) ** 2, 2 * weights * t * (1 - t), t**2))
+    return (b0 * start + b1 * middle + b2 * end) / (b0 + b1 + b2)
 
 
-def loop(*arcs: tuple[Sequence[Tensor], float | Tensor]) -> Outline:
-    """Make an outline from one ((x0, y0, x1, y1, x2, y2), weight) per arc, every number (B,)."""
-    points = torch.stack([torch.stack(list(numbers), dim=-1) for numbers, _ in arcs], dim=1)
-    weights = [torch.as_tensor(w, dtype=points.dtype, device=points.device).expand(len(points)) for _, w in arcs]
-    return Outline(points.unflatten(-1, (3, 2)), torch.stack(weights, dim=1))
-
-
-def through(curve: Tensor) -> Tensor:
+def through(curve: Array) -> Array:
     """Parabolas through a finely sampled curve, (B, 2 N + 1, 2) -> (B, N, 3, 2): each takes three points.
 
     The error falls with the third power of the step; its sign changes within a piece, so areas keep the fourth.
     """
     start, on, end = curve[:, :-1:2], curve[:, 1::2], curve[:, 2::2]
-    return torch.stack((start, 2 * on - 0.5 * (start + end), end), dim=2)
+    return library(curve).stack((start, 2 * on - 0.5 * (start + end), end), 2)
+
+
+def closed(*curves: Array) -> Outline:
+    """The outline of parabolas through finely sampled curves (B, 2 N + 1, 2), joined by straight lines in order."""
+    xp = library(*curves)
+    arcs: list[Array] = []
+    for curve, following in zip(curves, (*curves[1:], curves[0]), strict=True):
+        end, start = curve[:, -1], following[:, 0]
+        arcs += [through(curve), xp.stack((end, 0.5 * (end + start), start), 1)[:, None]]
+    points = xp.concat(arcs, 1)
+    return Outline(points, xp.ones_like(points[..., 0, 0]))
+
+
+def rounded(centre: Array, half_x: Array, half_y: Array, corner_x: Array, corner_y: Array) -> Outline:
+    """A box around (centre, 0) with quarter-ellipse corners, all (B,) mm: four corners, each with the side after it.
+
+    Corners as large as the box make an ellipse, whose sides have no length.
+    """
+    xp = library(centre)
+    flat_x, flat_y = half_x - corner_x, half_y - corner_y
+    corners: list[Array] = []
+    for k, (right, up) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
+        side = xp.stack((centre + right * half_x, up * flat_y), -1)
+        top = xp.stack((centre + right * flat_x, up * half_y), -1)
+        corner = xp.stack((centre + right * half_x, up * half_y), -1)
+        corners.append(xp.stack((side, corner, top) if k % 2 == 0 else (top, corner, side), 1))
+    arcs: list[Array] = []
+    for this, following in zip(corners, (*corners[1:], corners[0]), strict=True):
+        end, start = this[:, 2], following[:, 0]
+        arcs += [this, xp.stack((end, 0.5 * (end + start), start), 1)]
+    points = xp.stack(arcs, 1)
+    return Outline(points, xp.ones_like(points[..., 0, 0]) * like([math.sqrt(0.5), 1.0] * 4, points))
+
+
+def _nodes(points: Array) -> tuple[Array, Array, Array]:
+    """The three control points of arcs (..., 3, 2), each (..., 2)."""
+    return points[..., 0, :], points[..., 1, :], points[..., 2, :]

@@ -43,7 +43,7 @@ FIRST = (
     "tests/collect/tui/test_session.py",
     "tests/collect/quality/test_recognised.py",
     "tests/calibrate/fit",
-    "tests/model/train",
+    "tests/model/test_train.py",
     "tests/collect/teach/test_first_day.py",
 )
 """The longest tests and groups, longest first, so that no worker is left alone with one of them at the end."""

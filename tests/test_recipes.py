@@ -32,7 +32,7 @@ from brushloop.drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
 from brushloop.model import strokes
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_models
 

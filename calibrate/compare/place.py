@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -24,14 +24,11 @@ from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.preprocess import Prepared, Steps, prepare, preprocess
 from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
-from brushloop.model.brush import Brush
-from brushloop.model.loops import Loop
+from brushloop.model.ccdbsm import Brush
+from brushloop.model.outline import Outline
+from brushloop.model.strokes import StrokeModel
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Header
-
-if TYPE_CHECKING:
-    from brushloop.model.outline import Shape
-    from brushloop.model.strokes import StrokeModel
 
 Image = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
@@ -224,17 +221,17 @@ def captured_images(stroke_id: str, prepared: Prepared) -> dict[Key, Image]:
 
 
 def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
-    """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.brush.DomainError`."""
-    gray = drawn(loop_of(model.profile(depth_mm, tilt_deg)), axis_mm(depth_mm, tilt_deg), field)
+    """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.ccdbsm.DomainError`."""
+    gray = drawn(model.profile(depth_mm, tilt_deg), axis_mm(depth_mm, tilt_deg), field)
     return {(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS}
 
 
 def simulated_pixels(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> Pixels:
-    """(len(KEYS), 128, 128) predictions of a press. May raise `model.brush.DomainError`."""
+    """(len(KEYS), 128, 128) predictions of a press. May raise `model.ccdbsm.DomainError`."""
     return key_pixels(simulated(model, depth_mm, tilt_deg, field))
 
 
-def loop_pixels(loop: Loop, field: Field) -> Pixels:
+def loop_pixels(loop: Outline, field: Field) -> Pixels:
     """(len(KEYS), 128, 128) of a mark whose x is from the zero-touch point."""
     gray = drawn(loop, 0.0, field)
     return key_pixels({(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS})
@@ -245,13 +242,6 @@ def key_pixels(images: dict[Key, Image]) -> Pixels:
     return np.stack([to_pixels(images[key]) for key in KEYS])
 
 
-def loop_of(shape: Shape) -> Loop:
-    """The outline of a shape, as numbers without gradients."""
-    outline, ends = shape.outline(), (shape.x_min_mm, shape.x_max_mm)
-    points, weights = (part[0].detach().double().cpu().numpy() for part in (outline.points, outline.weights))
-    return Loop(points, weights, *(float(end[0]) for end in ends))
-
-
 def axis_mm(depth_mm: float, tilt_deg: float) -> float:
     """Distance from the zero-touch point to where the brush axis meets the paper, toward the side the ferrule leans to.
 
@@ -260,24 +250,25 @@ def axis_mm(depth_mm: float, tilt_deg: float) -> float:
     return depth_mm * math.tan(math.radians(tilt_deg))
 
 
-def drawn(loop: Loop, origin_x_mm: float, field: Field) -> dict[Alignment, Image]:
+def drawn(loop: Outline, origin_x_mm: float, field: Field) -> dict[Alignment, Image]:
     """(128, 128) exact coverage of a mark in each alignment.
 
     `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
     """
     left, top = field.anchor_mm
-    middle_mm, normal_mm = 0.5 * (loop.x_min_mm + loop.x_max_mm), (loop.x_max_mm - loop.x_min_mm) / NORMAL_LENGTH_PX
+    x_min_mm, x_max_mm = float(loop.x_min_mm[0]), float(loop.x_max_mm[0])
+    middle_mm, normal_mm = 0.5 * (x_min_mm + x_max_mm), (x_max_mm - x_min_mm) / NORMAL_LENGTH_PX
     side_mm = SIZE_PX * normal_mm
     views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
     return dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(loop, views, SIZE_PX), strict=True))
 
 
-def draw_loop(loop: Loop, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:
+def draw_loop(loop: Outline, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:
     """Exact coverage of a mark in each view, (mm per pixel, x and y of its origin from the upper left corner, mm)."""
     from brushloop.model.raster import kernel  # numba takes a fifth of a second to import
 
     maps = np.array([[1 / px, 0.0, x / px, 0.0, -1 / px, y / px] for px, x, y in views])
-    points, weights = (np.stack([part] * len(maps)) for part in (loop.points, loop.weights))
+    points, weights = (np.stack([part[0]] * len(maps)) for part in (loop.points, loop.weights))
     out = np.empty((len(maps), size_px, size_px), np.float32)
     untyped: Any = kernel
     untyped.rasterise(points, weights, maps, out)

@@ -16,10 +16,12 @@ from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Floats, Grid, Pres
 from brushloop.calibrate.fit.fit import fit_presses, zero_touches
 from brushloop.calibrate.fit.prior import Prior
 from brushloop.calibrate.stats import CEILING, Average, average, ceiling_values, pair_means
-from brushloop.model.brush import DomainError
+from brushloop.model.arrays import as_batch
+from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
-from brushloop.model.loops import BEZIER_PIECES, Loop, bezier_side, closed
-from brushloop.model.plane import Plane, fit_plane
+from brushloop.model.outline import Outline
+from brushloop.model.strokes import Plane, fit_plane
+from brushloop.model.strokes.peers import bezier
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -27,7 +29,6 @@ BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
 Predict = Callable[[float, float], Images]
-Outline = Callable[[float, float], Loop]
 MAX_FOLDS = 15
 """Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
 PER_CELL = 3
@@ -97,7 +98,7 @@ def leave_cell_out(
         # In 256 levels, as validation stores them: the numbers of both are equal.
         others = [replace(one, ink=to_pixels(np.asarray(one.ink, np.float32)) / 255.0) for one in without(cells, fold)]
         press = fit_held_out(others, grid, radius_mm, length_mm, prior)
-        models: dict[str, Outline] = {FITTED: press.outline, UNCALIBRATED: published.outline}
+        models: dict[str, Callable[[float, float], Outline]] = {FITTED: press.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
             models[BEZIER] = refit_bezier(others, grid).outline
         for cell in fold:
@@ -107,7 +108,7 @@ def leave_cell_out(
 
 
 def _images(
-    models: Mapping[str, Callable[[float, float], Loop]], cell: Cell, grid: Grid
+    models: Mapping[str, Callable[[float, float], Outline]], cell: Cell, grid: Grid
 ) -> Iterator[tuple[str, Images]]:
     for name, outline in models.items():
         with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
@@ -156,16 +157,14 @@ class RefittedBezier:
 
     plane: Plane
 
-    def outline(self, depth_mm: float, tilt_deg: float) -> Loop:
+    def outline(self, depth_mm: float, tilt_deg: float) -> Outline:
         """The stroke, x from the point of touch."""
         left, right, belly, shoulder = self.plane.at(depth_mm, tilt_deg).values()
-        t = np.linspace(1.0, 0.0, 2 * BEZIER_PIECES + 1)
         right, belly, shoulder = max(right, left + 0.2), max(belly, 0.1), min(max(shoulder, 0.0), 1.0)
-        x, y = bezier_side(t, -left, right, belly, shoulder)
-        return closed(np.column_stack([x, y]), np.column_stack([x, -y])[::-1])
+        return bezier(*as_batch(-left, right, belly, shoulder))
 
 
-def image_of(loop: Loop, grid: Grid) -> Images:
+def image_of(loop: Outline, grid: Grid) -> Images:
     """Coverage (len(y_mm), len(x_mm)) of a mark on the grid."""
     corner = (0.5 * grid.px_mm - float(grid.x_mm[0]), 0.5 * grid.px_mm + float(grid.y_mm[0]))
     image = draw_loop(loop, [(grid.px_mm, *corner)], max(len(grid.x_mm), len(grid.y_mm)))[0]
@@ -183,7 +182,7 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
         left = float(grid.x_mm[columns[0]]) - 0.5 * grid.px_mm
         right = float(grid.x_mm[columns[-1]]) + 0.5 * grid.px_mm
         width = float(stroke.ink.sum(axis=0).max()) * grid.px_mm
-        # The enclosed area is belly length (4 - s) / 5, as in `model.strokes.bezier`.
+        # The enclosed area is belly length (4 - s) / 5, as in `model.strokes.peers.bezier_sizes`.
         area = float(stroke.ink.sum()) * grid.px_mm**2
         rows.append((left, right, width, float(np.clip(4.0 - 5.0 * area / (width * (right - left)), 0.0, 1.0))))
     height, tilt = [s.depth_mm for s in strokes], [s.tilt_deg for s in strokes]

@@ -27,9 +27,9 @@ from brushloop.calibrate.report import (
     source_point,
 )
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
-from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
-from brushloop.model.loops import Loop
+from brushloop.model.outline import Outline
 
 MAX_CELLS = 48
 MARGIN_MM = 1.5
@@ -110,7 +110,7 @@ def _csim(press: FittedPress, cell: Cell, strokes: list[Pressed], grid: Grid) ->
     return f"{100.0 * np.mean([csim(drawn, image) for image in seen if image.any()]):.1f}"
 
 
-def _outline(press: FittedPress, cell: Cell) -> Loop | None:
+def _outline(press: FittedPress, cell: Cell) -> Outline | None:
     try:
         return press.outline(*cell)
     except DomainError:  # so light that the brush leaves no mark
@@ -122,7 +122,7 @@ def _path(press: FittedPress, cell: Cell) -> str:
     loop = _outline(press, cell)
     if loop is None:
         return ""
-    points = np.round(loop.points * np.array([1.0, -1.0]), 2)
+    points = np.round(np.asarray(loop.points[0], np.float64) * [1.0, -1.0], 2)
     x, y = points[0, 0].tolist()
     curves = "".join(f"Q{a:g} {b:g} {c:g} {d:g}" for (a, b), (c, d) in points[:, 1:].tolist())
     return f"M{x:g} {y:g}{curves}Z"

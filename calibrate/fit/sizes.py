@@ -15,7 +15,7 @@ import numpy as np
 
 from brushloop.calibrate.fit.captures import Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.stats import student_95
-from brushloop.model.plane import fit_plane
+from brushloop.model.strokes import fit_plane
 
 SIZES = ("reach toward the tip", "reach toward the heel", "width")
 """From the point of touch to either end of the ink, and the greatest width; mm."""

@@ -1,16 +1,13 @@
-"""`brushloop invert SESSION` as a function: depth and tilt of every captured press, and the protocol that repeats them.
-
-Importing this module loads torch.
-"""
+"""`brushloop invert SESSION` as a function: depth and tilt of each press, and the protocol that repeats them."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.compare import MM_PER_PX
@@ -29,12 +26,9 @@ from brushloop.calibrate.invert.invert import (
 )
 from brushloop.calibrate.presses import Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.model.brush import Brush, DomainError
-from brushloop.model.fitted import NAMES
-from brushloop.model.fitted_shape import fitted_model
-from brushloop.model.inversion.noise import Noise
-from brushloop.model.inversion.press import Inverter, Range
-from brushloop.model.protocol import Basis
+from brushloop.model.ccdbsm import Brush, DomainError
+from brushloop.model.fitted import NAMES, fitted_model
+from brushloop.model.inversion import Inverter, Range
 from brushloop.model.strokes import UnknownModelError, stroke_model
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, unseen
@@ -164,10 +158,6 @@ def _inverter(request: RecoverRequest, brush: Brush) -> tuple[Inverter, str, Col
             raise ValueError(f"tilt_deg = {within.tilt_deg}: expected 0 to 30")
     except ValueError as error:
         raise CalibrationError("--depth-range, --tilt-range", str(error)) from None
-    options: dict[str, Any] = {
-        "noise": Noise.BLOCKS, "px_mm": request.mm_per_px, "anchor_sigma_mm": request.anchor_sd_mm
-    }  # fmt: skip
-    basis = Basis(brush) if request.lam is None else Basis(brush, request.lam)
     try:
         if request.fit is not None:
             artefact = load_artefact(request.fit, BrushFit)
@@ -177,11 +167,11 @@ def _inverter(request: RecoverRequest, brush: Brush) -> tuple[Inverter, str, Col
             if least >= within.depth_mm[1]:
                 raise CalibrationError("--depth-range", f"ends before the fitted brush marks, at {least:.2f} mm")
             model, within = fitted_model(press), Range((least, within.depth_mm[1]), within.tilt_deg)
-            return Inverter.of_model(model, within=within, **options), model.name, artefact.cells
-        if request.model == "ccd-bsm":
-            return Inverter.of_brush(basis, within=within, **options), request.model, ()
-        model = stroke_model(request.model, brush, basis.lam)
-        return Inverter.of_model(model, within=within, **options), request.model, ()
+            cells: Collection[DepthTilt] = artefact.cells
+        else:
+            model, cells = stroke_model(request.model, brush, math.pi if request.lam is None else request.lam), ()
+        inverter = Inverter(model, within, px_mm=request.mm_per_px, anchor_sigma_mm=request.anchor_sd_mm)
+        return inverter, model.name, cells
     except UnknownModelError as error:
         raise CalibrationError("--model", str(error)) from None
     except DomainError as error:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.presses import Press, Refused
 from brushloop.calibrate.stats import student_95
-from brushloop.model.inversion.press import Flag, Inverter
+from brushloop.model.inversion import Flag, Inverter
 
 NO_MODEL_ERROR = "no_model_error"
 """Flag of a press whose standard deviations leave out the error of the model."""

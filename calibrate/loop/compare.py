@@ -15,12 +15,12 @@ from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.loop.scores import Pair, PairScore, Verdict, score_pairs, verdicts
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import DomainError
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.terminal import Progress, unseen
 
 if TYPE_CHECKING:
-    from brushloop.model.protocol import StrokeModel
+    from brushloop.model.strokes import StrokeModel
 
 NOT_AGAIN = "was not pressed again"
 
@@ -115,10 +115,10 @@ def _replayed(header: Header) -> str | None:
 def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     """The model and the digest of the recording that it was fitted to, empty for none."""
     if fit is None:
-        from brushloop.model.strokes import stroke_model  # torch, which takes seconds to load
+        from brushloop.model.strokes import stroke_model
 
         return stroke_model("ccd-bsm", brush_of(header)), ""
     artefact = load_artefact(fit, BrushFit)
-    from brushloop.model.fitted_shape import fitted_model
+    from brushloop.model.fitted import fitted_model
 
     return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.score import csim
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import (
     BLUE,
@@ -24,10 +23,11 @@ from brushloop.calibrate.report import (
     printable,
     render,
 )
-from brushloop.model.protocol import ParameterSpec
-from brushloop.model.train.checkpoint import load_checkpoint, load_weights, sha256
-from brushloop.model.train.config import TrainConfig
-from brushloop.model.train.report import load_samples
+from brushloop.model.generator.stroke import read_generator
+from brushloop.model.generator.targets import INPUTS
+from brushloop.model.train.card import NUMBERS, load_samples, read_curves
+from brushloop.model.train.config import TrainConfig, config_of
+from brushloop.model.train.data import sha256
 
 PAGE = "training.html"
 SMOOTH_STEPS = 50
@@ -35,7 +35,6 @@ MAX_POINTS = 2000
 """Points of the loss curve that are drawn, evenly chosen from all."""
 MUCH_ABOVE = 1.5
 """Times its lowest value that the last validation loss may be."""
-SHOWN_INPUTS = 4
 EXACT = "exact images of a stroke model"
 
 
@@ -45,18 +44,15 @@ def write_training_page(folder: Path) -> Path:
     Raises TrainError for a folder that holds no finished training, and OSError.
     """
     path = folder / "generator.safetensors"
-    config, _, report = load_weights(path)
-    _, state = load_checkpoint(folder / "checkpoint.safetensors")
-    if not len(state.losses):
-        raise CalibrationError(str(folder), "holds no training step")
-    losses = np.asarray(state.losses.numpy(), np.float64)
-    checks = np.asarray(state.validations.numpy(), np.float64)
+    file = read_generator(path)
+    config, report = config_of(path, file), file.report
+    losses, checks = read_curves(folder)
     label = config.tuning.source if config.tuning else EXACT
     text = render(
         "training.html.j2",
         label=label,
         note=_note(config),
-        samples=list(_samples(folder, config.build_target().inputs)),
+        samples=list(_samples(folder)),
         images=f"{config.target.size_px} × {config.target.size_px} pixels of {config.target.px_mm:g} mm",
         verdict=list(_verdict(config, report)),
         trust=list(_trust(config, report, checks)),
@@ -64,7 +60,10 @@ def write_training_page(folder: Path) -> Path:
         likeness=_likeness(checks, label) if len(checks) > 1 else "",
         tuned=config.tuning is not None,
         numbers=list(_numbers(report)),
-        inputs=config.build_target().inputs,
+        inputs=(
+            ("depth_mm", "mm", config.target.depth_mm, "H, how far the tip is pressed below the paper"),
+            ("tilt_deg", "deg", config.target.tilt_deg, "alpha, the brush axis from the vertical"),
+        ),
         facts=list(_facts(config, report, path)),
     )
     page = folder / PAGE
@@ -78,17 +77,15 @@ def _note(config: TrainConfig) -> str:
     return "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated"
 
 
-def _samples(folder: Path, inputs: Sequence[ParameterSpec]) -> Iterator[dict[str, Any]]:
+def _samples(folder: Path) -> Iterator[dict[str, Any]]:
     """Target, network and difference of each stroke that the training kept, the worst first."""
-    found = load_samples(folder, len(inputs))
-    values: list[list[float]] = np.asarray(found.inputs.numpy(), np.float64).tolist()
-    targets, images = _images(found.targets), _images(found.drawn)
+    found = load_samples(folder)
+    targets, images = (list(np.asarray(stack, np.float32)) for stack in (found.targets, found.drawn))
     scores = [_score(target, drawn) for target, drawn in zip(targets, images, strict=True)]
     for k in sorted(range(len(scores)), key=lambda k: scores[k]):
         target, drawn = targets[k], images[k]
-        named = [f"{spec.name} {value:.3g}" for spec, value in zip(inputs, values[k], strict=True)]
         yield {
-            "name": ", ".join(named[:SHOWN_INPUTS]) + (" …" if len(named) > SHOWN_INPUTS else ""),
+            "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, found.inputs[k], strict=True)),
             "csim": f"{100.0 * scores[k]:.2f}",
             "images": {
                 "target": ink_uri(target),
@@ -100,11 +97,6 @@ def _samples(folder: Path, inputs: Sequence[ParameterSpec]) -> Iterator[dict[str
 
 def _score(target: Image, drawn: Image) -> float:
     return csim(target, drawn) if target.any() and drawn.any() else 0.0
-
-
-def _images(pixels: Any) -> list[Image]:
-    stack: NDArray[np.float32] = np.asarray(pixels.numpy(), np.float32) / np.float32(255.0)
-    return list(stack)
 
 
 def _verdict(config: TrainConfig, report: dict[str, Any]) -> Iterator[str]:
@@ -172,14 +164,7 @@ def _short(text: str) -> str:
 
 
 def _numbers(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for label, name, form in (
-        ("MSE", "mse", ".3g"),
-        ("PSNR, dB", "psnr_db", ".2f"),
-        ("IoU", "iou", ".5f"),
-        ("CSIM", "csim", ".5f"),
-        ("SSIM, mean", "ssim", ".5f"),
-        ("SSIM, least", "ssim_min", ".5f"),
-    ):
+    for label, name, form in NUMBERS:
         value = report.get(name)
         if isinstance(value, int | float):
             yield label, format(value, form)
@@ -187,7 +172,10 @@ def _numbers(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _facts(config: TrainConfig, report: dict[str, Any], path: Path) -> Iterator[tuple[str, str]]:
     target = config.target
-    yield "stroke model", f"{target.model}, R {target.radius_mm:g} mm, L {target.length_mm:g} mm, λ {target.lam:.5g}"
+    yield (
+        "stroke model",
+        f"{target.model.name}, R {target.radius_mm:g} mm, L {target.length_mm:g} mm, λ {target.lam:.5g}",
+    )
     yield "network", ", ".join(f"{name} {value}" for name, value in config.layers.model_dump().items())
     yield "training", f"{config.batch} images a step, seed {config.seed}, highest rate {config.learning_rate:g}"
     if config.tuning:

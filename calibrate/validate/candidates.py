@@ -1,7 +1,4 @@
-"""The models compared with captures: every registered one, the fitted brush, refits to other cells, generators.
-
-Models need torch, which takes seconds to load; therefore they are imported when the first one is made.
-"""
+"""The models compared with captures: every registered one, the fitted brush, refits to other cells, generators."""
 
 from __future__ import annotations
 
@@ -15,12 +12,12 @@ from typing import TYPE_CHECKING
 from brushloop.calibrate.compare.place import Field, Pixels, brush_of, loop_pixels, simulated_pixels
 from brushloop.calibrate.validate.heldout import Refit, bezier_pixels
 from brushloop.calibrate.validate.sources import LoadedSession
-from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.fitted import NAME
 from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
-    from brushloop.model.protocol import StrokeModel
+    from brushloop.model.strokes import StrokeModel
 
 FITTED = NAME
 PUBLISHED = "as published"
@@ -63,7 +60,7 @@ def generator_file(path: Path) -> Generator:
 
 def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> list[Candidate]:
     """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
-    from brushloop.model.fitted_shape import fitted_model
+    from brushloop.model.fitted import fitted_model
     from brushloop.model.strokes import stroke_model, stroke_models
 
     brush = brush_of(session.header)
@@ -81,7 +78,7 @@ def closed_forms(session: LoadedSession, view: Field, *, ablations: bool) -> lis
 
 def generators(session: LoadedSession, files: Sequence[Generator], view: Field) -> list[Candidate]:
     """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
-    from brushloop.model.train.checkpoint import load_generator
+    from brushloop.model.generator.stroke import load_generator
 
     found: list[Candidate] = []
     for number, file in enumerate(files):
@@ -89,7 +86,7 @@ def generators(session: LoadedSession, files: Sequence[Generator], view: Field) 
         name = (
             model.name if number == 0 or model.name not in {one.name for one in found} else f"{model.name}-{number + 1}"
         )
-        images = f"trained on exact images of {model.target.model.label}"
+        images = "trained on exact images of CCD-BSM"
         basis = f"{images}, then tuned on captures" if model.fitted else images
         found.append(replace(_of_model(model, basis, view, name, model.label), file=file.path))
     return found
@@ -127,7 +124,7 @@ def held_out(fits: dict[Condition, Refit], brush: Brush, view: Field, *, fitted:
 
 def tuned(files: dict[Condition, Path], brush: Brush, view: Field, number: int) -> Candidate:
     """A generator tuned on all cells except the one it predicts."""
-    from brushloop.model.train.checkpoint import load_generator
+    from brushloop.model.generator.stroke import load_generator
 
     loaded: dict[Path, StrokeModel] = {}
 

@@ -28,7 +28,7 @@ from brushloop.calibrate.validate.rows import Numbers, Rows
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import VERSION, Store
 from brushloop.model.fitted import MODES, TERMS, FittedPress
-from brushloop.model.plane import Plane
+from brushloop.model.strokes import Plane
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
 

@@ -27,7 +27,7 @@ from brushloop.calibrate.validate.rows import Numbers, Row, Rows
 from brushloop.calibrate.validate.sources import LoadedSession
 from brushloop.calibrate.validate.store import Store
 from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
-from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import DomainError
 from brushloop.sessions.terminal import Progress
 
 CHUNK = 16

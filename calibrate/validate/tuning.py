@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import FINE, Field, Image, axis_mm, brush_of, prepare_press
+from brushloop.calibrate.compare.place import FINE, Field, Image, brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.fit.heldout import folds
 from brushloop.calibrate.report import source_label
@@ -28,14 +28,14 @@ from brushloop.calibrate.validate.candidates import Generator
 from brushloop.calibrate.validate.heldout import Refit
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
 from brushloop.calibrate.validate.store import VERSION
-from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import DomainError
+from brushloop.model.generator.targets import ANCHOR_SHARE, INPUTS, Placement, Target
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
 
 if TYPE_CHECKING:
-    from brushloop.model.generator.stroke import GeneratorModel
-    from brushloop.model.train.loop import Validation
+    from brushloop.model.train.train import Validation
 
 MAX_STROKES = 100_000
 FOLDS = 5
@@ -66,7 +66,7 @@ class AlignedStrokes:
 
 def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStrokes:
     """Convert the presses of sessions to the generator's image format. Raises what `load_generator` raises."""
-    from brushloop.model.train.checkpoint import load_generator
+    from brushloop.model.generator.stroke import load_generator
 
     target = load_generator(generator).target
     label = source_label(one_source(sessions), (session.header.brush for session in sessions))
@@ -79,11 +79,12 @@ def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStr
                 aligned.left_out.append((stroke.stroke_id, "has no depth or tilt"))
                 continue
             try:
-                values = _inputs_of(model, stroke.depth_mm, stroke.tilt_deg)
+                values: dict[str, float] = dict(zip(INPUTS, (stroke.depth_mm, stroke.tilt_deg), strict=True))
+                model.target.check(np.array([list(values.values())]))
                 prepared = prepare_press(capture, session.calibration, Field())
                 if prepared.cut:
                     raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
-                aligned.images.append(_placed(prepared, model, values, stroke.depth_mm, stroke.tilt_deg))
+                aligned.images.append(_placed(prepared, model.target))
             except (CaptureRefused, SessionDamaged) as error:
                 aligned.left_out.append((stroke.stroke_id, error.what))
                 continue
@@ -102,16 +103,14 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condi
 
     Raises `CalibrationError` if fewer than two conditions are left.
     """
-    import torch
-
     from brushloop.model.train.data import save_captures
 
     chosen = [k for k, cell in enumerate(aligned.cells) if cell not in leave_out]
     conditions = len({tuple(aligned.inputs[k].values()) for k in chosen})
     if conditions < 2:
         raise CalibrationError(str(out), f"{conditions} conditions are left, at least 2 are needed to tune on")
-    columns = {name: torch.tensor([aligned.inputs[k][name] for k in chosen]) for name in aligned.inputs[0]}
-    stack = torch.as_tensor(np.stack([aligned.images[k] for k in chosen]))
+    columns = {name: [aligned.inputs[k][name] for k in chosen] for name in aligned.inputs[0]}
+    stack = np.stack([aligned.images[k] for k in chosen]).astype(np.float32)
     out.parent.mkdir(parents=True, exist_ok=True)
     save_captures(out, columns, stack, aligned.px_mm, aligned.placement, aligned.source)
     return len(chosen)
@@ -154,7 +153,7 @@ def tuned_by_cell(
 
 @dataclass(slots=True)
 class _TrainingProgress:
-    """Reports the steps of a training; see `model.train.loop.Progress`."""
+    """Reports the steps of a training; see `model.train.train.Progress`."""
 
     progress: Progress
     what: str
@@ -170,18 +169,18 @@ class _TrainingProgress:
 def _tune(
     folder: Path, captures: Path, generator: Generator, source: str, steps: int, progress: _TrainingProgress
 ) -> None:
-    from brushloop.model.train.checkpoint import load_weights, sha256
+    from brushloop.model.generator.stroke import read_generator
     from brushloop.model.train.config import checked
-    from brushloop.model.train.run import Tuning, run_training
+    from brushloop.model.train.data import sha256
+    from brushloop.model.train.train import TuningFiles, run_training
 
-    config, _, _ = load_weights(generator.path)
     tuning: dict[str, Any] = {
         "start_sha256": generator.sha256,
         "captures_sha256": sha256(captures),
         "source": source,
         "held_out": HELD_OUT,
     }
-    fields: dict[str, Any] = config.model_dump() | {
+    fields: dict[str, Any] = read_generator(generator.path).config | {
         "steps": steps,
         "learning_rate": LEARNING_RATE,
         "seed": 0,
@@ -190,68 +189,40 @@ def _tune(
         "checkpoint_every": max(1, steps // 4),
         "tuning": tuning,
     }
-    files = Tuning(generator.path, captures)
+    files = TuningFiles(generator.path, captures)
     run_training(checked("tune", fields), folder, progress, lambda: False, files)
 
 
 def _with_images(aligned: AlignedStrokes, session: LoadedSession, fit: Refit, generator: Generator) -> AlignedStrokes:
-    """Add images of the fitted brush, if the generator's inputs are depth and tilt alone."""
-    import torch
-
-    from brushloop.model.fitted_shape import fitted_model
-    from brushloop.model.generator.targets import Placement, Target
-    from brushloop.model.train.checkpoint import load_generator
+    """Add images of the fitted brush, if there is one."""
+    from brushloop.model.fitted import fitted_model
+    from brushloop.model.generator.stroke import load_generator
 
     brush = brush_of(session.header)
     target = load_generator(generator.path, brush).target
-    ranges = {spec.name: (spec.low, spec.high) for spec in target.inputs}
-    if fit.fitted is None or set(ranges) != {"depth_mm", "tilt_deg"} or target.placement is Placement.BASE:
+    if fit.fitted is None:
         return aligned
     fitted = fitted_model(fit.press(float(brush.radius_mm), float(brush.length_mm)))
-    drawn = Target(fitted, ranges, {}, target.placement, target.px_mm, target.size_px)
-    inputs = drawn.draw(IMAGES, torch.Generator().manual_seed(0))
-    names = [spec.name for spec in drawn.inputs]
+    inputs = target.draw(IMAGES, (0,))
     return replace(
         aligned,
-        images=[*aligned.images, *(np.asarray(image, np.float32) for image in drawn.images(inputs).numpy())],
-        inputs=[*aligned.inputs, *({name: float(row[k]) for k, name in enumerate(names)} for row in inputs)],
+        images=[*aligned.images, *target.images(inputs, fitted)],
+        inputs=[*aligned.inputs, *(dict(zip(INPUTS, row, strict=True)) for row in inputs.tolist())],
         cells=[*aligned.cells, *[NO_CELL] * IMAGES],
     )
 
 
-def _inputs_of(model: GeneratorModel, depth_mm: float, tilt_deg: float) -> dict[str, float]:
-    """The generator's inputs for a press of its brush. Raises DomainError outside its training range."""
-    values = {name: float(value[0]) for name, value in model.of_press(depth_mm, tilt_deg).items()}
-    out: dict[str, float] = {}
-    for spec in model.target.inputs:
-        value = values.get(spec.name, spec.default)
-        if not spec.low <= value <= spec.high:
-            raise DomainError(spec.name, value, f"[{spec.low:g}, {spec.high:g}]", "what the generator was trained for")
-        out[spec.name] = value
-    return out
-
-
-def _placed(
-    prepared: Prepared, model: GeneratorModel, values: dict[str, float], depth_mm: float, tilt_deg: float
-) -> Image:
+def _placed(prepared: Prepared, target: Target) -> Image:
     """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` if the stroke does not fit."""
-    from brushloop.model.generator.targets import ANCHOR_SHARE, Placement
-
-    target = model.target
     side_mm = target.size_px * target.px_mm
     assert prepared.anchor_px is not None  # prepare_press aligns every press with its point of touch
-    anchor = (prepared.anchor_px[0] / PX_PER_MM, prepared.anchor_px[1] / PX_PER_MM)
-    match target.placement:
-        case Placement.CENTRED:
-            rows, columns = (np.flatnonzero(prepared.mask.any(axis=axis)) for axis in (1, 0))
-            middle = (columns[0] + columns[-1] + 1) / 2 / PX_PER_MM, (rows[0] + rows[-1] + 1) / 2 / PX_PER_MM
-            corner = middle[0] - side_mm / 2, middle[1] - side_mm / 2
-        case Placement.ZERO_TOUCH:
-            corner = anchor[0] - ANCHOR_SHARE[0] * side_mm, anchor[1] - ANCHOR_SHARE[1] * side_mm
-        case Placement.BASE:
-            fixed = target.fixed
-            base = tuple(values.get(name, fixed.get(name, 0.0)) for name in ("base_x_mm", "base_y_mm"))
-            corner = anchor[0] + axis_mm(depth_mm, tilt_deg) - base[0], anchor[1] - base[1]
+    if target.placement is Placement.CENTRED:
+        rows, columns = (np.flatnonzero(prepared.mask.any(axis=axis)) for axis in (1, 0))
+        middle = (columns[0] + columns[-1] + 1) / 2 / PX_PER_MM, (rows[0] + rows[-1] + 1) / 2 / PX_PER_MM
+        corner = middle[0] - side_mm / 2, middle[1] - side_mm / 2
+    else:
+        anchor = (prepared.anchor_px[0] / PX_PER_MM, prepared.anchor_px[1] / PX_PER_MM)
+        corner = anchor[0] - ANCHOR_SHARE[0] * side_mm, anchor[1] - ANCHOR_SHARE[1] * side_mm
     image = _resampled(prepared.mask, corner, target.px_mm, target.size_px)
     inked = float(np.count_nonzero(prepared.mask)) / PX_PER_MM**2
     if abs(float(image.sum()) * target.px_mm**2 - inked) > 0.01 * inked:

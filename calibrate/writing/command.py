@@ -21,7 +21,7 @@ from brushloop.calibrate.writing.plan_files import PICTURE as PLAN_PICTURE
 from brushloop.calibrate.writing.plan_files import write_plan, write_record
 from brushloop.calibrate.writing.plan_record import PlannedBy, load_plan
 from brushloop.calibrate.writing.report import PICTURE, summary, write_written
-from brushloop.model.brush import Brush, DomainError
+from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.characters.brush import Reach
 from brushloop.model.characters.plan import Cell
 from brushloop.model.strokes import UnknownModelError, stroke_model

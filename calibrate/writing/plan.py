@@ -24,7 +24,7 @@ from brushloop.model.characters.plan import Path as Way
 from brushloop.model.characters.refine import refine
 from brushloop.model.drag import DragModel
 from brushloop.model.footprint import Footprint
-from brushloop.model.protocol import StrokeModel
+from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"

@@ -21,7 +21,7 @@ from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
 from brushloop.collect.chains.writing import Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import CollectRequest
-from brushloop.model.train import SHIPPED_GENERATOR
+from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.sessions.store import open_sessions
 from brushloop.sessions.terminal import say, show_work
 

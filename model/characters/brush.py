@@ -12,11 +12,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from brushloop.model.drag import DragModel
-from brushloop.model.protocol import StrokeModel
+from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 _TABLE = 64
@@ -81,8 +80,7 @@ class Reach:
 def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: Floats) -> Floats:
     """The depths at which presses have these half widths, clipped to the feasible range, (N,) -> (N,) mm."""
     heights = np.linspace(*reach.depth_mm, _TABLE)
-    with torch.no_grad():
-        widths = model.profile(torch.from_numpy(heights), tilt_deg).width_mm.numpy()
+    widths = model.profile(heights, tilt_deg).width_mm
     return np.interp(2 * half_width_mm, np.maximum.accumulate(widths), heights)
 
 
@@ -95,5 +93,4 @@ def dragged_depth_of(drag: DragModel, reach: Reach, half_width_mm: Floats) -> Fl
 
 def behind_of(model: StrokeModel, tilt_deg: float, depth_mm: float) -> float:
     """How far a mark extends behind the brush axis, per mm of depth."""
-    with torch.no_grad():
-        return -float(model.profile(depth_mm, tilt_deg).x_min_mm[0]) / depth_mm
+    return -float(model.profile(depth_mm, tilt_deg).x_min_mm[0]) / depth_mm

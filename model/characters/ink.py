@@ -20,10 +20,9 @@ from brushloop.model.characters.glyph import Glyph
 from brushloop.model.characters.plan import Cell, Path, grid
 from brushloop.model.drag import DragModel
 from brushloop.model.outline import Outline
-from brushloop.model.protocol import StrokeModel
-from brushloop.model.raster.compiled import coverage_numpy
+from brushloop.model.raster import SIZE_PX, coverage
 from brushloop.model.raster.exact import coverage_at
-from brushloop.model.raster.frame import SIZE_PX
+from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -88,9 +87,9 @@ def reference(glyph: Glyph, cell: Cell, size_px: int = SIZE_PX) -> Image:
     """The image of a character's outlines, with the exact coverage of each stroke."""
     image = np.zeros((size_px, size_px), np.float32)
     for stroke in glyph.strokes:
-        points = torch.from_numpy(cell.to_mm(stroke.arcs))[None]
-        loop = Outline(points, torch.ones(points.shape[:2], dtype=points.dtype))
-        drawn = coverage_numpy(loop, (0.0, cell.side_mm), size_px=size_px, px_mm=cell.side_mm / size_px, threads=1)
+        points = cell.to_mm(stroke.arcs)[None]
+        loop = Outline(points, np.ones(points.shape[:2]))
+        drawn = coverage(loop, (0.0, cell.side_mm), size_px=size_px, px_mm=cell.side_mm / size_px)
         image = np.maximum(image, drawn[0])
     return image
 

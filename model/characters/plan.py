@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from brushloop.model.characters.brush import Reach, behind_of, depth_of, dragged_depth_of
 from brushloop.model.characters.glyph import FOOT_UNITS, SIDE_UNITS, Glyph
 from brushloop.model.drag import DragModel
-from brushloop.model.protocol import StrokeModel
+from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 

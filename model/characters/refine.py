@@ -18,7 +18,7 @@ from brushloop.model.characters.brush import Reach
 from brushloop.model.characters.drag import dragged, is_dragged
 from brushloop.model.characters.ink import Image, dense, stamped
 from brushloop.model.drag import DragModel
-from brushloop.model.protocol import StrokeModel
+from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 _RATE = (0.12, 0.12, 0.12, 0.1, 1.5)

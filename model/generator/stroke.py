@@ -1,104 +1,160 @@
-"""A generator as a stroke model: its image, traced to a shape that can be turned, scaled and compared."""
+"""A trained generator as a stroke model: its file, its images in numpy, and the outlines traced from them.
+
+Only training needs torch (`model.generator.network` is the same network there).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError, safe_open
 
-from brushloop.model.brush import DomainError
-from brushloop.model.ccdbsm import as_batch
-from brushloop.model.generator.network import Generator
-from brushloop.model.generator.targets import Placement, Target
+from brushloop.model.arrays import Array, as_batch, as_numpy
+from brushloop.model.ccdbsm import Brush
+from brushloop.model.generator import TrainError
+from brushloop.model.generator.targets import INPUTS, Target
 from brushloop.model.outline import Outline
-from brushloop.model.protocol import Number, ParameterSpec, Values
+from brushloop.model.strokes import StrokeModel
+
+Singles = NDArray[np.float32]
+FORMAT = "brushloop-generator-2"
+MAX_WEIGHTS = 50_000_000
+MAX_HEADER_BYTES = 4 * 1024 * 1024
+"""Largest header of a safetensors file; it holds the names of the tensors, and the configuration."""
+MAX_CONFIG_CHARS = 64 * 1024
+
+
+class Layers(BaseModel):
+    """Sizes of a network: the layers of the paper's section III-B, which gives none."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    degree: Annotated[int, Field(ge=1, le=16)] = 4
+    """Of the Chebyshev polynomials of each input."""
+    width: Annotated[int, Field(ge=1, le=2048)] = 256
+    """Of the fully connected layers."""
+    depth: Annotated[int, Field(ge=1, le=8)] = 2
+    """Their number."""
+    channels: Annotated[int, Field(ge=1, le=128)] = 16
+    """Of the map of `side` x `side` that they put out."""
+    side: Literal[8, 16, 32, 64] = 16
+
+    def shapes(self, size_px: int) -> dict[str, tuple[int, ...]]:
+        """The weights by name, with their shapes. Raises ValueError if `side` does not divide the image."""
+        if size_px % self.side:
+            raise ValueError(f"layers.side = {self.side} does not divide size_px = {size_px}")
+        sizes = [self.degree * len(INPUTS), *[self.width] * self.depth, self.channels * self.side**2]
+        shapes: dict[str, tuple[int, ...]] = {}
+        for k in range(len(sizes) - 1):
+            name = f"fully_connected.{2 * k}"  # an activation stands between two layers
+            shapes |= {f"{name}.weight": (sizes[k + 1], sizes[k]), f"{name}.bias": (sizes[k + 1],)}
+        out = (size_px // self.side) ** 2
+        return shapes | {"convolution.0.weight": (out, self.channels, 3, 3), "convolution.0.bias": (out,)}
+
+    def weight_count(self, size_px: int) -> int:
+        """Number of weights."""
+        return sum(int(np.prod(shape)) for shape in self.shapes(size_px).values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GeneratorModel:
-    """A `StrokeModel` drawn by a trained generator; `fitted` if it was tuned on captures.
+class GeneratorFile:
+    """The content of a `generator.safetensors`."""
 
-    The parameters are the generator's inputs with their trained ranges; a base that is an input only positions
-    the stroke and is not one of them. `shape` is the outline at half coverage of the drawn image, traced between
-    pixel centres, so it carries no gradient and its tip ends where the stroke is half a pixel wide; `images` are the
-    network's output, and are differentiable.
-    """
-
-    name: str
-    label: str
-    definition: str
-    network: Generator
     target: Target
-    fitted: bool = False
+    layers: Layers
+    weights: dict[str, Singles]
+    config: dict[str, Any]
+    """The whole configuration of its training (`model.train.config.TrainConfig`)."""
+    report: dict[str, Any]
+    """How its images compare with exact ones: plain numbers and strings."""
 
     @property
-    def parameters(self) -> tuple[ParameterSpec, ...]:
-        """See `StrokeModel.parameters`."""
-        return tuple(spec for spec in self.network.inputs.specs if not spec.name.startswith("base_"))
+    def tuned(self) -> bool:
+        """Whether it was tuned on captures."""
+        return self.config.get("tuning") is not None
 
-    def images(self, values: Mapping[str, Number]) -> Tensor:
-        """The network's images in its trained placement and scale, (B, N, N); see `StrokeModel.shape` for errors."""
-        return self.network(self._inputs(values))
-
-    def shape(self, values: Mapping[str, Number]) -> Outline:
-        """See `StrokeModel.shape`; also raises ValueError if the generator draws no ink."""
-        inputs = self._inputs(values)
-        with torch.no_grad():
-            drawn = self.network(inputs)
-        origin = self.target.origin_mm(inputs)
-        return traced(drawn, origin, self.target.px_mm)
-
-    def of_press(self, depth_mm: Number, tilt_deg: Number) -> Values:
-        """See `StrokeModel.of_press`; DomainError outside the trained ranges or if a fixed parameter differs.
-
-        A parameter that was fixed in training must have the value that the stroke model gives this press.
-        """
-        values = self.target.model.of_press(depth_mm, tilt_deg)
-        trained = {spec.name for spec in self.network.inputs.specs}
-        fixed = {spec.name: self.target.fixed.get(spec.name, spec.default) for spec in self.target.model.parameters}
-        for name in fixed.keys() - trained:
-            off = (values[name] - fixed[name]).abs() > 1e-6 * abs(fixed[name])
-            if off.any():
-                raise DomainError(name, float(values[name][off][0]), f"the {fixed[name]:g} it was trained with")
-        return {name: value for name, value in values.items() if name in trained}
-
-    def profile(self, depth_mm: Number, tilt_deg: Number) -> Outline:
-        """See `StrokeModel.profile`."""
-        return self.shape(self.of_press(depth_mm, tilt_deg))
-
-    def _inputs(self, values: Mapping[str, Number]) -> Tensor:
-        """The inputs by name as (B, P) float32, checked."""
-        specs = self.network.inputs.specs
-        unknown = values.keys() - {spec.name for spec in specs}
-        if unknown:
-            raise ValueError(f"{self.name} has no parameter {sorted(unknown)[0]!r}")
-        batch = as_batch(*(values.get(spec.name, spec.default) for spec in specs))
-        for spec, value in zip(specs, batch, strict=True):
-            spec.check(value.detach())
-        return torch.stack([value.to(torch.float32) for value in batch], dim=-1)
+    def images(self, inputs: Array) -> Singles:
+        """The network's images of (N, 2) inputs in its placement and scale, (N, size_px, size_px) in [0, 1]."""
+        layers, weights = self.layers, self.weights
+        low, high = np.transpose([getattr(self.target, name) for name in INPUTS]).astype(np.float32)
+        unit = 2 * (np.asarray(inputs, np.float32) - low) / (high - low) - 1
+        x = chebyshev(unit, layers.degree)[..., 1:].reshape(len(unit), -1)
+        for k in range(layers.depth + 1):
+            x = x @ weights[f"fully_connected.{2 * k}.weight"].T + weights[f"fully_connected.{2 * k}.bias"]
+            if k < layers.depth:
+                x = x / (1 + np.exp(-x))  # SiLU
+        side, scale = layers.side, self.target.size_px // layers.side
+        padded = np.pad(x.reshape(-1, layers.channels, side, side), ((0, 0), (0, 0), (1, 1), (1, 1)))
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(2, 3))
+        map_ = np.tensordot(windows, weights["convolution.0.weight"], axes=([1, 4, 5], [1, 2, 3]))
+        map_ = (map_ + weights["convolution.0.bias"]).reshape(-1, side, side, scale, scale)
+        field = map_.transpose(0, 1, 3, 2, 4).reshape(-1, self.target.size_px, self.target.size_px)  # pixel shuffle
+        return np.clip(field + np.float32(0.5), 0, 1)
 
 
-def generator_model(network: Generator, target: Target, *, fitted: bool = False) -> GeneratorModel:
-    """A trained network as a stroke model called `<model>-generator`; CCD-BSM's is the paper's CCD-BSMG."""
-    ccd = target.model.name == "ccd-bsm"
-    tuned = ", then tuned on captured strokes" if fitted else ""
-    base = "" if target.placement is not Placement.BASE else " at a base point"
+def chebyshev(unit: Array, degree: int) -> Any:
+    """T_0 to T_degree of numbers in [-1, 1], (...) -> (..., degree + 1), by T_k+1 = 2 x T_k - T_k-1."""
+    terms = [np.ones_like(unit), unit]
+    for _ in range(degree - 1):
+        terms.append(2 * unit * terms[-1] - terms[-2])
+    return np.stack(terms[: degree + 1], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GeneratorModel(StrokeModel):
+    """A stroke model that a trained generator draws.
+
+    Its outlines are traced at half coverage between pixel centres, so a tip ends where the stroke is half a pixel wide.
+    """
+
+    file: GeneratorFile
+
+    @property
+    def target(self) -> Target:
+        """What the generator was trained to draw."""
+        return self.file.target
+
+
+def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorModel:
+    """Load `generator.safetensors` as a stroke model; CCD-BSM's is the paper's CCD-BSMG.
+
+    Raises TrainError for a file that cannot be used, and if it was trained for another brush than this.
+    """
+    file = read_generator(Path(path))
+    if brush is not None:
+        for name in ("radius_mm", "length_mm"):
+            trained, wanted = getattr(file.target, name), float(as_numpy(getattr(brush, name)))
+            if wanted != trained:
+                raise TrainError(path, f"was trained for a brush with {name} = {trained:g}, not {wanted:g}")
+    return generator_model(file)
+
+
+def generator_model(file: GeneratorFile) -> GeneratorModel:
+    """The stroke model of a generator; `fitted` if it was tuned on captures, or its brush was fitted to some."""
+    tuned = ", then tuned on captured strokes" if file.tuned else ""
+
+    def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
+        inputs = np.stack([as_numpy(part) for part in as_batch(depth_mm, tilt_deg)], axis=-1)
+        file.target.check(inputs)
+        return traced(file.images(inputs), file.target.origin_mm(inputs), file.target.px_mm)
+
     return GeneratorModel(
-        name="ccd-bsmg" if ccd else f"{target.model.name}-generator",
-        label="CCD-BSMG" if ccd else f"{target.model.label} generator",
-        definition=f"A network trained on exact images of {target.model.label}{base}{tuned}; its outline is traced at "
-        f"half coverage.",
-        network=network,
-        target=target,
-        fitted=fitted or target.model.fitted,
+        name="ccd-bsmg",
+        label="CCD-BSMG",
+        definition=f"A network trained on exact images of CCD-BSM{tuned}; its outline is traced at half coverage.",
+        profile=profile,
+        fitted=file.tuned or file.target.fitted_brush,
+        file=file,
     )
 
 
-def traced(images: Tensor, origin_mm: Tensor, px_mm: float) -> Outline:
+def traced(images: Singles, origin_mm: Array, px_mm: float) -> Outline:
     """The longest contour at half coverage of each image, (B, N, N) and (B, 2), as straight arcs in mm.
 
     Raises ValueError for an image without ink.
@@ -106,8 +162,8 @@ def traced(images: Tensor, origin_mm: Tensor, px_mm: float) -> Outline:
     import skimage.measure
 
     untyped: Any = skimage.measure
-    polygons: list[Tensor] = []
-    for image, origin in zip(images.cpu().double().numpy(), origin_mm, strict=True):
+    polygons: list[NDArray[np.float64]] = []
+    for image, origin in zip(images.astype(np.float64), origin_mm, strict=True):
         contours = untyped.find_contours(np.pad(image, 1), 0.5)
         if not contours:
             raise ValueError("the generator draws no ink for these parameters")
@@ -115,10 +171,77 @@ def traced(images: Tensor, origin_mm: Tensor, px_mm: float) -> Outline:
         x, y = columns * px_mm - float(origin[0]), float(origin[1]) - rows * px_mm
         if np.dot(x, np.roll(y, -1)) < np.dot(y, np.roll(x, -1)):
             x, y = x[::-1], y[::-1]
-        polygons.append(torch.from_numpy(np.stack((x, y), axis=-1)))
+        polygons.append(np.stack((x, y), axis=-1))
     most = max(map(len, polygons))
     # Zero-length arcs at the end give all outlines the same number of arcs.
-    ends = torch.stack([torch.cat((p, p[:1].expand(most + 1 - len(p), 2))) for p in polygons])
+    ends = np.stack([np.concatenate((p, np.repeat(p[:1], most + 1 - len(p), axis=0))) for p in polygons])
     start, end = ends[:, :-1], ends[:, 1:]
-    points = torch.stack((start, 0.5 * (start + end), end), dim=2)
-    return Outline(points, torch.ones(points.shape[:2], dtype=points.dtype))
+    points = np.stack((start, 0.5 * (start + end), end), axis=2)
+    return Outline(points, np.ones(points.shape[:2]))
+
+
+def read_generator(path: Path) -> GeneratorFile:
+    """Read a generator's file, which is not trusted: safetensors holds numbers and strings, never code.
+
+    Its size is bounded before it is read, its configuration is validated, and its tensors must be finite and have the
+    names, shapes and types of the network that the configuration describes. Raises TrainError.
+    """
+    metadata, tensors = read_tensors(path, 4 * MAX_WEIGHTS + 2**26)
+    if metadata.get("format") != FORMAT:
+        raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, expected {FORMAT!r}")
+    config, report = (_table(path, name, metadata.get(name, "")) for name in ("config", "report"))
+    try:
+        target, layers = Target.model_validate(config.get("target")), Layers.model_validate(config.get("layers"))
+        if layers.weight_count(target.size_px) > MAX_WEIGHTS:
+            raise TrainError(path, f"asks for {layers.weight_count(target.size_px):,} weights; at most {MAX_WEIGHTS:,}")
+        wanted = layers.shapes(target.size_px)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise TrainError(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    except ValueError as error:
+        raise TrainError(path, str(error)) from error
+    for name in sorted(wanted.keys() ^ tensors.keys()):
+        raise TrainError(path, f"tensor {name[:100]!r} is {'missing' if name in wanted else 'not known'}")
+    for name, shape in wanted.items():
+        tensor = tensors[name]
+        if tensor.shape != shape or tensor.dtype != np.float32:
+            raise TrainError(path, f"{name} is {tensor.dtype} {tensor.shape}, expected float32 {shape}")
+        if not np.isfinite(tensor).all():
+            raise TrainError(path, f"{name} holds numbers that are not finite")
+    return GeneratorFile(target, layers, tensors, config, report)
+
+
+def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
+    """Read metadata and arrays of a safetensors file of at most `most_bytes`. Raises TrainError."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        what = "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror)
+        raise TrainError(path, what) from error
+    if not path.is_file():
+        raise TrainError(path, "is not a file")
+    if size > most_bytes:
+        raise TrainError(path, f"holds {size:,} bytes; at most {most_bytes:,} are read")
+    try:
+        with path.open("rb") as opened:
+            header = int.from_bytes(opened.read(8), "little")
+        if header > MAX_HEADER_BYTES:
+            raise ValueError(f"its header has {header:,} bytes; at most {MAX_HEADER_BYTES:,} are read")
+        with safe_open(path, framework="np") as file:
+            untyped: Any = file
+            return dict(untyped.metadata() or {}), {name: untyped.get_tensor(name) for name in untyped.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, RuntimeError, TypeError) as error:
+        raise TrainError(path, f"is not a safetensors file: {str(error).splitlines()[0][:200]}") from error
+
+
+def _table(path: Path, name: str, text: str) -> dict[str, Any]:
+    """The JSON object in a piece of metadata."""
+    if len(text) > MAX_CONFIG_CHARS:
+        raise TrainError(path, f"{name} is longer than {MAX_CONFIG_CHARS} characters")
+    try:
+        table = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise TrainError(path, f"{name} is not JSON") from error
+    if not isinstance(table, dict):
+        raise TrainError(path, f"{name} is not a table")
+    return table

@@ -15,38 +15,39 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from brushloop.model.outline import Outline, Shape, evaluate
-from brushloop.model.raster.frame import PX_MM, SIZE_PX, Place, check_raster, to_pixels
+from brushloop.model.arrays import Array
+from brushloop.model.outline import Outline, evaluate
+from brushloop.model.raster import PX_MM, SIZE_PX, check_raster, to_pixels
 
 _CHUNK = 16  # images at a time: about 2,500 pieces each, a dozen numbers per piece
 _LEAST_CUTS = 24  # parabolas per arc of an ellipse: the error is below 1e-6 of a pixel for any radius
 
 
 def coverage_at(
-    shape: Shape,
-    origin_mm: Place,
-    heading_deg: float | Tensor = 0.0,
+    outline: Outline,
+    origin_mm: Array,
+    heading_deg: Array = 0.0,
     *,
     size_px: int = SIZE_PX,
     px_mm: float = PX_MM,
 ) -> Tensor:
-    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B shapes.
+    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], of B outlines of torch or numpy.
 
-    `origin_mm` (2,) or (B, 2) and `heading_deg` scalar or (B,) as in `model.raster.frame`. Differentiable in the
-    shape's parameters, the origin and the heading. dtype and device are the shape's. Raises ValueError for a size
-    or shape that makes no image. The error stays below 1e-6 in float64 and 1e-3 in float32.
+    `origin_mm` (2,) or (B, 2) and `heading_deg` scalar or (B,) as in `model.raster`. Differentiable in the outline's
+    parameters, the origin and the heading. dtype and device are the outline's. Raises ValueError for a size or outline
+    that makes no image. The error stays below 1e-6 in float64 and 1e-3 in float32.
     """
     check_raster(size_px, px_mm)
-    outline = shape.outline()
-    kind = outline.points.dtype
+    points, weights = torch.as_tensor(outline.points), torch.as_tensor(outline.weights)
+    kind = points.dtype
     # Always in double precision: the share of a pixel is a small difference of positions in the image.
-    wide = kind if outline.points.device.type == "mps" else torch.float64
-    m = to_pixels(origin_mm, heading_deg, px_mm, outline.weights.to(wide))[:, None, None]
-    x, y = outline.points.to(wide).unbind(-1)
-    points = torch.stack((m[..., 0] * x + m[..., 1] * y + m[..., 2], m[..., 3] * x + m[..., 4] * y + m[..., 5]), -1)
+    wide = kind if points.device.type == "mps" else torch.float64
+    m = to_pixels(origin_mm, heading_deg, px_mm, weights.to(wide))[:, None, None]
+    x, y = points.to(wide).unbind(-1)
+    placed = torch.stack((m[..., 0] * x + m[..., 1] * y + m[..., 2], m[..., 3] * x + m[..., 4] * y + m[..., 5]), -1)
     if len(points) == 0:
-        return outline.points.new_zeros((0, size_px, size_px))
-    parts = zip(points.split(_CHUNK), outline.weights.to(wide).split(_CHUNK), strict=True)
+        return points.new_zeros((0, size_px, size_px))
+    parts = zip(placed.split(_CHUNK), weights.to(wide).split(_CHUNK), strict=True)
     return torch.cat([_draw(Outline(p, w), size_px).to(kind) for p, w in parts])
 
 

@@ -1,4 +1,4 @@
-"""The stroke models by name: what a validation compares, a report describes and a generator is trained on.
+"""Stroke models by name: what a validation compares, a report describes and a generator is trained on.
 
 A model is a file in this folder with a function `models(basis) -> tuple[StrokeModel, ...]`; it is found automatically.
 """
@@ -8,11 +8,18 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
-from brushloop.model.brush import Brush
-from brushloop.model.protocol import Basis, ParameterSpec, StrokeModel
+import numpy as np
 
-__all__ = ["Basis", "ParameterSpec", "StrokeModel", "UnknownModelError", "stroke_model", "stroke_models"]
+from brushloop.model.arrays import Array, as_batch, as_numpy
+from brushloop.model.ccdbsm import Brush, CcdBsm, ccdbsm
+from brushloop.model.outline import Outline
+
+# The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
+DEPTHS = tuple(depth_mm / 48 for depth_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
+TILTS_DEG = (0.0, 5.0, 10.0)
 
 
 class UnknownModelError(LookupError):
@@ -24,19 +31,101 @@ class UnknownModelError(LookupError):
         self.known = known
 
 
+@dataclass(frozen=True, slots=True)
+class StrokeModel:
+    """What the mark of a press looks like."""
+
+    name: str
+    """The key on the command line and in files."""
+    label: str
+    """The name as a report prints it."""
+    definition: str
+    """What the shape is, in one sentence."""
+    profile: Callable[[Array, Array], Outline]
+    """Outlines of presses to depths H in mm at tilts alpha in deg, scalars or (B,); may raise DomainError."""
+    fitted: bool = False
+    """Whether any parameter was fitted to captures; a report must state this with each score."""
+
+
+@dataclass(frozen=True, slots=True)
+class Basis:
+    """The CCD-BSM, with its brush and lambda, from which the other models of that brush are derived.
+
+    `fitted` says that lambda (or the brush) was fitted to captures; every derived model is then marked as fitted.
+    """
+
+    brush: Brush
+    lam: float = math.pi
+    fitted: bool = False
+
+    def mark(self, depth_mm: Array, tilt_deg: Array) -> CcdBsm:
+        """The CCD-BSM mark of a press; raises DomainError outside its domain."""
+        return ccdbsm(self.brush, depth_mm, tilt_deg, self.lam)
+
+    def regressed(self, measure: Callable[[CcdBsm], Mapping[str, Array]]) -> Callable[[Array, Array], dict[str, Array]]:
+        """A function (H, alpha) -> parameters: `measure` of the marks at the paper's 15 cells, regressed on first use.
+
+        Without captures the regression adds no information about real ink. The function raises DomainError where
+        CCD-BSM has no mark.
+        """
+        planes: list[Plane] = []
+
+        def parameters(depth_mm: Array, tilt_deg: Array) -> dict[str, Array]:
+            self.mark(depth_mm, tilt_deg)
+            if not planes:
+                length_mm = float(as_numpy(self.brush.length_mm).reshape(-1)[0])
+                cells = np.meshgrid(np.multiply(length_mm, DEPTHS), TILTS_DEG, indexing="ij")
+                depth, tilt = (part.ravel() for part in cells)
+                planes.append(fit_plane(depth, tilt, measure(self.mark(depth, tilt))))
+            return planes[0].at(*as_batch(depth_mm, tilt_deg))
+
+        return parameters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane:
+    """Parameters as c0 + c1 H + c2 H alpha: `coefficients` (P, 3) for the P `names`.
+
+    Wang and Min regress a Bezier stroke's lengths on the descending height and the tilt angle. Here the effect of tilt
+    is proportional to depth, as is every length of CCD-BSM, so a regressed stroke stays valid far from the cells.
+    """
+
+    names: tuple[str, ...]
+    coefficients: Array
+
+    def at(self, depth_mm: Array, tilt_deg: Array) -> dict[str, Array]:
+        """The parameters at H and alpha: floats or arrays of one shape, which each parameter has too."""
+        rows = zip(self.names, self.coefficients.tolist(), strict=True)
+        return {name: a + depth_mm * (b + c * tilt_deg) for name, (a, b, c) in rows}
+
+
+def fit_plane(depth_mm: Array, tilt_deg: Array, values: Mapping[str, Array]) -> Plane:
+    """The least-squares fit to values (N,) at H and alpha (N,), for captures or marks alike.
+
+    Raises ValueError if the cells do not span a plane: at least two depths and two tilts are needed.
+    """
+    depth, tilt = np.asarray(depth_mm, np.float64), np.asarray(tilt_deg, np.float64)
+    design = np.column_stack([np.ones_like(depth), depth, depth * tilt])
+    targets = np.column_stack([np.asarray(value, np.float64) for value in values.values()])
+    coefficients, _, rank, _ = np.linalg.lstsq(design, targets)
+    if rank < 3:
+        raise ValueError(f"{len(design)} cells do not span depth and tilt: two depths and two tilts are needed")
+    return Plane(tuple(values), coefficients.T)
+
+
 def stroke_models(brush: Brush, lam: float = math.pi, *, fitted: bool = False) -> dict[str, StrokeModel]:
     """Every model of one brush by name: ccd-bsm first, then the others by name.
 
     `fitted` says that lambda or the brush was fitted to captures. Raises ValueError if two files claim one name.
     """
     basis = Basis(brush, lam, fitted)
-    found: dict[str, StrokeModel] = {}
+    models: dict[str, StrokeModel] = {}
     for file in pkgutil.iter_modules(__path__):
         for model in importlib.import_module(f"{__name__}.{file.name}").models(basis):
-            if model.name in found:
+            if model.name in models:
                 raise ValueError(f"two stroke models are called {model.name!r}, one in {file.name}")
-            found[model.name] = model
-    return {name: found[name] for name in sorted(found, key=lambda name: (name != "ccd-bsm", name))}
+            models[model.name] = model
+    return {name: models[name] for name in sorted(models, key=lambda name: (name != "ccd-bsm", name))}
 
 
 def stroke_model(name: str, brush: Brush, lam: float = math.pi, *, fitted: bool = False) -> StrokeModel:

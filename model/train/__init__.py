@@ -1,6 +1,15 @@
-"""Training the generator: `brushloop train`. Only this part of `model` touches files."""
+"""Training the generator: `brushloop train`. Only this folder loads torch."""
 
-from pathlib import Path
+from __future__ import annotations
 
-SHIPPED_GENERATOR = Path(__file__).parents[1] / "generator" / "data" / "generator.safetensors"
-"""The generator that comes with brushloop; its card beside it says what it was trained on, and by which command."""
+from typing import ClassVar
+
+
+class TrainingStopped(Exception):
+    """Training cannot usefully continue, or was asked to stop, at `step`; the last checkpoint is complete."""
+
+    exit_code: ClassVar[int] = 4
+
+    def __init__(self, step: int, what: str) -> None:
+        self.step = step
+        super().__init__(f"step {step}: {what}")

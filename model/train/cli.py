@@ -5,10 +5,19 @@ A command that trains returns the folder of the training, of which the front doo
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as ProgressBar
+
+    from brushloop.model.train.config import TrainConfig
+    from brushloop.model.train.train import TuningFiles, Validation
 
 app = typer.Typer(help="Train the neural stroke generator, or tune it on captures.")
 
@@ -19,21 +28,19 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of this training; the same command resumes it.")] = Path(
         "generator"
     ),
-    target: Annotated[str, typer.Option(help="press, anchored, all, qbc or bezier.")] = "press",
+    target: Annotated[str, typer.Option(help="press or anchored.")] = "press",
     config: Annotated[Path | None, typer.Option(help="A train.toml instead of a target's defaults.")] = None,
     steps: Annotated[int | None, typer.Option(help="Largest number of steps, G in Algorithm 1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of weights and images.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads of torch.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Threads that draw images ahead.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda.")] = None,
 ) -> Path | None:
-    """Train on exact images of a stroke model (Algorithm 1), in one process on one device."""
+    """Train on exact images of CCD-BSM (Algorithm 1), in one process on one device."""
     if context.invoked_subcommand is not None:
         return None
     from brushloop.model.train import config as configs
-    from brushloop.model.train.run import train_with_bar
 
-    changes = {"steps": steps, "seed": seed, "threads": threads, "workers": workers, "device": device}
+    changes = {"steps": steps, "seed": seed, "threads": threads, "device": device}
     changes = {name: value for name, value in changes.items() if value is not None}
     if config is None:
         chosen = configs.preset(target, **changes)
@@ -53,13 +60,13 @@ def tune(
     seed: Annotated[int, typer.Option(min=0, help="Which conditions are held out, and the order of the rest.")] = 0,
 ) -> Path:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""
-    from brushloop.model.train.checkpoint import load_weights, sha256
-    from brushloop.model.train.config import checked
-    from brushloop.model.train.data import load_captures
-    from brushloop.model.train.run import Tuning, train_with_bar
+    from brushloop.model.generator.stroke import read_generator
+    from brushloop.model.train.config import checked, config_of
+    from brushloop.model.train.data import load_captures, sha256
+    from brushloop.model.train.train import TuningFiles
 
-    before = load_weights(generator)[0]
-    _, source = load_captures(captures, before)
+    before = config_of(generator, read_generator(generator))
+    _, source = load_captures(captures, before.target)
     fields: dict[str, Any] = before.model_dump() | {
         "steps": steps,
         "learning_rate": learning_rate,
@@ -72,4 +79,60 @@ def tune(
             "held_out": held_out,
         },
     }
-    return train_with_bar(checked("tune", fields), out, Tuning(generator, captures))
+    return train_with_bar(checked("tune", fields), out, TuningFiles(generator, captures))
+
+
+def train_with_bar(config: TrainConfig, folder: Path, tuning: TuningFiles | None = None) -> Path:
+    """Train with a progress bar; return the folder. Raises as `run_training`."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as ProgressBar
+
+    from brushloop.model.train.train import run_training
+
+    words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
+    columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True), words)
+    with _asked_to_stop() as stopping, ProgressBar(*columns) as progress:
+        path = run_training(config, folder, Bar(progress, config.steps), stopping, tuning)
+    card = path.with_suffix(".md")
+    progress.console.print(f"Generator: {path}, its card: {card}", markup=False, soft_wrap=True)
+    return folder
+
+
+class Bar:
+    """A progress bar that shows the latest losses; where there is no terminal, a line for each tenth of the steps."""
+
+    def __init__(self, progress: ProgressBar, steps: int) -> None:
+        self._progress, self._steps, self._tenths = progress, steps, 0
+        self._task = progress.add_task("training", total=steps, loss="", validation="")
+
+    def stepped(self, step: int, loss: float) -> None:
+        """See `Progress.stepped`."""
+        self._progress.update(self._task, completed=step, loss=f"left, MSE {loss:.1e}")
+        if self._progress.console.is_terminal or 10 * step // self._steps <= self._tenths:
+            return
+        self._tenths = 10 * step // self._steps
+        left_s = self._progress.tasks[self._task].time_remaining
+        left = f", about {left_s:.0f} s left" if left_s and step < self._steps else ""
+        self._progress.console.print(f"training: {step} of {self._steps} steps{left}, MSE {loss:.1e}")
+
+    def validated(self, validation: Validation) -> None:
+        """See `Progress.validated`."""
+        self._progress.update(self._task, validation=f"held out {validation.mse:.1e}")
+        if validation.blank:
+            self._progress.console.print(
+                f"step {validation.step}: the generator draws {validation.ink_share:.2%} ink where the targets hold "
+                f"{validation.target_share:.2%}; training ends if that stays"
+            )
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Turn SIGINT and SIGTERM into a request to stop after the current step."""
+    requests: list[int] = []
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda number, _: requests.append(number)) for number in signals}
+    try:
+        yield lambda: bool(requests)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

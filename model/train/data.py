@@ -1,7 +1,5 @@
 """Training and validation images by number: any step's batch follows from (seed, step) alone.
 
-So a resumed training needs no random-generator state.
-
 Captured strokes to tune on come as one safetensors file. Tensors: `images` (n, N, N) uint8 (255 is ink) or float32 in
 [0, 1], and one (n,) float32 or float64 tensor for each of the generator's inputs, by name, in its unit. Metadata:
 `format` (FORMAT), `px_mm`, `placement`, and `source`, where the images come from. Scale and placement must be the
@@ -10,185 +8,138 @@ generator's, else its pixels would mean something else.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Generator
-from concurrent.futures import Future, ThreadPoolExecutor
+import hashlib
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
-import torch
-from safetensors.torch import save
-from torch import Tensor
+from numpy.typing import NDArray
+from safetensors.numpy import save
 
-from brushloop.model.generator.targets import Target
-from brushloop.model.train.checkpoint import read_tensors, write_whole
+from brushloop.model.generator import TrainError
+from brushloop.model.generator.stroke import read_tensors
+from brushloop.model.generator.targets import INPUTS, Target
 from brushloop.model.train.config import TrainConfig
-from brushloop.model.train.errors import TrainError
 
+Singles = NDArray[np.float32]
 _TRAINING, _VALIDATION, _ORDER, _SPLIT = range(4)
 FORMAT = "brushloop-captures-1"
 MAX_BYTES = 2**30
-_AHEAD = 2  # batches per worker: one being drawn, one waiting
-
-
-class Images(Protocol):
-    """A numbered set of (inputs, image)."""
-
-    def __len__(self) -> int:
-        """Number of images."""
-        ...
-
-    def pick(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs (n, P) and images (n, N, N) of these numbers (n,)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Exact:
-    """Images made on demand: the target's exact coverage of `inputs` (n, P)."""
+class Images:
+    """A numbered set of images: those of captured strokes, or exact ones that are drawn on demand."""
 
     target: Target
-    inputs: Tensor
-    threads: int = 1
+    inputs: Singles
+    """(n, 2): H and alpha of each image."""
+    captured: Singles | None = None
+    """(n, N, N) in [0, 1]; None for exact images."""
 
     def __len__(self) -> int:
         return len(self.inputs)
 
-    def pick(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Images.pick`."""
-        chosen = self.inputs[numbers]
-        return chosen, self.target.images(chosen, self.threads)
+    def pick(self, numbers: NDArray[Any]) -> tuple[Singles, Singles]:
+        """Inputs (n, 2) and images (n, N, N) of these numbers (n,), or of a mask."""
+        inputs = self.inputs[numbers]
+        return inputs, self.target.images(inputs) if self.captured is None else self.captured[numbers]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Kept:
-    """Images that were captured: `inputs` (n, P) and `images` (n, N, N) in [0, 1]."""
-
-    inputs: Tensor
-    images: Tensor
-
-    def __len__(self) -> int:
-        return len(self.inputs)
-
-    def pick(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Images.pick`."""
-        return self.inputs[numbers], self.images[numbers]
+def exact_sets(config: TrainConfig) -> tuple[Images, Images]:
+    """The training and the validation set of a configuration."""
+    target, seed = config.target, config.seed
+    training = target.draw(config.training_images, (seed, _TRAINING))
+    return Images(target, training), Images(target, target.draw(config.validation_images, (seed, _VALIDATION)))
 
 
-def exact_sets(config: TrainConfig) -> tuple[Exact, Exact]:
-    """The training and the validation set of a configuration; raises ValueError if the target rejects nearly all."""
-    target = config.build_target()
-    counts = ((config.training_images, _TRAINING), (config.validation_images, _VALIDATION))
-    training, validation = (
-        Exact(target, target.draw(count, _generator(config.seed, stream)), config.threads) for count, stream in counts
-    )
-    return training, validation
-
-
-def split(captures: Kept, seed: int, held_out: float) -> tuple[Kept, Kept]:
+def split(captures: Images, seed: int, held_out: float) -> tuple[Images, Images]:
     """Captures to learn from and to validate on: repeats of one condition, that is of equal inputs, stay together.
 
     There is at least one condition on each side; `load_captures` refuses captures of a single one.
     """
-    conditions, condition_of = torch.unique(captures.inputs, dim=0, return_inverse=True)
-    order = torch.randperm(len(conditions), generator=_generator(seed, _SPLIT))
+    conditions, condition_of = np.unique(captures.inputs, axis=0, return_inverse=True)
+    order = np.random.default_rng((seed, _SPLIT)).permutation(len(conditions))
     count = min(max(1, round(held_out * len(conditions))), len(conditions) - 1)
-    held = torch.isin(condition_of, order[:count])
-    return Kept(*captures.pick(~held)), Kept(*captures.pick(held))
+    held = np.isin(condition_of.reshape(-1), order[:count])
+    return Images(captures.target, *captures.pick(~held)), Images(captures.target, *captures.pick(held))
 
 
-def batch_numbers(count: int, batch: int, seed: int, step: int) -> Tensor:
+def batch_numbers(count: int, batch: int, seed: int, step: int) -> NDArray[np.int64]:
     """Numbers, out of `count`, of the images in a step's batch, (min(batch, count),); every epoch in another order.
 
     An incomplete batch at the end of an epoch is dropped.
     """
     batch = min(batch, count)
     epoch, position = divmod(step, count // batch)
-    order = torch.randperm(count, generator=_generator(seed, _ORDER, epoch))
+    order = np.random.default_rng((seed, _ORDER, epoch)).permutation(count)
     return order[position * batch : (position + 1) * batch]
 
 
-def _generator(seed: int, *stream: int) -> torch.Generator:
-    """An independent generator for each stream of a seed."""
-    state = np.random.SeedSequence([seed, *stream]).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state) & (2**63 - 1))
-
-
 def save_captures(
-    path: Path, inputs: dict[str, Tensor], images: Tensor, px_mm: float, placement: str, source: str
+    path: Path, inputs: Mapping[str, Any], images: Singles, px_mm: float, placement: str, source: str
 ) -> None:
     """Write captures, `inputs` each (n,) by name, `images` (n, N, N) in [0, 1]; a source such as `loopback rig`."""
-    pixels = (images.clamp(0, 1) * 255).round().to(torch.uint8)
-    tensors = {"images": pixels.contiguous()} | {name: value.float().contiguous() for name, value in inputs.items()}
+    pixels = np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
+    tensors = {"images": pixels} | {name: np.asarray(value, np.float32) for name, value in inputs.items()}
     metadata = {"format": FORMAT, "px_mm": repr(px_mm), "placement": placement, "source": source}
     write_whole(path, save(tensors, metadata))
 
 
-def load_captures(path: Path, config: TrainConfig) -> tuple[Kept, str]:
-    """Captures for a generator of this configuration, and their source. Raises TrainError if any do not fit."""
+def load_captures(path: Path, target: Target) -> tuple[Images, str]:
+    """Captures for a generator of this target, and their source. Raises TrainError if any do not fit."""
     metadata, tensors = read_tensors(path, MAX_BYTES)
-    if metadata.get("format") != FORMAT:
-        raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, expected {FORMAT!r}")
-    placement, size = config.target.placement, config.target.size_px
-    if metadata.get("placement") != placement:
-        raise TrainError(
-            path, f"placement is {metadata.get('placement', 'missing')[:40]!r}, the generator's {placement}"
-        )
-    if metadata.get("px_mm") != repr(config.target.px_mm):
-        raise TrainError(
-            path, f"px_mm is {metadata.get('px_mm', 'missing')[:40]}, the generator's {config.target.px_mm}"
-        )
-    images = tensors.pop("images", None)
-    if images is None or images.ndim != 3 or images.shape[1:] != (size, size):
+    for name, wanted in (("format", FORMAT), ("placement", str(target.placement)), ("px_mm", repr(target.px_mm))):
+        if metadata.get(name) != wanted:
+            raise TrainError(path, f"{name} is {metadata.get(name, 'missing')[:60]!r}, expected {wanted!r}")
+    images, size = tensors.pop("images", np.zeros(0)), target.size_px
+    if images.ndim != 3 or images.shape[1:] != (size, size):
         raise TrainError(path, f"images must be (n, {size}, {size})")
-    if images.dtype == torch.uint8:
-        images = images.float() / 255
-    if images.dtype != torch.float32 or not ((images >= 0) & (images <= 1)).all():
+    if images.dtype == np.uint8:
+        images = images.astype(np.float32) / np.float32(255)
+    if images.dtype != np.float32 or not ((images >= 0) & (images <= 1)).all():
         raise TrainError(path, "images must be uint8, or float32 from 0 to 1")
-    columns: list[Tensor] = []
-    for spec in config.build_target().inputs:
-        value = tensors.pop(spec.name, None)
-        if value is None or value.shape != (len(images),) or not value.is_floating_point():
-            raise TrainError(path, f"{spec.name} must be {len(images)} floating-point numbers")
-        bad = ~((value >= spec.low) & (value <= spec.high))
-        if bad.any():
-            raise TrainError(path, f"{spec.name} = {float(value[bad][0]):g} is outside [{spec.low:g}, {spec.high:g}]")
-        columns.append(value.float())
-    for name in sorted(tensors):
+    for name in INPUTS:
+        if name not in tensors or tensors[name].shape != (len(images),) or tensors[name].dtype.kind != "f":
+            raise TrainError(path, f"{name} must be {len(images)} floating-point numbers")
+    for name in sorted(tensors.keys() - set(INPUTS)):
         raise TrainError(path, f"{name[:60]!r} is not an input of the generator")
-    inputs = torch.stack(columns, dim=-1)
-    if len(torch.unique(inputs, dim=0)) < 2:
-        raise TrainError(path, "captures of at least two conditions are needed: one to learn from, one to validate on")
-    return Kept(inputs, images), metadata.get("source", "not stated")[:200].replace("\n", " ")
-
-
-def batches(config: TrainConfig, images: Images, start: int) -> Generator[tuple[Tensor, Tensor]]:
-    """Inputs (n, P) and images (n, N, N) of the steps from `start` to the last, in order.
-
-    Close the iterator to end the threads early.
-
-    A batch follows from the seed and its step alone, so the number of `config.workers` changes no image. Without
-    workers each batch is drawn when it is asked for. The compiled rasters release the interpreter's lock, so threads
-    draw beside the training.
-    """
-
-    def draw(step: int) -> tuple[Tensor, Tensor]:
-        return images.pick(batch_numbers(len(images), config.batch, config.seed, step))
-
-    steps = range(start, config.steps)
-    if config.workers == 0:
-        yield from map(draw, steps)
-        return
-    pool = ThreadPoolExecutor(config.workers)
-    waiting: deque[Future[tuple[Tensor, Tensor]]] = deque()
+    inputs = np.stack([tensors[name] for name in INPUTS], axis=-1).astype(np.float32)
     try:
-        for step in steps:
-            waiting.append(pool.submit(draw, step))
-            if len(waiting) > _AHEAD * config.workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        target.check(inputs)
+    except ValueError as error:
+        raise TrainError(path, str(error)) from error
+    if len(np.unique(inputs, axis=0)) < 2:
+        raise TrainError(path, "captures of at least two conditions are needed: one to learn from, one to validate on")
+    return Images(target, inputs, images), metadata.get("source", "not stated")[:200].replace("\n", " ")
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's content. Raises TrainError if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise TrainError(path, error.strerror or "cannot be read") from error
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a temporary file, flush it to disk and rename it: after a kill there is the old file or the new one."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
     finally:
-        pool.shutdown(cancel_futures=True)
+        os.close(folder)

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from brushloop.model.brush import Brush, DomainError
-from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.ccdbsm import Brush, DomainError, basic_lengths, ccdbsm
+from brushloop.model.raster.press import lengths
 
 # (H, alpha): O3A, O3C, O4O3, length, width, all mm, for R = 6, L = 48 and lambda = pi.
 TABLE = {
@@ -66,28 +67,27 @@ def test_lengths_equal_the_cotangent_form_of_the_paper(press: tuple[Brush, float
 def test_lengths_are_distances_in_a_cone_cut_by_the_paper(press: tuple[Brush, float, float]) -> None:
     brush, h, tilt_deg = press
     a = math.radians(tilt_deg)
-    axis = torch.tensor([math.sin(a), 0.0, math.cos(a)], dtype=torch.float64)
-    apex = torch.tensor([0.0, 0.0, -h], dtype=torch.float64)  # the tip, H below the paper z = 0
+    axis = np.array([math.sin(a), 0.0, math.cos(a)])
+    apex = np.array([0.0, 0.0, -h])  # the tip, H below the paper z = 0
     o3 = apex + axis * (h / math.cos(a))
     slope = float(brush.radius_mm) / float(brush.length_mm)
 
-    def outside(point: torch.Tensor) -> float:
+    def outside(point: np.ndarray) -> float:
         """Positive outside the cone: distance to the axis less the cone's radius there."""
         along = float((point - apex) @ axis)
-        return float(torch.linalg.vector_norm(point - apex - along * axis)) - slope * along
+        return float(np.linalg.norm(point - apex - along * axis)) - slope * along
 
     def wall(direction: list[float]) -> float:
         """The distance on the paper from O3 to the cone's wall."""
-        unit = torch.tensor(direction, dtype=torch.float64)
-        return brentq(lambda s: outside(o3 + s * unit), 0.0, 50 * h, xtol=1e-13)
+        return brentq(lambda s: outside(o3 + s * np.array(direction)), 0.0, 50 * h, xtol=1e-13)
 
     mark = ccdbsm(brush, h, tilt_deg)
     toward_tip = wall([-1.0, 0.0, 0.0])
     assert mark.o3a_mm.item() == pytest.approx(toward_tip, rel=1e-7)
     assert mark.o3c_mm.item() == pytest.approx(wall([0.0, 1.0, 0.0]), rel=1e-7)
     # The tip hinges about the wall point A: the wall below the paper is laid down on it.
-    hinge = o3 - torch.tensor([toward_tip, 0.0, 0.0], dtype=torch.float64)
-    below = float(torch.linalg.vector_norm(hinge - apex))
+    hinge = o3 - np.array([toward_tip, 0.0, 0.0])
+    below = float(np.linalg.norm(hinge - apex))
     assert mark.o4o3_mm.item() == pytest.approx(toward_tip + below, rel=1e-7)
 
 
@@ -103,7 +103,7 @@ def test_the_area_matches_quadrature(press: tuple[Brush, float, float], lam: flo
 @given(presses())
 def test_the_half_width_is_greatest_at_the_brush_axis_and_ends_at_both_ends(press: tuple[Brush, float, float]) -> None:
     mark = ccdbsm(*press)
-    places = torch.stack((1.5 * mark.x_min_mm, mark.x_min_mm, torch.zeros(1).double(), mark.x_max_mm), dim=-1)
+    places = np.stack((1.5 * mark.x_min_mm, mark.x_min_mm, np.zeros(1), mark.x_max_mm), axis=-1)
     peak = mark.half_width_mm.item()
     assert mark.half_width(places)[0].tolist() == pytest.approx([0.0, 0.0, peak, 0.0], abs=1e-6 * peak)
 
@@ -117,12 +117,26 @@ def test_every_length_is_proportional_to_depth(press: tuple[Brush, float, float]
     assert smaller.area_mm2.item() == pytest.approx(factor**2 * mark.area_mm2.item(), rel=1e-12)
 
 
-def test_parameters_broadcast_and_keep_their_dtype() -> None:
-    mark = ccdbsm(BRUSH, torch.tensor([11.0, 20.0], dtype=torch.float32), 5)
+def test_a_tensor_computes_in_torch_and_keeps_its_dtype_all_else_in_numpy() -> None:
+    depths = np.array([11.0, 20.0])
+    mark, in_torch = ccdbsm(BRUSH, depths, 5), ccdbsm(BRUSH, torch.tensor(depths, dtype=torch.float32), 5)
+    assert isinstance(mark.o3a_mm, np.ndarray)
     assert mark.o3a_mm.shape == mark.lam.shape == (2,)
-    assert mark.o3a_mm.dtype == torch.float32
-    assert ccdbsm(BRUSH, 11, 5).o3a_mm.dtype == torch.float64
-    assert ccdbsm(BRUSH, 11, 5, dtype=torch.float32).o3a_mm.dtype == torch.float32
+    assert in_torch.o3a_mm.dtype == torch.float32
+    for size in ("o3a_mm", "o3c_mm", "o4o3_mm", "area_mm2"):
+        np.testing.assert_allclose(getattr(in_torch, size).numpy(), getattr(mark, size), rtol=1e-6)
+
+
+@given(presses(), st.floats(0.1, 10))
+def test_the_scalar_forms_of_the_equations_agree_with_the_arrays(press: tuple[Brush, float, float], lam: float) -> None:
+    brush, depth_mm, tilt_deg = press
+    mark = ccdbsm(brush, depth_mm, tilt_deg, lam)
+    scalar = basic_lengths(depth_mm, math.radians(tilt_deg), brush.radius_mm, brush.length_mm, math)
+    assert scalar == pytest.approx((mark.o3a_mm.item(), mark.o3c_mm.item(), mark.o4o3_mm.item()), rel=1e-12)
+    compiled = np.zeros((1, 5))
+    assert lengths(np.array([[depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam]]), compiled) == 1
+    sizes = [mark.o3a_mm.item(), mark.o4o3_mm.item(), mark.half_width_mm.item()]
+    assert compiled[0, :3].tolist() == pytest.approx(sizes, rel=1e-12)
 
 
 def test_gradients_are_exact_in_every_parameter() -> None:
@@ -149,7 +163,7 @@ def test_presses_outside_the_domain_are_refused(
     depth_mm: float, tilt_deg: float, name: str, value: float, says: str
 ) -> None:
     with pytest.raises(DomainError) as caught:
-        ccdbsm(BRUSH, torch.tensor([15.0, depth_mm], dtype=torch.float64), tilt_deg)
+        ccdbsm(BRUSH, np.array([15.0, depth_mm]), tilt_deg)
     assert caught.value.name == name
     assert caught.value.value == pytest.approx(value, nan_ok=True)
     assert says in str(caught.value)
@@ -167,4 +181,4 @@ def test_impossible_brush_dilation_and_shape_are_refused() -> None:
     with pytest.raises(DomainError, match="lam = 0"):
         ccdbsm(BRUSH, 15, 5, 0)
     with pytest.raises(ValueError, match=r"\(2, 2\)"):
-        ccdbsm(BRUSH, torch.ones(2, 2), 5)
+        ccdbsm(BRUSH, np.ones((2, 2)), 5)

@@ -18,7 +18,7 @@ from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import BLUE, ORANGE, ink_uri, overlay_uri, plot, plot_uri
 from brushloop.calibrate.validate.report.data import Report
 from brushloop.calibrate.validate.run import Outcome
-from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import DomainError
 
 ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""

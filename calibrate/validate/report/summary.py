@@ -31,7 +31,7 @@ from brushloop.calibrate.validate.report.data import (
 from brushloop.calibrate.validate.rows import Rows
 from brushloop.calibrate.validate.run import ANOTHER, REPEATED, Outcome
 from brushloop.calibrate.validate.sources import LoadedSession, one_source
-from brushloop.model.brush import DomainError
+from brushloop.model.ccdbsm import DomainError
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Condition

@@ -18,8 +18,7 @@ from brushloop.calibrate.invert.invert import Row, off_command
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.presses import ReplayConfig
-from brushloop.model.brush import Brush
-from brushloop.model.ccdbsm import ccdbsm
+from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.raster.exact import coverage_at
 from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.messages import encode_png
@@ -35,7 +34,7 @@ START = (34.0, 20.0)  # mm from the left and top edge
 def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
     """A 50 x 40 mm photograph at 12 px/mm of CCD-BSM's own mark, touched at START, ferrule to the right."""
     origin = (START[0] + depth_mm * math.tan(math.radians(tilt_deg)), START[1])
-    ink = coverage_at(ccdbsm(Brush(), depth_mm, tilt_deg), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
+    ink = coverage_at(ccdbsm(Brush(), depth_mm, tilt_deg).outline(), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 

@@ -13,7 +13,7 @@ from brushloop.calibrate.loop.compare import by_name, pair_up
 from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, Pair, PairScore, score_pairs, scores_of, verdicts
 from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
 from brushloop.calibrate.stats import interval_over_groups
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
 from brushloop.sessions.messages import encode_png

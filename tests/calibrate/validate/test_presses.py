@@ -20,7 +20,7 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.compare.score import best_shift
 from brushloop.calibrate.validate.jobs import ABSENT, PrepareJob, Press, ScoreJob, prepare_job, score_job
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_models
 from brushloop.sessions.messages import encode_png

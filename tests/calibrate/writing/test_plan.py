@@ -19,7 +19,7 @@ from brushloop.calibrate.writing.plan_files import PICTURE, write_plan
 from brushloop.calibrate.writing.plan_record import PROTOCOL, load_plan
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.model.characters.brush import Reach
 from brushloop.model.drag import DragModel
 from brushloop.model.strokes import stroke_model

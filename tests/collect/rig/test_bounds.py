@@ -13,8 +13,8 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.brush_file import load_brush
 from brushloop.drivers.sim.described import SimFileError
+from brushloop.model.generator import TrainError
 from brushloop.model.train.config import load_config
-from brushloop.model.train.errors import TrainError
 from tests.collect.rig.test_config import RIG
 
 DIGITS = "9" * 10_000

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.model.characters.brush import Reach, dragged_depth_of
 from brushloop.model.characters.drag import dragged, trail
 from brushloop.model.characters.ink import swept, written

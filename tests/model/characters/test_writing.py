@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from brushloop.model.brush import Brush
+from brushloop.model.ccdbsm import Brush
 from brushloop.model.characters.brush import Reach, depth_of
 from brushloop.model.characters.glyph import parse_glyph
 from brushloop.model.characters.ink import dense, reference, stamped, swept, written

@@ -7,8 +7,8 @@ clamp(m - level, 0, 1). Each level is crossed once on the tip's side and once on
 form. There P(a) is less, and the two pixels that meet at the level are corrected by the difference. Below the axis all
 is mirrored.
 
-Everything is in pixels here. Means are whole numbers of 2^-23 pixel (coarser in images larger than 128), because
-float32 rounds half widths of more than 16 pixels by up to 1e-6.
+In the compiled part everything is in pixels. Means are whole numbers of 2^-23 pixel (coarser in images larger than
+128), because float32 rounds half widths of more than 16 pixels by up to 1e-6.
 """
 
 import math
@@ -16,9 +16,53 @@ import math
 import numba
 import numpy as np
 
+from brushloop.model.arrays import Array
+from brushloop.model.ccdbsm import Brush, ccdbsm
+from brushloop.model.raster import PX_MM, SIZE_PX, Images, check_raster, checked_images, in_parts
 from brushloop.model.raster.kernel import FURTHEST, OPTIONS, compiled, inline
 
 CENTRED = 1e-9  # px; an axis this close to a row edge or to the middle of a row has a mirror image on the grid
+
+
+def press_images(
+    brush: Brush,
+    depth_mm: Array,
+    tilt_deg: Array,
+    lam: Array = math.pi,
+    *,
+    origin_mm: Array | None = None,
+    size_px: int = SIZE_PX,
+    px_mm: float = PX_MM,
+    threads: int | None = 1,
+    out: Images | None = None,
+) -> Images:
+    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for CCD-BSM's marks of B presses at heading 0.
+
+    The same as `coverage` of `ccdbsm(brush, depth_mm, tilt_deg, lam)`, but several times as fast. Depth, tilt, lambda
+    and the lengths of `brush` are numbers or (B,). `origin_mm`, (2,) or (B, 2), centres each mark's bounding box if it
+    is left out; `threads` and `out` as for `coverage`, float32 only. Raises DomainError for a press outside the model's
+    domain, and ValueError for an invalid size, origin or `out`.
+    """
+    check_raster(size_px, px_mm)
+    columns = (depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)
+    presses = np.empty((np.broadcast(*columns).size, len(columns)))
+    for k, values in enumerate(columns):
+        presses[:, k] = values
+    marks = np.empty_like(presses)
+    inside = lengths(presses, marks)
+    if inside < len(presses):
+        depth, tilt, radius, length, dilation = presses[inside].tolist()
+        ccdbsm(Brush(radius, length), depth, tilt, dilation)  # raises a DomainError that names the value
+        raise ValueError(f"press {inside}: H = {depth:g} mm at {tilt:g} deg makes no mark")
+    if origin_mm is None:
+        half = 0.5 * size_px * px_mm
+        marks[:, 3], marks[:, 4] = half + 0.5 * (marks[:, 1] - marks[:, 0]), half
+    else:
+        marks[:, 3:] = origin_mm
+    marks /= px_mm
+    out = checked_images(out, len(marks), size_px)
+    in_parts(lambda at: draw(marks[at], out[at]), len(out), threads)
+    return out
 
 
 def draw(marks, out):

@@ -1,0 +1,138 @@
+"""Presses come back from their images, with intervals that keep their word and flags where they cannot."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from brushloop.model.ccdbsm import Brush
+from brushloop.model.inversion import Flag, Inverter, Range
+from brushloop.model.strokes import StrokeModel, stroke_models
+
+PX = 0.25
+SIDE = 128 * PX
+ANCHOR = (0.8 * SIDE, 0.5 * SIDE)
+MODELS = stroke_models(Brush())
+INVERT = Inverter(MODELS["ccd-bsm"], px_mm=PX)
+
+
+def drawn(depth_mm, tilt_deg, place_mm, heading_deg=0.0, model: StrokeModel = MODELS["ccd-bsm"]) -> np.ndarray:
+    columns = np.broadcast_arrays(depth_mm, tilt_deg, *np.transpose(place_mm), heading_deg)
+    return Inverter(model, px_mm=PX).predict(np.column_stack(columns), PX)
+
+
+def anchored(count: int, seed: int, tilts: tuple[float, float] = (0.0, 10.0)):
+    rng = np.random.default_rng(seed)
+    depth, tilt = rng.uniform(11, 20, count), rng.uniform(*tilts, count)
+    place = np.array(ANCHOR) + rng.uniform(-0.1, 0.1, (count, 2))
+    return depth, tilt, place, drawn(depth, tilt, place)
+
+
+def inside(recovered, name: str, true: np.ndarray) -> float:
+    low, high = recovered.interval(name)
+    return float(((low <= true) & (true <= high)).mean())
+
+
+def test_clean_images_give_the_press_exactly_in_20_ms_each() -> None:
+    depth, tilt, place, images = anchored(60, 1)
+    began = time.thread_time()
+    recovered = INVERT(images, place)
+    assert time.thread_time() - began < 60 * 0.020
+    assert np.abs(recovered.depth_mm - depth).max() < 1e-3
+    assert np.abs(recovered.tilt_deg - tilt).max() < 0.05
+    assert not any(flags & {Flag.ALPHA_UNKNOWN, Flag.DID_NOT_CONVERGE} for flags in recovered.flags)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(4.0, 20.0), st.floats(0.0, 25.0), st.floats(-180.0, 180.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+@example(10.3125, 20.0, 0.0, 0.0, 0.0)
+def test_place_and_heading_come_back_too(depth: float, tilt: float, heading: float, x: float, y: float) -> None:
+    turn, ahead = math.radians(heading), depth * (0.5 - math.tan(math.radians(tilt)))
+    place = np.array([[0.5 * SIDE + x + ahead * math.cos(turn), 0.5 * SIDE + y - ahead * math.sin(turn)]])
+    recovered = INVERT(drawn(depth, tilt, place, heading))
+    assert recovered.depth_mm[0] == pytest.approx(depth, abs=1e-3)
+    assert recovered.tilt_deg[0] == pytest.approx(tilt, abs=0.05)
+    assert recovered.values[0, 2:4] == pytest.approx(place[0], abs=0.02)
+    assert math.cos(math.radians(recovered.values[0, 4] - heading)) > 1 - 1e-6
+    assert Flag.ALPHA_UNKNOWN in recovered.flags[0]
+
+
+@pytest.mark.parametrize("model", ["bezier", "ellipse", "qbc"])
+def test_any_model_inverts_its_own_marks(model: str) -> None:
+    depth, tilt = np.array([12.0, 16.0, 18.5]), np.array([2.0, 5.0, 9.0])
+    images = drawn(depth, tilt, [ANCHOR] * 3, model=MODELS[model])
+    recovered = Inverter(MODELS[model], px_mm=PX)(images, ANCHOR)
+    assert np.abs(recovered.depth_mm - depth).max() < 1e-3
+    assert np.abs(recovered.tilt_deg - tilt).max() < 0.05
+
+
+def test_binary_images_give_the_depth_to_a_fiftieth_of_a_millimetre() -> None:
+    depth, tilt, place, images = anchored(100, 2)
+    recovered = INVERT((images > 0.5).astype(np.float32), place)
+    assert np.abs(recovered.depth_mm - depth).mean() < 0.02
+    assert inside(recovered, "depth_mm", depth) >= 0.85
+    assert inside(recovered, "tilt_deg", tilt) >= 0.75
+
+
+def test_intervals_under_sensor_noise_keep_their_word() -> None:
+    depth, tilt, place, images = anchored(200, 3, (1.0, 10.0))
+    noisy = images + np.random.default_rng(4).normal(0, 0.05, images.shape)
+    recovered = INVERT(noisy, place)
+    assert inside(recovered, "depth_mm", depth) >= 0.88  # few blocks lie on a boundary: a little less than 95 %
+    assert inside(recovered, "tilt_deg", tilt) >= 0.78
+
+
+def test_the_recovered_press_is_the_best_of_a_grid_around_it() -> None:
+    _, _, place, images = anchored(1, 5)
+    target = (images > 0.5).astype(np.float32)
+    recovered = INVERT(target, place)
+    steps = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 21), np.linspace(-0.5, 0.5, 21)), -1).reshape(-1, 2)
+    near = recovered.values[0, :2] + np.vstack(((0.0, 0.0), steps))
+    cost = np.square(drawn(near[:, 0], np.maximum(near[:, 1], 0), np.repeat(place, len(near), 0)) - target).sum((1, 2))
+    assert cost[0] <= cost.min() * (1 + 1e-3)
+
+
+def test_an_uncertain_anchor_widens_the_interval_of_alpha() -> None:
+    _, tilt, place, images = anchored(40, 7, (2.0, 10.0))
+    binary, off = (images > 0.5).astype(np.float32), np.random.default_rng(8).normal(0, 0.1, place.shape)
+    recovered = Inverter(MODELS["ccd-bsm"], px_mm=PX, anchor_sigma_mm=0.1)(binary, place + off)
+    assert np.median(recovered.sigma[:, 1]) > 3 * np.median(INVERT(binary, place).sigma[:, 1])
+    assert inside(recovered, "tilt_deg", tilt) >= 0.85
+    assert not any(Flag.DID_NOT_CONVERGE in flags for flags in recovered.flags)
+
+
+def test_flags_say_what_is_wrong() -> None:
+    depth, tilt, place, images = anchored(1, 9)
+    blank = INVERT(np.zeros_like(images), place)
+    assert Flag.BLANK in blank.flags[0]
+    assert np.isnan(blank.depth_mm[0])
+    shifted = np.array([[5.0, 0.5 * SIDE]])
+    assert Flag.CUT in INVERT(drawn(depth, tilt, shifted), shifted).flags[0]
+    low = Inverter(MODELS["ccd-bsm"], Range((2.0, 10.0), (0.0, 10.0)), px_mm=PX)(images, place)
+    assert Flag.AT_BOUND in low.flags[0]
+    assert low.depth_mm[0] == 10.0
+
+
+def test_an_upright_press_at_the_end_of_alphas_range_does_not_speak_against_the_model() -> None:
+    place = np.array([ANCHOR])
+    images = drawn(15.0, 0.0, place)
+    off = [
+        INVERT(images, place + np.array([beside, 0.0])) for beside in (-0.3, 0.3)
+    ]  # as if the brush leaned the other way
+    [flags] = [recovered.flags[0] for recovered in off if recovered.tilt_deg[0] == 0.0]
+    assert Flag.UPRIGHT in flags
+    assert Flag.AT_BOUND not in flags
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    with pytest.raises(ValueError, match="anchor_sigma_mm = -1"):
+        Inverter(MODELS["ccd-bsm"], anchor_sigma_mm=-1.0)
+    with pytest.raises(ValueError, match="expected \\(B, 128, 128\\)"):
+        INVERT(np.zeros((1, 64, 64)), ANCHOR)
+    with pytest.raises(ValueError, match=r"expected 0\.001 <= low < high"):
+        Range((5.0, 5.0))

@@ -1,0 +1,253 @@
+"""Coverage in torch, compiled, and straight from presses: against quadrature, supersampling and each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from brushloop.model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
+from brushloop.model.outline import Outline, cross
+from brushloop.model.raster import PX_MM, centred_origin, coverage
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster.press import press_images
+from brushloop.model.strokes import stroke_models
+
+MODELS = stroke_models(Brush())
+MARK = ccdbsm(Brush(), 15.0, 7.0)
+ORIGIN = (12.117, 13.743)
+presses = st.tuples(st.floats(3, 20), st.floats(0, 60))
+
+
+def half_width_of(mark: CcdBsm) -> Callable[[float], float]:
+    """Eq. 1 of one mark, written independently."""
+    a, w, t = mark.o3a_mm.item(), mark.half_width_mm.item(), mark.o4o3_mm.item()
+
+    def half_width(x: float) -> float:
+        if not -t < x < a:
+            return -1.0
+        return w * (1 - (x / t) ** 2) if x < 0 else w * math.sqrt(1 - (x / a) ** 2)
+
+    return half_width
+
+
+def pixel_by_quadrature(mark: CcdBsm, i: int, j: int, origin: tuple[float, float], heading_deg: float) -> float:
+    """The share of pixel (i, j) under the mark: the pixel's square is turned into the stroke frame and integrated."""
+    psi = math.radians(heading_deg)
+    corners = []
+    for column, row in ((j, i), (j + 1, i), (j + 1, i + 1), (j, i + 1)):
+        right, up = column * PX_MM - origin[0], origin[1] - row * PX_MM
+        corners.append((right * math.cos(psi) + up * math.sin(psi), up * math.cos(psi) - right * math.sin(psi)))
+    half_width = half_width_of(mark)
+
+    def inked(x: float) -> float:
+        cuts = []
+        for (xa, ya), (xb, yb) in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if min(xa, xb) <= x <= max(xa, xb) and xa != xb:
+                cuts.append(ya + (x - xa) / (xb - xa) * (yb - ya))
+        w = half_width(x)
+        return max(0.0, min(max(cuts), w) - max(min(cuts), -w)) if cuts and w > 0 else 0.0
+
+    low, high = min(x for x, _ in corners), max(x for x, _ in corners)
+    kinks = [*(x for x, _ in corners), 0.0, mark.o3a_mm.item(), -mark.o4o3_mm.item()]
+    points = sorted(x for x in kinks if low < x < high)
+    area, _ = quad(inked, low, high, points=points or None, limit=500, epsabs=1e-10, epsrel=1e-10)
+    return area / PX_MM**2
+
+
+@pytest.mark.parametrize("press", [(15.0, 7.0), (11.0, 0.0), (6.0, 60.0)])
+@pytest.mark.parametrize("heading_deg", [0.0, 45.0, 133.3, -71.0])
+def test_boundary_pixels_match_quadrature_at_any_heading(press: tuple[float, float], heading_deg: float) -> None:
+    mark = ccdbsm(Brush(), *press)
+    exact = coverage_at(mark.outline(), ORIGIN, heading_deg)[0].numpy()
+    compiled = coverage(mark.outline(), ORIGIN, heading_deg, out=np.empty((1, 128, 128)))[0]
+    boundary = np.argwhere((exact > 0) & (exact < 1))
+    for i, j in boundary[np.random.default_rng(0).choice(len(boundary), 10, replace=False)]:
+        expected = pixel_by_quadrature(mark, i, j, ORIGIN, heading_deg)
+        assert abs(exact[i, j] - expected) < 1e-6
+        assert abs(compiled[i, j] - expected) < 1e-6
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_supersampling_agrees_at_a_heading(name: str) -> None:
+    # A point is counted whole, so single pixels differ by up to half a line of 32 points.
+    outline, psi = MODELS[name].profile(15.0, 7.0), math.radians(30)
+    fine = (np.arange(32 * 64) + 0.5) * 0.4 / 32
+    right, up = np.meshgrid(fine - ORIGIN[0], ORIGIN[1] - fine)
+    x, y = right * math.cos(psi) + up * math.sin(psi), up * math.cos(psi) - right * math.sin(psi)
+    edge = outline.polyline(64)[0]
+    upper = edge[np.argsort(edge[:, 0])]
+    upper = upper[upper[:, 1] >= 0]  # every model here is symmetric about its axis
+    inside = abs(y) <= np.interp(x, *upper.T, left=-1, right=-1)
+    sampled = inside.reshape(64, 32, 64, 32).mean((1, 3))
+    raster = {"size_px": 64, "px_mm": 0.4}
+    for image in (
+        coverage_at(outline, ORIGIN, 30.0, **raster)[0].numpy(),
+        coverage(outline, ORIGIN, 30.0, **raster)[0],
+    ):
+        assert abs(image - sampled).max() <= 1 / 32
+        assert image.sum() == pytest.approx(sampled.sum(), rel=1e-3)
+
+
+@given(presses, st.floats(-360, 360), st.floats(-5, 30), st.floats(-5, 30), st.sampled_from(sorted(MODELS)))
+@settings(deadline=None, max_examples=60)
+def test_both_exact_paths_agree_wherever_a_mark_lies(
+    press: tuple[float, float], heading_deg: float, x_mm: float, y_mm: float, name: str
+) -> None:
+    outline = MODELS[name].profile(*press)
+    exact = coverage_at(outline, (x_mm, y_mm), heading_deg, size_px=64, px_mm=0.4)[0].numpy()
+    compiled = coverage(outline, (x_mm, y_mm), heading_deg, size_px=64, px_mm=0.4)[0]
+    assert abs(exact - compiled).max() < 1e-6
+    assert exact.min() >= 0
+    assert exact.max() <= 1
+
+
+def test_marks_on_pixel_edges_come_out_right() -> None:
+    # Whole numbers of pixels and eighths of a turn put ends, turns and 45 degree points onto edges and corners.
+    rng = np.random.default_rng(0)
+    depth_mm, tilt_deg = (rng.choice(of, 100) for of in ((2.0, 8.0, 10.3125, 16.0), (0.0, 5.0, 20.0)))
+    heading_deg, origin = 45.0 * rng.integers(-4, 5, 100), 0.25 * rng.integers(24, 104, (100, 2))
+    outline = ccdbsm(Brush(), depth_mm, tilt_deg).outline()
+    image = coverage(outline, origin, heading_deg, px_mm=0.25, out=np.empty((100, 128, 128)))
+    assert abs(image - coverage_at(outline, origin, heading_deg, px_mm=0.25).numpy()).max() < 1e-6
+    assert image.min() >= 0
+    assert image.max() <= 1
+
+
+@pytest.mark.parametrize("weight", [0.05, 0.2, 0.45, 0.6, 0.95])
+def test_arcs_of_any_span_and_shear_come_out_right(weight: float) -> None:
+    arcs = np.random.default_rng(0).uniform(2, 24, (20, 3, 2))
+    start, middle, end = np.moveaxis(arcs, 1, 0)
+    backwards = cross(middle - start, end - start) < 0
+    arcs[backwards] = arcs[backwards, ::-1]
+    chords = np.stack((arcs[:, 2], 0.5 * (arcs[:, 0] + arcs[:, 2]), arcs[:, 0]), axis=1)
+    outline = Outline(np.stack((arcs, chords), axis=1), np.tile([weight, 1.0], (20, 1)))
+    image = coverage(outline, (0.0, 25.6), out=np.empty((20, 128, 128)))
+    assert abs(image - coverage_at(outline, (0.0, 25.6)).numpy()).max() < 1e-6
+
+
+@given(presses, st.floats(-180, 180), st.sampled_from(sorted(MODELS)))
+@settings(deadline=None, max_examples=40)
+def test_the_ink_of_a_whole_mark_is_its_area(press: tuple[float, float], heading_deg: float, name: str) -> None:
+    outline = MODELS[name].profile(*press)
+    side = 2.4 * (outline.x_max_mm - outline.x_min_mm + outline.width_mm).item()
+    image = coverage_at(outline, (side / 2, side / 2), heading_deg, px_mm=side / 128)
+    assert image.sum().item() * (side / 128) ** 2 == pytest.approx(outline.area_mm2.item(), rel=1e-6)
+
+
+@pytest.mark.parametrize(("size_px", "px_mm"), [(128, 0.2), (64, 0.05), (200, 0.1), (1, 30.0)])
+@pytest.mark.parametrize("grid", ["nowhere", "on corners", "beside corners"])
+def test_images_straight_from_presses_match_the_outline_s(size_px: int, px_mm: float, grid: str) -> None:
+    # Marks that end on pixel edges, lie on row edges and in the middle of rows, and reach beyond the image or miss it.
+    rng = np.random.default_rng(size_px)
+    tilt_deg = rng.uniform(0, 60, 150)
+    depth_mm = np.minimum(rng.uniform(0.01, 40, 150), 47 * np.cos(np.radians(tilt_deg)))
+    mark = ccdbsm(Brush(), depth_mm, tilt_deg)
+    side_mm = size_px * px_mm
+    origin = rng.uniform(-0.6 * side_mm - 10, 1.6 * side_mm + 10, (150, 2))
+    if grid != "nowhere":
+        origin = np.round(2 * origin / px_mm) / 2 * px_mm
+        origin[:, 0] = np.round(origin[:, 0] / px_mm) * px_mm - rng.choice([0.0, 1.0], 150) * mark.o3a_mm
+    if grid == "beside corners":
+        origin += rng.choice([1e-6, -1e-7, 1e-12], (150, 2))
+    level = coverage_at(mark.outline(), origin, size_px=size_px, px_mm=px_mm).numpy()
+    dirty = np.full(level.shape, 7, np.float32)
+    images = press_images(Brush(), depth_mm, tilt_deg, origin_mm=origin, size_px=size_px, px_mm=px_mm, out=dirty)
+    assert abs(images - level).max() < 1e-6
+    assert images.min() >= 0
+    assert images.max() <= 1
+
+
+def test_presses_of_many_brushes_are_centred_and_checked() -> None:
+    brush, lam = Brush(np.array([5.0, 6.0, 7.0]), 44.0), np.array([1.0, 2.0, 3.0])
+    outline = ccdbsm(brush, 15.0, 7.0, lam).outline()
+    expected = coverage(outline, centred_origin(outline))
+    np.testing.assert_allclose(press_images(brush, 15.0, 7.0, lam), expected, rtol=0, atol=1e-6)
+    with pytest.raises(DomainError, match=r"tilt_deg = -1 is outside \[0, 82.875\) deg"):
+        press_images(Brush(), np.array([15.0, 15.0]), np.array([7.0, -1.0]))
+    with pytest.raises(DomainError, match=r"depth_mm = nan is outside \(0, 47.6"):
+        press_images(Brush(), math.nan, 7.0)
+    with pytest.raises(ValueError, match="a shape is not finite"):
+        press_images(Brush(), np.full(2, 15.0), 7.0, origin_mm=np.array([[1.0, 1.0], [math.nan, 1.0]]))
+
+
+# torch itself compiles its forward-mode rules with torch.jit.script on first use, and warns about it.
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+def test_gradients_are_exact_in_every_parameter() -> None:
+    def image(h, tilt, radius, length, lam, origin, heading) -> torch.Tensor:
+        mark = ccdbsm(Brush(radius, length), h, tilt, lam)
+        return coverage_at(mark.outline(), origin, heading, size_px=9, px_mm=2.0)
+
+    values = ([13.0], [6.0], [6.0], [48.0], [3.0], [[14.3, 8.0]], [25.0])  # no boundary runs along a pixel edge
+    point = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values]
+    assert torch.autograd.gradcheck(image, point, check_forward_ad=True)
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_every_model_has_exact_gradients_that_stay_finite_where_the_axis_lies_on_a_row_edge(name: str) -> None:
+    def image(h: torch.Tensor, tilt: torch.Tensor) -> torch.Tensor:
+        return coverage_at(MODELS[name].profile(h, tilt), (14.3, 8.0), size_px=9, px_mm=2.0)
+
+    point = [torch.tensor([value], dtype=torch.float64, requires_grad=True) for value in (13.0, 6.0)]
+    assert torch.autograd.gradcheck(image, point)
+
+
+@given(presses, st.floats(-180, 180))
+@settings(deadline=None, max_examples=30)
+def test_single_precision_is_good_to_a_thousandth(press: tuple[float, float], heading_deg: float) -> None:
+    double, single = (
+        ccdbsm(Brush(), torch.tensor([press[0]], dtype=kind), press[1]).outline()
+        for kind in (torch.float64, torch.float32)
+    )
+    image = coverage_at(single, ORIGIN, heading_deg)
+    assert image.dtype == torch.float32
+    assert (image - coverage_at(double, ORIGIN, heading_deg)).abs().max().item() < 1e-3
+
+
+def test_the_tip_points_left_and_rows_grow_downwards() -> None:
+    mark = ccdbsm(Brush(), 11.0, 5.0)
+    image = coverage(mark.outline(), (18.0, 5.1))[0]
+    rows, columns = np.nonzero(image > 1e-6)
+    assert columns.min() == int((18.0 - mark.o4o3_mm.item()) / PX_MM)
+    assert columns.max() == int((18.0 + mark.o3a_mm.item()) / PX_MM)
+    assert (rows.min() + rows.max() + 1) / 2 * PX_MM == pytest.approx(5.1)
+
+
+def test_large_batches_run_on_threads_and_come_out_the_same() -> None:
+    depths_mm = np.linspace(11, 20, 150)
+    outline = ccdbsm(Brush(), depths_mm, 5.0).outline()
+    one, two = (coverage(outline, centred_origin(outline), depths_mm, threads=n) for n in (1, 2))
+    assert one.dtype == np.float32
+    np.testing.assert_array_equal(one, two)
+    nothing = Outline(outline.points[:0], outline.weights[:0])
+    assert coverage(nothing, (1.0, 1.0)).shape == coverage_at(nothing, (1.0, 1.0)).shape == (0, 128, 128)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"size_px": 0}, "size_px = 0"),
+        ({"px_mm": -1.0}, "px_mm = -1"),
+        ({"heading_deg": np.zeros(2)}, r"heading_deg has shape \(2,\)"),
+        ({"origin_mm": np.zeros((2, 2))}, r"origin_mm has shape \(2, 2\), expected \(2,\) or \(3, 2\)"),
+    ],
+)
+def test_what_makes_no_image_is_refused(options: dict, words: str) -> None:
+    outline = ccdbsm(Brush(), np.array([11.0, 13.0, 15.0]), 5.0).outline()
+    for draw in (coverage_at, coverage):
+        with pytest.raises(ValueError, match=words):
+            draw(outline, **{"origin_mm": (1.0, 1.0)} | options)
+
+
+def test_images_that_cannot_be_drawn_into_and_places_out_of_reach_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"out is int64 \(1, 128, 128\)"):
+        coverage(MARK.outline(), (1.0, 1.0), out=np.zeros((1, 128, 128), np.int64))
+    for nowhere in (math.nan, math.inf, 1e30):
+        with pytest.raises(ValueError, match="a shape is not finite, or lies more than 1e"):
+            coverage(MARK.outline(), (nowhere, 1.0))
