@@ -15,8 +15,6 @@ from typer.core import TyperGroup
 import brushloop.calibrate.cli
 import brushloop.calibrate.cli_camera
 import brushloop.calibrate.fit.cli
-import brushloop.calibrate.invert.cli
-import brushloop.calibrate.loop.cli
 import brushloop.calibrate.validate.cli
 import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
@@ -113,13 +111,13 @@ app.add_typer(brushloop.calibrate.cli_camera.app, name="camera")
 app.add_typer(brushloop.calibrate.validate.cli.app, name="validate")
 app.command("fit")(brushloop.calibrate.fit.cli.fit)
 app.command("twin")(brushloop.twin.cli.twin)
-app.command("invert")(brushloop.calibrate.invert.cli.invert)
+app.command("invert")(brushloop.calibrate.cli.invert)
 loop = typer.Typer(
     cls=PathOrCommand,
     help="Recover the presses of a SESSION, press them again and compare (`brushloop loop SESSION`), or only compare.",
 )
 loop.command("session")(brushloop.collect.cli.loop)
-loop.command("compare")(brushloop.calibrate.loop.cli.compare)
+loop.command("compare")(brushloop.calibrate.cli.compare_loop)
 app.add_typer(loop, name="loop")
 brushloop.sessions.cli.app.command("export")(brushloop.calibrate.cli.export)
 app.add_typer(brushloop.sessions.cli.app, name="sessions")

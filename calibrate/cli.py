@@ -1,4 +1,7 @@
-"""`brushloop calibrate SESSION`, and its further commands: show, diff, apply, preprocess."""
+"""`brushloop calibrate SESSION` with show, diff, apply and preprocess; export, `invert` and `loop compare`.
+
+Heavy imports wait until a command runs.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
 
@@ -137,7 +141,7 @@ def export(
         raise CalibrationError("--calibration", "needs --crops")
 
     def make_cropper(recording: Recording) -> Cropper:
-        from brushloop.calibrate.crops import cropper_of
+        from brushloop.calibrate.presses import cropper_of
 
         return cropper_of(recording, calibration)
 
@@ -148,3 +152,69 @@ def export(
         say(f"left out: {stroke_id}: {reason}", err=True)
     if left_out:
         raise typer.Exit(LEFT_OUT)
+
+
+def invert(
+    session: Annotated[Path, typer.Argument(help="A session's folder or its .mcap file; imports count as sessions.")],
+    out: Annotated[Path, typer.Option(help="CSV to write; protocol-replay.toml goes beside it.")] = Path(
+        "recovered.csv"
+    ),
+    model: Annotated[str, typer.Option(help="The stroke model to invert.")] = "ccd-bsm",
+    fit: Annotated[Path | None, typer.Option(help="A brush fitted to captures, instead of --model.")] = None,
+    lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="lambda of CCD-BSM; pi when left out.")] = None,
+    depth_range: Annotated[tuple[float, float], typer.Option(help="Depths to look for, mm.")] = (2.0, 30.0),
+    tilt_range: Annotated[tuple[float, float], typer.Option(help="Tilts to look for, deg; at most 30.")] = (0.0, 30.0),
+    anchor_sd: Annotated[float, typer.Option(min=0, max=5, help="Standard deviation of the touch point, mm.")] = 0.1,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
+    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
+    presses: Annotated[
+        int | None, typer.Option(min=1, help="Only this many presses, spread evenly over the session.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How many times the protocol presses each stroke.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order in which the protocol presses.")] = 1,
+) -> None:
+    """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
+    from brushloop.calibrate.files import check_target
+    from brushloop.sessions.recording import Recording
+
+    check_target(out, ".csv")
+    Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
+
+    from brushloop.calibrate.invert.command import RecoverRequest, recover
+    from brushloop.sessions.terminal import show_work
+
+    request = RecoverRequest(
+        session=session,
+        out=out,
+        model=model,
+        fit=fit,
+        lam=lam,
+        depth_range_mm=depth_range,
+        tilt_range_deg=tilt_range,
+        anchor_sd_mm=anchor_sd,
+        mm_per_px=mm_per_px,
+        calibration=calibration,
+        presses=presses,
+        repeats=repeats,
+        seed=seed,
+    )
+    show_work(recover, request)
+
+
+def compare_loop(
+    original: Annotated[Path, typer.Argument(help="The session whose strokes were pressed again.")],
+    again: Annotated[Path, typer.Argument(help="The session of the replay protocol.")],
+    fit: Annotated[
+        Path | None, typer.Option(help="Brush fit that recovered depth and tilt; else CCD-BSM as published.")
+    ] = None,
+    mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
+    out: Annotated[Path, typer.Option(help="Folder for loop.html, loop.png, loop.csv, loop.json.")] = Path("loop"),
+) -> None:
+    """Compare re-pressed strokes with their originals, and with the brush's own repeatability."""
+    import sys
+
+    from brushloop.calibrate.loop.report import CompareRequest
+    from brushloop.calibrate.loop.report import compare as run
+    from brushloop.sessions.terminal import show_work
+
+    show_work(run, CompareRequest(original, again, out, " ".join(["brushloop", *sys.argv[1:]]), fit, mm_per_px))

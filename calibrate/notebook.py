@@ -26,15 +26,14 @@ from brushloop.calibrate.compare.place import (
     brush_of,
     covered,
     prepare_press,
-    rectified,
     simulated,
 )
 from brushloop.calibrate.compare.score import csim, ssim
-from brushloop.calibrate.crops import ink_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.fit.command import FitRequest, FitResult, fit_presses
+from brushloop.calibrate.presses import crop
 from brushloop.calibrate.session import calibration_of
 from brushloop.calibrate.validate.main import Request, ValidationOutput, check
 from brushloop.calibrate.validate.main import validate as run_validation
@@ -136,8 +135,7 @@ class RecordedPress:
 
     @cached_property
     def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
-        raster, steps = rectified(self._capture, self._session.applied, Field())
-        return raster, ink_of(self._capture, steps)
+        return crop(self._capture, self._session.applied)[:2]
 
 
 class Session:

@@ -1,4 +1,4 @@
-"""Show every stage from a photograph to a 128 x 128 stroke in a picture, and write the numbers fitted in each."""
+"""Show what becomes of a photograph on the way to a 128 x 128 stroke, and write the numbers fitted in each stage."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 COLUMNS = 4
-SCALE = {"px_per_mm": PX_PER_MM}
 TITLE_CHARS = 52
 
 
@@ -39,16 +38,10 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """The stages of a capture, and the resulting stroke image."""
+    """The stages of a capture; the last is the image that a validation compares."""
 
     where: str
     stages: tuple[Stage, ...]
-    binary: Mask
-    """(128, 128) of the field, True where ink: the image that a validation compares."""
-    soft: Soft
-    """(128, 128) coverage from 0 to 1."""
-    anchor_px: tuple[float, float] | None
-    """The zero-touch point on the small image: pixel j covers [j, j + 1). It may lie outside."""
     flags: tuple[str, ...]
     params: Params
 
@@ -74,43 +67,27 @@ def show_stroke(session: Path, stroke: str, out: Path, progress: Progress = unse
 
 
 def show_photograph(path: Path, px_per_mm: float | None, before: Path | None, out: Path) -> Trace:
-    """Show a flat photograph of known scale. Raises `CalibrationError`."""
+    """Show a flat photograph of known scale; with a page `before` it, only the new ink. Raises `CalibrationError`."""
     if px_per_mm is None:
         raise CalibrationError(str(path), "is a photograph: give --px-per-mm")
     image = read_gray(path)
     if before is not None:
-        image = only_new(read_gray(before), image, px_per_mm, str(path))
-    trace = trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), Params())
-    return _written(trace, out)
-
-
-def only_new(before: Gray, after: Gray, px_per_mm: float, where: str) -> Gray:
-    """A page with only the ink that is new since `before`, black on white. Raises `CaptureRefused`."""
-    new = new_stroke(before, after, px_per_mm, where)
-    return np.rint(255.0 * (1.0 - new.soft)).astype(np.uint8)
-
-
-def _written(trace: Trace, out: Path) -> Trace:
-    draw_stages(trace, out)
-    numbers = {"where": trace.where, "params": asdict(trace.params), "fitted": trace.log, "flags": list(trace.flags)}
-    write_whole(out.with_suffix(".json"), json.dumps(numbers, indent=2) + "\n")
-    return trace
+        image = _gray(new_stroke(read_gray(before), image, px_per_mm, str(path)).soft)
+    return _written(trace_scaled(image, (px_per_mm, px_per_mm), None, str(path), Params()), out)
 
 
 def trace_capture(capture: Capture, calibration: Calibration | None, where: str) -> Trace:
     """Trace a capture of a session, as `rectified` crops it, or as an import brings it. Raises `CaptureRefused`."""
     image = capture.image()
     raster, steps = rectified(capture, calibration, Field())
-    if calibration is None:
-        return _traced(raster, steps, where, Params(), (_captured(image), Stage("rectify", raster, SCALE)))
-    k1, k2, p1, p2, k3 = calibration.lens.distortion
-    found = {"pix2len_mm_per_px": calibration.mm_per_px, "rms_px": calibration.rms_px}
-    before = (
-        _captured(image),
-        Stage("undistort", calibration.lens.undistort(image), {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}),
-        Stage("rectify", raster, SCALE | found),
-    )
-    return _traced(raster, steps, where, Params.of(calibration), before)
+    before, fitted = [_captured(image)], dict[str, float]()
+    if calibration is not None:
+        lens = calibration.lens
+        terms: dict[str, float] = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=True))
+        before.append(Stage("undistort", lens.undistort(image), terms))
+        fitted = {"pix2len_mm_per_px": calibration.mm_per_px, "rms_px": calibration.rms_px}
+    before.append(Stage("rectify", raster, {"px_per_mm": PX_PER_MM} | fitted))
+    return _traced(steps, where, Params.of(calibration), before)
 
 
 def trace_scaled(
@@ -119,16 +96,49 @@ def trace_scaled(
     """Trace a flat photograph of known scale. Raises `CaptureRefused`."""
     raster = rescale(image, px_per_mm, where)
     anchor = None if anchor_px is None else on_raster(anchor_px, px_per_mm)
-    before = (_captured(image), Stage("rectify", raster, SCALE))
-    return _traced(raster, preprocess(raster, anchor, where, params), where, params, before)
+    before = [_captured(image), Stage("rectify", raster, {"px_per_mm": PX_PER_MM})]
+    return _traced(preprocess(raster, anchor, where, params), where, params, before)
 
 
 def _captured(image: Gray) -> Stage:
     return Stage("captured", image, {"width_px": float(image.shape[1]), "height_px": float(image.shape[0])})
 
 
-def draw_stages(trace: Trace, path: Path) -> None:
-    """Write a PNG with a picture of each stage, its name and numbers above, and the flags below. Raises OSError."""
+def _traced(steps: Steps, where: str, params: Params, before: list[Stage]) -> Trace:
+    view, whole, chosen = Field(), steps.prepared, steps.chosen
+    if whole.anchor_px is None:
+        corner = view.corner_around_px(whole.mask)
+        cropped = crop(whole, corner, view)
+    else:
+        corner, cropped = view.corner_px(whole.anchor_px), crop_at_anchor(whole, whole.anchor_px, view)
+    flags = list(whole.flags)
+    if np.count_nonzero(cropped.mask) < np.count_nonzero(whole.mask):
+        flags.append(f"too long: the stroke does not fit {view.side_mm:g} mm, its ends are cut off")
+    level, binary = steps.level, captured_mm(cropped, Tone.BINARY) > 0.5
+    contrast = {"reflectance": level.threshold, "contrast": 1.0 - level.darkest, "gate": params.contrast_gate}
+    counted_parts = {
+        "parts": float(chosen.parts),
+        "specks": float(chosen.specks),
+        "others": float(len(chosen.others_mm2)),
+        "others_mm2": float(sum(chosen.others_mm2)),
+        "area_mm2": float(np.count_nonzero(whole.mask)) / PX_PER_MM**2,
+    }
+    place = {"left_px": float(corner[0]), "top_px": float(corner[1])}
+    if cropped.anchor_px is not None:
+        place |= {"anchor_x_px": cropped.anchor_px[0], "anchor_y_px": cropped.anchor_px[1]}
+    scale = {"mm_per_px": view.mm_per_px, "area_mm2": float(binary.sum()) * view.mm_per_px**2}
+    after = (
+        Stage("flatten", to_levels(steps.reflectance), {"background_mm": params.background_mm}),
+        Stage("threshold", _shade(steps.ink), contrast),
+        Stage("components", _shade(whole.mask, steps.ink), counted_parts),
+        Stage("crop", _cross(_gray(cropped.soft), cropped.anchor_px), place),
+        Stage("resize", _shade(binary), scale),
+    )
+    return Trace(where, (*before, *after), tuple(flags), params)
+
+
+def _written(trace: Trace, out: Path) -> Trace:
+    """Write a PNG with a picture of each stage, its numbers above and the flags below, and the numbers as JSON."""
     rows = -(-len(trace.stages) // COLUMNS)
     figure, axes = picture_grid(rows, COLUMNS, (12.4, 3.8 * rows + 0.2 * len(trace.flags)))
     for axis in axes.flat[len(trace.stages) :]:
@@ -138,64 +148,10 @@ def draw_stages(trace: Trace, path: Path) -> None:
         title = textwrap.fill(f"{number} {stage.name}: {numbers}", TITLE_CHARS)
         show_picture(axis, (1.0 - stage.image / 255.0).astype(np.float32), title, fontsize=7)
     figure.supxlabel("\n".join(map(printable, (trace.where, *trace.flags))), fontsize=8)
-    save_picture(figure, path)
-
-
-def _traced(raster: Gray, steps: Steps, where: str, params: Params, before: tuple[Stage, ...]) -> Trace:
-    view, anchor_px = Field(), steps.prepared.anchor_px
-    whole, chosen = steps.prepared, steps.chosen
-    if anchor_px is None:
-        corner = view.corner_around_px(whole.mask)
-        cropped = crop(whole, corner, view)
-    else:
-        corner, cropped = view.corner_px(anchor_px), crop_at_anchor(whole, anchor_px, view)
-    flags = list(whole.flags)
-    if np.count_nonzero(cropped.mask) < np.count_nonzero(whole.mask):
-        flags.append(f"too long: the stroke does not fit {view.side_mm:g} mm, its ends are cut off")
-    anchor, binary = cropped.anchor_px, captured_mm(cropped, Tone.BINARY) > 0.5
-    shrink = view.mm_per_px * PX_PER_MM
-    small_anchor = None if anchor is None else (anchor[0] / shrink, anchor[1] / shrink)
-    light = (raster / np.maximum(steps.reflectance, 1e-3)).astype(np.float32)[steps.window]
-    after = (
-        Stage("light", np.clip(light, 0, 255).astype(np.uint8), _range(light, "gray_level")),
-        Stage("flatten", to_levels(steps.reflectance), {"background_mm": params.background_mm}),
-        Stage(
-            "gate",
-            _shade(steps.reflectance < 1.0 - params.contrast_gate),
-            {"contrast": 1.0 - steps.level.darkest, "gate": params.contrast_gate},
-        ),
-        Stage("threshold", _shade(steps.ink), {"reflectance": steps.level.threshold}),
-        Stage(
-            "components",
-            _shade(whole.mask, steps.ink),
-            {
-                "parts": float(chosen.parts),
-                "specks": float(chosen.specks),
-                "others": float(len(chosen.others_mm2)),
-                "others_mm2": float(sum(chosen.others_mm2)),
-                "join_mm": params.join_mm,
-                "speck_share": params.speck_share,
-                "hole_mm2": params.hole_mm2,
-            },
-        ),
-        Stage("crop", _gray(cropped.soft), {"left_px": float(corner[0]), "top_px": float(corner[1])}),
-        Stage(
-            "anchor",
-            _cross(_gray(cropped.soft), anchor),
-            {} if anchor is None else {"x_px": anchor[0], "y_px": anchor[1]},
-        ),
-        Stage("binarise", _shade(cropped.mask), {"area_mm2": float(np.count_nonzero(cropped.mask)) / PX_PER_MM**2}),
-        Stage(
-            "resize",
-            _shade(binary),
-            {"mm_per_px": view.mm_per_px, "area_mm2": float(binary.sum()) * view.mm_per_px**2},
-        ),
-    )
-    return Trace(where, (*before, *after), binary, captured_mm(cropped, Tone.GRAY), small_anchor, tuple(flags), params)
-
-
-def _range(values: Soft, name: str) -> dict[str, float]:
-    return {f"{name}_low": float(np.quantile(values, 0.01)), f"{name}_high": float(np.quantile(values, 0.99))}
+    save_picture(figure, out)
+    record = {"where": trace.where, "params": asdict(trace.params), "fitted": trace.log, "flags": list(trace.flags)}
+    write_whole(out.with_suffix(".json"), json.dumps(record, indent=2) + "\n")
+    return trace
 
 
 def _shade(mask: Mask, also: Mask | None = None) -> Gray:
@@ -211,10 +167,10 @@ def _gray(soft: Soft) -> Gray:
     return np.rint(255.0 * (1.0 - soft)).astype(np.uint8)
 
 
-def _cross(image: Gray, anchor: tuple[float, float] | None) -> Gray:
+def _cross(image: Gray, anchor_px: tuple[float, float] | None) -> Gray:
     drawn = image.copy()
-    if anchor is not None:
-        place = (round(anchor[0] - 0.5), round(anchor[1] - 0.5))
+    if anchor_px is not None:
+        place = (round(anchor_px[0] - 0.5), round(anchor_px[1] - 0.5))
         cv2.drawMarker(drawn, place, 255, cv2.MARKER_CROSS, 40, 7)
         cv2.drawMarker(drawn, place, 0, cv2.MARKER_CROSS, 40, 3)
     return drawn

@@ -15,7 +15,7 @@ from brushloop.calibrate.cli import app
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stages import trace_scaled
+from brushloop.calibrate.stages import Trace, trace_scaled
 from brushloop.calibrate.stroke.params import Params
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.sessions.recording import Recording
@@ -37,14 +37,19 @@ def trace(image: np.ndarray, anchor: tuple[float, float] | None = None, params: 
     return trace_scaled(image, (10.0, 10.0), anchor, "photograph", params or Params())
 
 
+def inked(found: Trace) -> np.ndarray:
+    """The last stage, (128, 128), True where ink."""
+    return found.stages[-1].image == 0
+
+
 def test_a_stroke_comes_out_at_the_scale_of_the_validation_with_its_anchor() -> None:
     found = trace(photograph((400, 300)), (430.0, 310.0))
-    assert found.binary.shape == (128, 128)
+    assert inked(found).shape == (128, 128)
     assert found.log["resize.mm_per_px"] == Field().mm_per_px
-    assert found.binary.sum() * MM_PER_PX**2 == pytest.approx(np.pi * 6 * 2, rel=0.05)
+    assert found.log["resize.area_mm2"] == pytest.approx(np.pi * 6 * 2, rel=0.05)
     left, top = (v / MM_PER_PX for v in Field().anchor_mm)
-    assert found.anchor_px == pytest.approx((left, top), abs=0.1)
-    rows, columns = np.nonzero(found.binary)
+    assert found.log["crop.anchor_x_px"] == pytest.approx(20.0 * MM_PER_PX * left, abs=0.6)
+    rows, columns = np.nonzero(inked(found))
     assert (columns.mean(), rows.mean()) == pytest.approx((left - 3.0 / MM_PER_PX, top - 1.0 / MM_PER_PX), abs=1.0)
     assert found.log["components.others"] == 0
     assert found.flags == ()
@@ -52,9 +57,9 @@ def test_a_stroke_comes_out_at_the_scale_of_the_validation_with_its_anchor() -> 
 
 def test_without_an_anchor_the_stroke_lies_in_the_middle() -> None:
     found = trace(photograph((200, 150)))
-    rows, columns = np.nonzero(found.binary)
+    rows, columns = np.nonzero(inked(found))
     assert (columns.mean(), rows.mean()) == pytest.approx((63.5, 63.5), abs=1.0)
-    assert found.anchor_px is None
+    assert "crop.anchor_x_px" not in found.log
 
 
 def test_an_anchor_far_from_the_stroke_is_refused() -> None:
@@ -62,22 +67,27 @@ def test_an_anchor_far_from_the_stroke_is_refused() -> None:
         trace(photograph((200, 150)), (700.0, 500.0))
 
 
-def test_eight_strokes_in_one_crop_are_flagged() -> None:
-    places = [(150 + 165 * (k % 4), 150 + 250 * (k // 4)) for k in range(8)]
-    assert any(flag.startswith("others: 7 more strokes") for flag in trace(photograph(*places)).flags)
+EIGHT = [(150 + 165 * (k % 4), 150 + 250 * (k // 4)) for k in range(8)]
 
 
-def test_a_saturated_frame_is_flagged_and_a_blank_one_refused() -> None:
-    assert any(flag.startswith("saturated") for flag in trace(photograph((400, 300), paper=300)).flags)
+@pytest.mark.parametrize(
+    ("image", "flag"),
+    [
+        (photograph(*EIGHT), "others: 7 more strokes"),
+        (photograph((400, 300), paper=300), "saturated"),
+        (photograph((400, 300), glare=(400, 318), paper=170), "glare"),
+        (photograph((790, 300)), "cut"),
+    ],
+    ids=["neighbours", "too bright", "glare", "at the edge"],
+)
+def test_a_defect_is_flagged(image: np.ndarray, flag: str) -> None:
+    assert any(one.startswith(flag) for one in trace(image).flags)
+
+
+@pytest.mark.parametrize("paper", [225, 300], ids=["blank", "blank and too bright"])
+def test_a_blank_page_is_refused(paper: int) -> None:
     with pytest.raises(CaptureRefused, match="is blank"):
-        trace(photograph())
-    with pytest.raises(CaptureRefused, match="is blank"):
-        trace(photograph(paper=300))
-
-
-def test_glare_and_cut_strokes_are_flagged() -> None:
-    assert any(flag.startswith("glare") for flag in trace(photograph((400, 300), glare=(400, 318), paper=170)).flags)
-    assert any(flag.startswith("cut") for flag in trace(photograph((790, 300))).flags)
+        trace(photograph(paper=paper))
 
 
 def test_a_stroke_longer_than_the_field_is_flagged() -> None:
@@ -90,7 +100,8 @@ def test_holes_of_glare_are_filled_where_that_is_asked_for() -> None:
     image = photograph((400, 300))
     cv2.circle(image, (400, 300), 5, 225, -1)
     kept, filled = trace(image), trace(image, params=Params(hole_mm2=1.0))
-    assert filled.binary.sum() - kept.binary.sum() == pytest.approx(np.pi * 0.25 / MM_PER_PX**2, abs=4)
+    area = [found.log["resize.area_mm2"] for found in (kept, filled)]
+    assert area[1] - area[0] == pytest.approx(np.pi * 0.25, abs=4 * MM_PER_PX**2)
 
 
 def test_the_command_shows_every_stage_and_writes_the_numbers(tmp_path: Path) -> None:
