@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import pytest
 
 from brushloop.calibrate import presses, store
 from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
 from brushloop.calibrate.session import open_session
-from brushloop.sessions.recording import mark_bad_or_good
+from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.photographed import imported_presses
 
 CELLS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
@@ -105,3 +107,25 @@ def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(sessi
     mark_bad_or_good(session, 0, name, 2)
     assert len(read(session)) == 3
     assert len(prepared) == 3
+
+
+def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Path, tmp_path: Path) -> None:
+    (tmp_path / "pages").mkdir()
+    page = imported_presses(tmp_path / "pages", tmp_path / "page", CELLS[:1], (1500, 2000), (1380, 700))
+    [whole], [near, *_] = read(page), read(session)
+    assert whole.measured.area_mm2 == pytest.approx(near.measured.area_mm2, rel=0.01)
+    assert np.abs(whole.coverage - near.coverage).mean() < 0.001
+    [capture] = Recording(page).captures()
+    raster, _, prepared = presses.crop(capture, None)
+    side = round(20.0 * (Field().side_mm + 32.0))
+    assert raster.shape == pytest.approx((side, side), abs=40), "its field, and what its light is estimated from"
+    assert prepared.anchor_px == pytest.approx([20.0 * (at + 16.0) for at in Field().anchor_mm], abs=20.0)
+
+
+def test_a_start_outside_its_page_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "pages").mkdir()
+    page = imported_presses(tmp_path / "pages", tmp_path / "page", CELLS[:1], (300, 480), (380, 150))
+    [capture] = Recording(page).captures()
+    stroke = capture.stroke.model_copy(update={"anchor_px": (9000.0, 150.0)})
+    with pytest.raises(CaptureRefused, match="none of it is in the field"):
+        presses.crop(replace(capture, stroke=stroke), None)

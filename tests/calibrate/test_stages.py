@@ -84,12 +84,6 @@ def test_a_defect_is_flagged(image: np.ndarray, flag: str) -> None:
     assert any(one.startswith(flag) for one in trace(image).flags)
 
 
-@pytest.mark.parametrize("paper", [225, 300], ids=["blank", "blank and too bright"])
-def test_a_blank_page_is_refused(paper: int) -> None:
-    with pytest.raises(CaptureRefused, match="is blank"):
-        trace(photograph(paper=paper))
-
-
 def test_a_stroke_longer_than_the_field_is_flagged() -> None:
     image = photograph()
     cv2.line(image, (100, 300), (700, 300), 25, 30)

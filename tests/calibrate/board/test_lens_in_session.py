@@ -222,7 +222,7 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     prepared = prepare_press(shown_first, made, Field())
     numbers = json.loads(out.with_suffix(".json").read_text())["fitted"]
     assert numbers["threshold.reflectance"] == prepared.threshold
-    assert numbers["binarise.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2
+    assert numbers["components.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2
     assert numbers["resize.mm_per_px"] == Field().mm_per_px
     compared = captured_mm(prepared, Tone.BINARY)
     assert numbers["resize.area_mm2"] == pytest.approx(compared.sum() * Field().mm_per_px ** 2)
