@@ -81,7 +81,7 @@ def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> str:
 
 def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[str]:
     yield f"# Made by `brushloop twin` (brushloop {version('brushloop')}); press with it: brushloop sim --brush FILE."
-    yield "# Everything that it presses is simulated. Intervals hold about 95 %: docs/twin.md."
+    yield "# Everything that it presses is simulated. Intervals hold about 95 %: docs/loopback-brush.md."
     yield f'name = "{twin_name(session_id)}"'
     if noise_gray is not None:
         yield ""

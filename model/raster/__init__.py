@@ -1,6 +1,6 @@
 """The definition of position, heading and pixel that all code uses, and outlines to exact coverage in bulk.
 
-Illustrated in `docs/raster.md`. Stroke frame: x along the stroke axis, positive toward the belly, heel and ferrule; y
+Illustrated in `docs/models.md`. Stroke frame: x along the stroke axis, positive toward the belly, heel and ferrule; y
 to the left of +x; the origin is O3, where the brush axis meets the paper. Lengths are mm.
 Image: square; the column grows to the right, the row downwards. Pixel (i, j) is the square between row edges i and
 i + 1 and column edges j and j + 1, so its centre is (i + 1/2, j + 1/2) pixels from the top left corner.
