@@ -37,11 +37,12 @@ from bench.prior import BRISTLE
 from brushloop.calibrate.compare.paper import TABLE_2
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
-from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Scores, fit_held_out, image_of, leave_cell_out
+from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, Scores, image_of, leave_cell_out, refit
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.scores import HEADLINE, REFERENCE, SIMULATED, read_written
 from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.model.fitted import FittedPress
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.twin.run import TWIN, fit_twin, workers
 
@@ -86,7 +87,8 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
             for draw in range(draws):
                 rng = np.random.default_rng([seed, draw, size])
                 chosen = [cells[cell][rng.integers(len(cells[cell]))] for cell in DESIGN[:size]]
-                press = fit_held_out(chosen, captures.grid, captures.radius_mm, captures.length_mm, prior)
+                job = Refit.of(chosen, captures.grid, captures.radius_mm, captures.length_mm, prior)
+                press = FittedPress(job.radius_mm, job.length_mm, **refit(job))
                 scores = Scores()
                 for cell in DESIGN[size:]:
                     scores.add(cells[cell], {FITTED: image_of(press.outline(*cell), captures.grid)})

@@ -35,9 +35,9 @@ from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.fit.command import FitRequest, FitResult, fit_presses
 from brushloop.calibrate.presses import crop
 from brushloop.calibrate.session import calibration_of
-from brushloop.calibrate.validate.main import Request, ValidationOutput, check
-from brushloop.calibrate.validate.main import validate as run_validation
-from brushloop.calibrate.validate.sources import local_path
+from brushloop.calibrate.validate.command import Request, ValidationOutput, check
+from brushloop.calibrate.validate.command import validate as run_validation
+from brushloop.calibrate.validate.inputs import local_path
 from brushloop.model.ccdbsm import Brush
 from brushloop.sessions.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.sessions.recording import Capture, Recording

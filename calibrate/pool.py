@@ -7,7 +7,7 @@ while a process first spends seconds on imports.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from importlib.metadata import version
 from typing import Any, ClassVar, TypeVar
 
 from brushloop.calibrate.errors import one_line
-from brushloop.calibrate.store import VERSION
+from brushloop.calibrate.store import VERSION, Arrays, Store
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -122,3 +122,25 @@ def software() -> str:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def finished(
+    scheduler: Scheduler, store: Store | None, function: Callable[[J], Arrays], jobs: Iterable[tuple[str, J]]
+) -> Iterator[tuple[str, Arrays]]:
+    """Yield (key, result) of every job, in no fixed order: what the store lacks is computed and kept there."""
+    ready: list[tuple[str, Arrays]] = []
+
+    def missing() -> Iterator[tuple[str, J]]:
+        for key, job in jobs:
+            if store is None or (arrays := store.get(key)) is None:
+                yield key, job
+            else:
+                ready.append((key, arrays))
+
+    for key, arrays in scheduler.run(function, missing()):
+        if store is not None:
+            store.put(key, arrays)
+        yield from ready
+        ready.clear()
+        yield key, arrays
+    yield from ready

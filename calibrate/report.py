@@ -178,6 +178,16 @@ def plot(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
     return figure, figure.subplots(rows, columns)
 
 
+def dress(axis: Any, title: str, x: str, y: str = "", *, grid: str = "both", legend: bool = False) -> None:
+    """Give a plot its title, the names of its axes, and a grid."""
+    axis.set_title(title, fontsize=10, parse_math=False)
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.grid(axis=grid, alpha=0.3)
+    if legend:
+        axis.legend()
+
+
 def printable(text: str) -> str:
     """A name or label for the text of a plot, with `?` for every character that no font draws."""
     return "".join(c if c.isprintable() else "?" for c in text)

@@ -15,6 +15,7 @@ from brushloop.calibrate.compare.place import SIZE_PX, Field, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import Refused, cut, uncommanded
 from brushloop.calibrate.session import open_session
+from brushloop.calibrate.store import Store
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
@@ -73,6 +74,8 @@ class Captures:
     stroke_ids: list[str]
     refused: list[tuple[str, str]]
     """(stroke, reason) of captures that cannot be used or are cut by the edge of their photograph."""
+    store: Store
+    """Finished work of the session."""
 
 
 def grid_of(view: Field) -> Grid:
@@ -101,9 +104,8 @@ def read_presses(
     grid, rows = grid_of(view), inked_rows([one.ink for one in pressed], view.mm_per_px)
     grid = Grid(grid.x_mm, grid.y_mm[rows])
     pressed = [Pressed(one.depth_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
-    return Captures(
-        opened.header, opened.sha256, opened.calibration, radius, length, rows, grid, pressed, names, refused
-    )
+    about = opened.header, opened.sha256, opened.calibration, radius, length
+    return Captures(*about, rows, grid, pressed, names, refused, opened.store)
 
 
 def inked_rows(images: Sequence[NDArray[np.floating]], px_mm: float) -> slice:

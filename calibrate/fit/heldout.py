@@ -15,7 +15,9 @@ from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Floats, Grid, Pressed, by_cell, inked_rows
 from brushloop.calibrate.fit.fit import fit_presses, zero_touches
 from brushloop.calibrate.fit.prior import Prior
+from brushloop.calibrate.pool import Scheduler, finished, threads
 from brushloop.calibrate.stats import CEILING, Average, average, ceiling_values, pair_means
+from brushloop.calibrate.store import Arrays, Store, key_of
 from brushloop.model.arrays import as_batch
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
@@ -68,13 +70,49 @@ def without(cells: Mapping[C, Sequence[One]], fold: Sequence[C]) -> list[One]:
     return others[:: max(1, -(-len(others) // MAX_STROKES))]
 
 
-def fit_held_out(
-    strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, prior: Prior | None = None
-) -> FittedPress:
-    """Fit these strokes, cut to the inked rows, from the prior: it knows no other stroke of their session."""
-    rows = inked_rows([one.ink for one in strokes], grid.px_mm)
-    cut = [replace(one, ink=one.ink[rows]) for one in strokes]
-    return fit_presses(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior=prior)
+@dataclass(frozen=True, slots=True)
+class Refit:
+    """A fit of the brush to some presses of a session, from the prior: it knows no other press of theirs."""
+
+    strokes: tuple[Pressed, ...]
+    """In 256 levels, cut to the rows with ink, so that equal presses are equal work for every command."""
+    grid: Grid
+    radius_mm: float
+    length_mm: float
+    prior: Prior | None = None
+
+    @classmethod
+    def of(
+        cls, strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, prior: Prior | None = None
+    ) -> Refit:
+        """The fit to these presses, whose ink is on the grid."""
+        rows = inked_rows([one.ink for one in strokes], grid.px_mm)
+        inks = (to_pixels(np.asarray(one.ink[rows], np.float32)) / 255.0 for one in strokes)
+        cut = tuple(replace(one, ink=ink) for one, ink in zip(strokes, inks, strict=True))
+        return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior)
+
+    @property
+    def key(self) -> str:
+        """Key in the store of finished work."""
+        prior = () if self.prior is None else (self.prior.mean, self.prior.precision)
+        presses = (part for one in self.strokes for part in (one.depth_mm, one.tilt_deg, one.ink))
+        return key_of("refit", self.radius_mm, self.length_mm, self.grid.x_mm, self.grid.y_mm, *prior, *presses)
+
+
+def refit(job: Refit) -> Arrays:
+    """The numbers of the fitted brush."""
+    press = fit_presses(job.strokes, job.grid, job.radius_mm, job.length_mm, prior=job.prior)
+    return {"values": press.values, "edges": press.edges, "ends": press.ends}
+
+
+def refits(
+    jobs: Sequence[Refit], store: Store | None, scheduler: Scheduler, what: str = "", progress: Progress = unseen
+) -> list[FittedPress]:
+    """The fitted brush of each job; jobs that are not finished in the store run side by side."""
+    keys = [job.key for job in jobs]
+    unique = dict(zip(keys, jobs, strict=True))
+    results = dict(counted(finished(scheduler, store, refit, unique.items()), what, len(unique), progress))
+    return [FittedPress(job.radius_mm, job.length_mm, **results[key]) for key, job in zip(keys, jobs, strict=True)]
 
 
 def leave_cell_out(
@@ -84,23 +122,25 @@ def leave_cell_out(
     length_mm: float,
     prior: Prior | None = None,
     progress: Progress = unseen,
+    store: Store | None = None,
 ) -> tuple[list[HeldOut], Floats]:
     """Score each cell as predicted by fits to other cells, and find its `zero_touches` for them, (cells, 2) mm.
 
-    `brushloop validate` uses the same fits. Both are empty for a single cell. Models without enough data are left out:
-    the ceiling needs two strokes of a cell, a regressed Bezier two depths and two tilts among the others. Nothing moved
-    between these presses, so every difference of a zero touch is an error of the model or of a press.
+    `brushloop validate` uses the same fits, which the store keeps. Both are empty for a single cell. Models without
+    enough data are left out: the ceiling needs two strokes of a cell, a regressed Bezier two depths and two tilts among
+    the others. Nothing moved between these presses, so every difference of a zero touch is an error of the model or of
+    a press.
     """
     cells = by_cell(strokes)
     published = FittedPress(radius_mm, length_mm)
     scores, errors, left = Scores(), [np.empty((0, 2))], folds(list(cells))
-    for fold in counted(left, "cells left out in turn", len(left), progress):
-        # In 256 levels, as validation stores them: the numbers of both are equal.
-        others = [replace(one, ink=to_pixels(np.asarray(one.ink, np.float32)) / 255.0) for one in without(cells, fold)]
-        press = fit_held_out(others, grid, radius_mm, length_mm, prior)
+    jobs = [Refit.of(without(cells, fold), grid, radius_mm, length_mm, prior) for fold in left]
+    with threads() as scheduler:
+        presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
+    for fold, job, press in zip(left, jobs, presses, strict=True):
         models: dict[str, Callable[[float, float], Outline]] = {FITTED: press.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-            models[BEZIER] = refit_bezier(others, grid).outline
+            models[BEZIER] = refit_bezier(job.strokes, job.grid).outline
         for cell in fold:
             scores.add(cells[cell], dict(_images(models, cell, grid)))
             errors.append(zero_touches(press, cells[cell], grid))

@@ -50,7 +50,9 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
     """Fit, leave each cell out in turn, and make the artefact."""
     grid, strokes = captures.grid, captures.strokes
     press = fit_presses(strokes, grid, captures.radius_mm, captures.length_mm)
-    held_out, errors = leave_cell_out(strokes, grid, captures.radius_mm, captures.length_mm, progress=progress)
+    held_out, errors = leave_cell_out(
+        strokes, grid, captures.radius_mm, captures.length_mm, progress=progress, store=captures.store
+    )
     artefact = BrushFit(
         session_id=captures.header.session_id,
         source=captures.header.source,

@@ -57,9 +57,8 @@ def validate(
     import sys
 
     from brushloop.calibrate.compare.place import Field
-    from brushloop.calibrate.validate.extras import ExtrasRequest
-    from brushloop.calibrate.validate.main import Request, check
-    from brushloop.calibrate.validate.main import validate as run
+    from brushloop.calibrate.validate.command import Request, check
+    from brushloop.calibrate.validate.command import validate as run
     from brushloop.sessions.terminal import shown
 
     request = Request(
@@ -76,7 +75,9 @@ def validate(
         held_out=held_out,
         tune_steps=tune,
         parquet=parquet,
-        extras=ExtrasRequest(tuple(loop or ()), tuple(written or ()), beside),
+        loops=tuple(loop or ()),
+        written=tuple(written or ()),
+        beside=beside,
         out=out,
         scheduler=scheduler,
         workers=workers,
@@ -101,16 +102,16 @@ def diff(
     """Show what got better or worse between two reports, sessions or software versions, by a paired test."""
     from brushloop.calibrate.validate.diff import compare
 
-    found = compare(before, after)
+    difference = compare(before, after)
     if json:
         from dataclasses import asdict
         from json import dumps
 
-        changes = [asdict(change) | {"verdict": change.verdict} for change in found.changes]
-        said = {"paired_by": found.paired_by, "source": found.before.label, "changes": changes}
+        changes = [asdict(change) | {"verdict": change.verdict} for change in difference.changes]
+        said = {"paired_by": difference.paired_by, "source": difference.before.label, "changes": changes}
         say(*dumps(said, indent=1, ensure_ascii=False).split("\n"))
         return
-    _print_difference(found)
+    _print_difference(difference)
 
 
 @app.command()
@@ -126,7 +127,7 @@ def captures(
     """Write captured presses in the format that `brushloop train tune` reads."""
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target
-    from brushloop.calibrate.validate.sources import open_session
+    from brushloop.calibrate.validate.inputs import open_session
     from brushloop.calibrate.validate.tuning import align_captures, write_captures
     from brushloop.sessions.disk import number
     from brushloop.sessions.records import Condition
@@ -149,15 +150,15 @@ def captures(
     say(f"{count} presses ({aligned.source}): {out}")
 
 
-def _print_difference(found: Difference) -> None:
+def _print_difference(difference: Difference) -> None:
     from rich.table import Table
 
     from brushloop.calibrate.validate.diff import sentences
 
-    say(*sentences(found))
-    title = f"after minus before, points of percent ({found.before.label})"
+    say(*sentences(difference))
+    title = f"after minus before, points of percent ({difference.before.label})"
     out = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
-    for change in found.changes:
+    for change in difference.changes:
         name, alignment, tone, measure = change.series
         span = change.test.interval
         out.add_row(

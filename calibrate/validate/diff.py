@@ -17,7 +17,7 @@ import numpy as np
 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import Paired, holm, paired
-from brushloop.calibrate.validate.report.data import Report, load_report
+from brushloop.calibrate.validate.report import Report, load_report
 from brushloop.sessions.disk import as_text
 
 SIGNIFICANT = 0.05

@@ -7,9 +7,8 @@ cells has its own tuning, in a folder named after a hash of its inputs; a killed
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -22,14 +21,15 @@ from brushloop.calibrate.compare.place import FINE, Field, Image, brush_of, prep
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.fit.heldout import folds
 from brushloop.calibrate.report import source_label
+from brushloop.calibrate.session import OpenSession
+from brushloop.calibrate.store import key_of
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
-from brushloop.calibrate.validate.candidates import Generator
-from brushloop.calibrate.validate.heldout import Refit
-from brushloop.calibrate.validate.sources import LoadedSession, one_source
-from brushloop.calibrate.validate.store import VERSION
+from brushloop.calibrate.validate.inputs import one_source
 from brushloop.model.ccdbsm import DomainError
+from brushloop.model.fitted import FittedPress
 from brushloop.model.generator.targets import ANCHOR_SHARE, INPUTS, Placement, Target
+from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
@@ -64,7 +64,7 @@ class AlignedStrokes:
     """(stroke, why) of presses that the generator does not draw or that cannot be used."""
 
 
-def align_captures(sessions: list[LoadedSession], generator: Path) -> AlignedStrokes:
+def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedStrokes:
     """Convert the presses of sessions to the generator's image format. Raises what `load_generator` raises."""
     from brushloop.model.generator.stroke import load_generator
 
@@ -117,32 +117,32 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condi
 
 
 def tuned_by_cell(
-    session: LoadedSession,
-    fits: dict[Condition, Refit],
-    generator: Generator,
+    session: OpenSession,
+    fits: Mapping[Condition, FittedPress | None],
+    generator: Path,
     steps: int,
     work: Path,
     progress: Progress,
 ) -> dict[Condition, Path]:
     """File of the generator tuned without each cell, by cell; empty for fewer than two cells.
 
-    `fits` has for each cell the result of a `refit_job` with the same `FOLDS`. Raises what `load_generator` and
-    training raise.
+    `fits` has for each cell the brush that was fitted without its fold, with the same `FOLDS`, None for a session
+    without a fit. Raises what `load_generator` and training raise.
     """
     left_out = folds(list(fits), FOLDS)
-    calibration = session.calibration.digest if session.calibration is not None else ""
+    digest = file_sha256(generator)
     files: dict[Condition, Path] = {}
     aligned: AlignedStrokes | None = None
     for number, fold in enumerate(left_out):
         fit = fits[fold[0]]
-        inputs = f"tune {VERSION} {session.sha256} {calibration} {generator.sha256} {steps} {LEARNING_RATE} {fold} "
-        inputs += f"{IMAGES} {fit.fitted}"
-        folder = work / "tuned" / hashlib.sha256(inputs.encode()).hexdigest()[:32]
+        brush = () if fit is None else (fit.values, fit.edges, fit.ends)
+        inputs = session.sha256, session.calibration_digest, digest, steps, LEARNING_RATE, fold, IMAGES, *brush
+        folder = work / "tuned" / key_of("tune", *inputs)[:32]
         path = folder / "generator.safetensors"
         if not path.exists():
             captures = folder / "captures.safetensors"
             if not captures.exists():
-                aligned = aligned or align_captures([session], generator.path)
+                aligned = aligned or align_captures([session], generator)
                 write_captures(_with_images(aligned, session, fit, generator), captures, fold)
             what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
             steps_done = _TrainingProgress(progress, what, number * steps, len(left_out) * steps)
@@ -166,21 +166,18 @@ class _TrainingProgress:
     def validated(self, validation: Validation) -> None: ...
 
 
-def _tune(
-    folder: Path, captures: Path, generator: Generator, source: str, steps: int, progress: _TrainingProgress
-) -> None:
+def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int, progress: _TrainingProgress) -> None:
     from brushloop.model.generator.stroke import read_generator
     from brushloop.model.train.config import checked
-    from brushloop.model.train.data import sha256
     from brushloop.model.train.train import TuningFiles, run_training
 
     tuning: dict[str, Any] = {
-        "start_sha256": generator.sha256,
-        "captures_sha256": sha256(captures),
+        "start_sha256": file_sha256(generator),
+        "captures_sha256": file_sha256(captures),
         "source": source,
         "held_out": HELD_OUT,
     }
-    fields: dict[str, Any] = read_generator(generator.path).config | {
+    fields: dict[str, Any] = read_generator(generator).config | {
         "steps": steps,
         "learning_rate": LEARNING_RATE,
         "seed": 0,
@@ -189,20 +186,22 @@ def _tune(
         "checkpoint_every": max(1, steps // 4),
         "tuning": tuning,
     }
-    files = TuningFiles(generator.path, captures)
+    files = TuningFiles(generator, captures)
     run_training(checked("tune", fields), folder, progress, lambda: False, files)
 
 
-def _with_images(aligned: AlignedStrokes, session: LoadedSession, fit: Refit, generator: Generator) -> AlignedStrokes:
+def _with_images(
+    aligned: AlignedStrokes, session: OpenSession, fit: FittedPress | None, generator: Path
+) -> AlignedStrokes:
     """Add images of the fitted brush, if there is one."""
     from brushloop.model.fitted import fitted_model
     from brushloop.model.generator.stroke import load_generator
 
     brush = brush_of(session.header)
-    target = load_generator(generator.path, brush).target
-    if fit.fitted is None:
+    target = load_generator(generator, brush).target
+    if fit is None:
         return aligned
-    fitted = fitted_model(fit.press(float(brush.radius_mm), float(brush.length_mm)))
+    fitted = fitted_model(fit)
     inputs = target.draw(IMAGES, (0,))
     return replace(
         aligned,

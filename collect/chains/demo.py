@@ -185,12 +185,12 @@ class Demo:
         Writing(request, say).run()
 
     def _validate(self) -> None:
-        from brushloop.calibrate.validate.main import Request, validate  # slow to import
+        from brushloop.calibrate.validate.command import Request, validate  # slow to import
 
         session = self._finished()
         command = f"brushloop validate {session} --generator {SHIPPED_GENERATOR}"
         say(f"$ {command}")
-        show_work(validate, Request((str(session),), command, generators=(SHIPPED_GENERATOR,)))
+        show_work(validate, Request(places=(str(session),), command=command, generators=(SHIPPED_GENERATOR,)))
 
     def _blank_sheet(self, protocol: Path) -> None:
         """Make the rig ready for the session of this protocol, with a blank sheet unless the session has begun."""

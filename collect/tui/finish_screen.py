@@ -145,9 +145,9 @@ def _result(name: str, folder: Path, progress: Progress) -> Printable:
         from brushloop.calibrate.fit.command import FitRequest, fit_presses
 
         return fit_presses(FitRequest(folder), progress)
-    from brushloop.calibrate.validate.main import Request, validate
+    from brushloop.calibrate.validate.command import Request, validate
 
-    return validate(Request((str(folder),), f"brushloop validate {folder}"), progress)
+    return validate(Request(places=(str(folder),), command=f"brushloop validate {folder}"), progress)
 
 
 def verdict_content(verdict: Verdict) -> Content:

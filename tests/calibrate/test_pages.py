@@ -24,7 +24,7 @@ from brushloop.calibrate.loop.scores import Pair, score_pairs, verdicts
 from brushloop.calibrate.pages.lens import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stroke.measure import Measured
-from brushloop.calibrate.validate.report.page import pages_beside
+from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing.compare import WritingComparison
 from brushloop.calibrate.writing.plan_files import figure_record
 from brushloop.calibrate.writing.plan_record import PlanRecord

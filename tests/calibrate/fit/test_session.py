@@ -14,7 +14,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
 from brushloop.calibrate.fit.captures import read_presses
 from brushloop.calibrate.fit.run import correction, fit_session
-from brushloop.calibrate.validate.report.data import load_report
+from brushloop.calibrate.validate.report import load_report
 from brushloop.model.fitted import NAME, NAMES
 from tests.photographed import imported_presses
 
@@ -48,7 +48,8 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert "paper's avg" in ran.output
     assert "…" not in ran.output
     report = load_report(session / "validation" / "report.json")
-    [rival] = [one for one in report.rivals if one.name == NAME]
+    rival = report.model(NAME)
+    assert rival is not None
     assert rival.basis == "fitted, in sample"
     mean = {name: report.stat(name, Alignment.MM, Tone.BINARY, "csim") for name in ("ccd-bsm", NAME)}
     assert mean[NAME].avg > mean["ccd-bsm"].avg + 5.0

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from brushloop.calibrate.validate.report.summary import collected_in
+from brushloop.calibrate.validate.report import collected_in
 from brushloop.sessions.events import CaptureResult, Condition, DipResult, Press, ZeroTouchResult
 from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore

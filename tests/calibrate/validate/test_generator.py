@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import Alignment, Tone
-from brushloop.calibrate.validate.report.data import load_report
-from brushloop.calibrate.validate.sources import LoadedSession
+from brushloop.calibrate.validate.inputs import FittedSession
+from brushloop.calibrate.validate.report import load_report
 from brushloop.calibrate.validate.tuning import align_captures
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
@@ -78,7 +78,8 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
     assert exact is not None
     assert mine.n == exact.n == 10
     assert mine.avg == pytest.approx(exact.avg, abs=6.0)
-    [rival] = [one for one in report.rivals if one.name == "ccd-bsmg"]
+    rival = report.model("ccd-bsmg")
+    assert rival is not None
     assert rival.basis == "trained on exact images of CCD-BSM"
     assert len(rival.sha256) == 64
 
@@ -89,7 +90,8 @@ def test_a_tuned_generator_is_judged_on_cells_that_it_has_not_seen(
     given = ("--generator", generator, "--tune", "80", "--model", "ccd-bsmg", "--model", "ccd-bsmg-heldout")
     assert "Tuned to this brush, CCD-BSMG reaches" in invoke("validate", session, "--out", tmp_path, *given)
     report = load_report(tmp_path / "report.json")
-    [rival] = [one for one in report.rivals if one.name == "ccd-bsmg-heldout"]
+    rival = report.model("ccd-bsmg-heldout")
+    assert rival is not None
     assert rival.basis == "fitted, held-out cells"
     plain, tuned = (
         report.stat(name, Alignment.SIZE_NORMALISED, Tone.GRAY, "csim") for name in ("ccd-bsmg", "ccd-bsmg-heldout")
@@ -151,9 +153,8 @@ def test_a_generator_for_another_brush_is_refused(generator: Path) -> None:
 
 
 def test_captures_of_a_described_brush_keep_its_remark() -> None:
-    header = SimpleNamespace(
-        source=Source.LOOPBACK, brush="soft (twin of monday, simulated)", brush_radius_mm=None, brush_length_mm=None
-    )
+    brush = "soft (twin of monday, simulated)"
+    header = SimpleNamespace(source=Source.LOOPBACK, brush=brush, brush_radius_mm=None, brush_length_mm=None)
     empty = SimpleNamespace(header=header, recording=SimpleNamespace(captures=lambda: iter(())))
-    found = align_captures([cast(LoadedSession, empty)], SHIPPED_GENERATOR)
+    found = align_captures([cast(FittedSession, empty)], SHIPPED_GENERATOR)
     assert found.source == "loopback rig, brush twin of monday, simulated"

@@ -11,9 +11,8 @@ from brushloop.calibrate.fit.captures import read_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.fit.run import fit_session
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.validate.candidates import BEZIER_REFITTED, FITTED_HELD_OUT
-from brushloop.calibrate.validate.main import Request, validate
-from brushloop.sessions.terminal import unseen
+from brushloop.calibrate.validate.command import Request, validate
+from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT
 
 NAMES = {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}
 
@@ -22,7 +21,7 @@ def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path
     captures = read_presses(session, Field())
     fitted = fit_session(captures, Field())
     fit = fitted.artefact.save(tmp_path)
-    report = validate(Request((str(session),), "test", fit=fit, out=tmp_path / "report", parquet=False), unseen).report
+    report = validate(Request(places=(str(session),), fit=fit, out=tmp_path / "report", parquet=False)).report
     assert report is not None
     rows = {NAMES[row.model]: row for row in fitted.held_out if row.model in NAMES}
     assert set(rows) == set(NAMES.values())
@@ -33,4 +32,4 @@ def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path
             assert (stat.avg, stat.n) == (pytest.approx(getattr(row, measure), abs=0.005), row.n)
         below = report.stat(name, Alignment.MM, Tone.BINARY, "csim")
         assert below is not None
-        assert below.below == (None if row.below is None else pytest.approx(row.below.mean, abs=0.005))
+        assert below.below_ceiling == (None if row.below is None else pytest.approx(row.below.mean, abs=0.005))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import brushloop
-from brushloop.calibrate.validate.report.findings import trust
+from brushloop.calibrate.validate.findings import trust
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke
 

@@ -18,12 +18,11 @@ from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.scores import Score
-from brushloop.calibrate.validate.gates import GateMissed, parse_gate
-from brushloop.calibrate.validate.report.data import Collected, Report, load_report
-from brushloop.calibrate.validate.report.findings import trust
-from brushloop.calibrate.validate.report.outputs import COLUMNS, score_rows
-from brushloop.calibrate.validate.report.page import _of_session
+from brushloop.calibrate.validate.findings import trust
+from brushloop.calibrate.validate.page import provenance
+from brushloop.calibrate.validate.report import Collected, Report, load_report
 from brushloop.calibrate.validate.run import Outcome
+from brushloop.calibrate.validate.tables import SCORE_COLUMNS, GateMissed, parse_gate, score_rows
 from brushloop.sessions.events import Remark
 from brushloop.sessions.recording import Recording, add_remark
 from brushloop.sessions.records import Condition, Source
@@ -62,8 +61,7 @@ def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> N
                     assert stat is not None
                     assert stat.n == 10
                     assert 0.0 < stat.min <= stat.median <= stat.max <= 100.0
-                    assert stat.avg_interval is not None
-                    assert stat.avg_interval.low <= stat.avg <= stat.avg_interval.high
+                    assert stat.avg_low <= stat.avg <= stat.avg_high
     cell = report.stat("ccd-bsm", Alignment.MM, Tone.BINARY, "csim", (15.0, 5.0))
     assert cell is not None
     assert cell.n == 2
@@ -76,7 +74,8 @@ def test_a_refitted_bezier_has_not_seen_what_it_predicts_and_beats_the_published
     assert refitted is not None
     assert published is not None
     assert refitted.avg > published.avg + 5.0
-    [rival] = [one for one in report.rivals if one.name == "bezier-refitted"]
+    rival = report.model("bezier-refitted")
+    assert rival is not None
     assert rival.basis == "fitted, held-out cells"
 
 
@@ -131,8 +130,8 @@ def test_every_score_of_a_twin_is_labelled_as_one() -> None:
         session_id="s", source=Source.LOOPBACK, brush="simulated bristle bundle (twin of monday, simulated), R = 5 mm"
     )
     score = Score("s", "a", Condition(11.0, 0.0), None, "ccd-bsm", Alignment.MM, Tone.BINARY, 0.9, 0.9)
-    outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], every_score=lambda: iter([score]))
-    labels = {one[COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
+    outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], scores=[score])
+    labels = {one[SCORE_COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
     assert labels == {"loopback rig, brush twin of monday, simulated"}
 
 
@@ -238,7 +237,7 @@ def test_what_was_left_out_selected_or_pressed_on_other_paper_stands_above_the_r
         )
         session = report.sessions[0].model_copy(update={"collected": collected.model_copy(update=changes)})
         one = report.model_copy(update={"sessions": (session,)})
-        return " ".join([*(point.text for point in trust(one)), *dict(_of_session(session)).values()])
+        return " ".join([*(point.text for point in trust(one)), *dict(provenance(session)).values()])
 
     assert "left out during" not in said()
     assert "8 planned, 8 photographed" in said()

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app, main
 from brushloop.calibrate.session import calibrate_session
-from brushloop.calibrate.validate.report.data import load_report
-from brushloop.calibrate.validate.sources import open_session
+from brushloop.calibrate.validate.inputs import open_session
+from brushloop.calibrate.validate.report import load_report
 from brushloop.sessions.records import Stroke
 from tests.calibrate.simulated_rigs import sheet
 

@@ -22,8 +22,8 @@ import pytest
 from brushloop.calibrate.artefact import current, put_to_use
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.validate import sources
-from brushloop.calibrate.validate.sources import fetched, open_session
+from brushloop.calibrate.validate import inputs
+from brushloop.calibrate.validate.inputs import fetched, open_session
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.events import Closed, Open
 from brushloop.sessions.journal import Journal
@@ -52,7 +52,7 @@ def test_a_url_with_its_checksum_opens_like_a_folder(session: Path, remote: str,
     for url in (f"{remote}#sha256={digest(session)}", f"{remote}/presses.mcap#sha256={digest(session)}"):
         opened = open_session(url, tmp_path, None, None)
         assert opened.sha256 == digest(session)
-        assert opened.count == 11
+        assert len(opened.strokes) == 11
         assert opened.kinds == {"press"}
 
 
@@ -67,7 +67,7 @@ def test_it_is_fetched_once(session: Path, remote: str, tmp_path: Path) -> None:
     open_session(url, tmp_path, None, None)
     fsspec.filesystem("memory").store["/lab/presses/presses.mcap"].seek(0)
     fsspec.filesystem("memory").pipe("/lab/presses/presses.mcap", b"changed since")
-    assert open_session(url, tmp_path, None, None).count == 11
+    assert len(open_session(url, tmp_path, None, None).strokes) == 11
 
 
 def test_of_several_calibrations_beside_the_pointed_one_is_used(session: Path, remote: str, tmp_path: Path) -> None:
@@ -120,14 +120,14 @@ def test_a_url_whose_package_is_not_there_names_the_extra(
 def test_a_recording_larger_than_allowed_is_refused(
     session: Path, remote: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sources, "MAX_DOWNLOAD_BYTES", 1000)
+    monkeypatch.setattr(inputs, "MAX_DOWNLOAD_BYTES", 1000)
     with pytest.raises(CalibrationError, match="larger than 1000 bytes"):
         open_session(f"{remote}#sha256={digest(session)}", tmp_path, None, None)
 
 
 def test_a_file_url_is_a_url_too(session: Path, tmp_path: Path) -> None:
     url = f"file://{session / 'presses.mcap'}#sha256={digest(session)}"
-    assert open_session(url, tmp_path, None, None).count == 11
+    assert len(open_session(url, tmp_path, None, None).strokes) == 11
 
 
 @contextmanager
@@ -168,7 +168,7 @@ def test_a_web_server_that_lists_nothing_gives_the_calibration_in_use(session: P
 
 
 def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_path: Path) -> None:
-    assert open_session(f"{web}/presses.mcap#sha256={digest(session)}", tmp_path, None, None).count == 11
+    assert len(open_session(f"{web}/presses.mcap#sha256={digest(session)}", tmp_path, None, None).strokes) == 11
     with pytest.raises(CalibrationError, match="has no checksum"):
         open_session(f"{web}/presses.mcap", tmp_path, None, None)
     with pytest.raises(CalibrationError, match="cannot be read"):
@@ -178,7 +178,7 @@ def test_a_web_server_is_a_place_like_any_other(web: str, session: Path, tmp_pat
 def test_a_web_server_that_stalls_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It accepts the connection and never answers."""
     pytest.importorskip("aiohttp", reason="needs the extra [remote]")
-    monkeypatch.setattr(sources, "STALL_S", 0.05)
+    monkeypatch.setattr(inputs, "STALL_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/x.mcap#sha256={'0' * 64}"
         with pytest.raises(CalibrationError, match="cannot be read"):
@@ -193,7 +193,7 @@ def test_a_recording_longer_than_a_block_comes_from_a_server_that_serves_no_rang
     (session.parent / "long.mcap.sha256").write_text(" " * 3000 + hashlib.sha256(data).hexdigest())
     url = f"{web.rpartition('/')[0]}/long.mcap"
     assert fetched(url, tmp_path).read_bytes() == data
-    monkeypatch.setattr(sources, "MAX_DOWNLOAD_BYTES", 10**6)
+    monkeypatch.setattr(inputs, "MAX_DOWNLOAD_BYTES", 10**6)
     with pytest.raises(CalibrationError, match=r"long.mcap: is larger than 1000000 bytes"):
         fetched(url, tmp_path / "again")
     assert not [path for path in (tmp_path / "again").rglob("*") if path.is_file()]

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 import brushloop.__main__
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.validate import main
-from brushloop.calibrate.validate.main import Request, ValidationOutput
+from brushloop.calibrate.validate import command
+from brushloop.calibrate.validate.command import Request, ValidationOutput
 from brushloop.collect.chains import demo
 from brushloop.collect.chains.commands import GIVEN_UP
 from brushloop.collect.chains.demo import FULL, QUICK, Demo, Size
@@ -93,7 +93,7 @@ class FakeWriting:
 def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     made = Chain()
     monkeypatch.setattr(demo, "collected", made.collected)
-    monkeypatch.setattr(main, "validate", made.validated)
+    monkeypatch.setattr(command, "validate", made.validated)
     monkeypatch.setattr(demo, "calibrated", lambda _say, _session: made.ran.append("calibrate"))
     monkeypatch.setattr(demo, "fitted", lambda _say, _session: made.ran.append("fit"))
     monkeypatch.setattr(demo, "run_loop", made.loop)

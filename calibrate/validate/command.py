@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
 
-from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.drags.measure import validate_drags
 from brushloop.calibrate.drags.predicted import predict_session
 from brushloop.calibrate.drags.report import DragValidation, write_drags
@@ -18,47 +16,40 @@ from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.pool import cluster, threads
-from brushloop.calibrate.report import framed, write_files
+from brushloop.calibrate.report import framed, source_note, write_files
 from brushloop.calibrate.stroke.params import Params
-from brushloop.calibrate.validate.ablation import similarity_by_strokes
-from brushloop.calibrate.validate.candidates import generator_file
-from brushloop.calibrate.validate.extras import Extras, ExtrasRequest, find_extras
-from brushloop.calibrate.validate.gates import check_gates, parse_gate
-from brushloop.calibrate.validate.report.data import Report
-from brushloop.calibrate.validate.report.figures import read_curve
-from brushloop.calibrate.validate.report.outputs import summary, summary_csv, table_3_csv, write_csv, write_parquet
-from brushloop.calibrate.validate.report.page import page_of, pages_beside
-from brushloop.calibrate.validate.report.summary import report_of
-from brushloop.calibrate.validate.run import Options, Outcome, validate_presses
-from brushloop.calibrate.validate.sources import URL, LoadedSession, one_source, open_session
+from brushloop.calibrate.validate import findings, tables
+from brushloop.calibrate.validate.inputs import URL, Extras, FittedSession, find_extras, one_source, open_session
+from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
+from brushloop.calibrate.validate.report import Report, report_of
+from brushloop.calibrate.validate.run import Options, Outcome, Refused, validate_presses
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FOLDER = "validation"
 WORK = "work"
 SCORES, PARQUET, TABLE_3 = "scores.csv", "scores.parquet", "table3.csv"
+MAX_REFUSED = 20
+"""Refused strokes listed on the terminal."""
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class Request(Options):
     """What the command line asked for."""
 
-    places: tuple[str, ...]
-    command: str
+    places: tuple[str, ...] = ()
+    command: str = ""
     """Named by the report as what made it."""
-    models: tuple[str, ...] = ()
-    view: Field = field(default_factory=Field)
     calibration: Path | None = None
     fit: Path | None = None
-    generators: tuple[Path, ...] = ()
     curves: tuple[str, ...] = ()
     gates: tuple[str, ...] = ()
-    ablations: bool = False
-    held_out: bool = True
-    tune_steps: int = 0
     parquet: bool | None = None
     """None writes it if pyarrow is installed."""
-    extras: ExtrasRequest = field(default_factory=ExtrasRequest)
+    loops: tuple[Path, ...] = ()
+    written: tuple[Path, ...] = ()
+    beside: bool = True
+    """Whether loops and characters found with the sessions are used where none are named."""
     out: Path | None = None
     scheduler: str = ""
     workers: int | None = None
@@ -84,7 +75,7 @@ class ValidationOutput:
         for drags in self.drags:
             yield from drag_summary(drags)
         if self.report is not None:
-            yield from summary(self.report)
+            yield from _summary(self.report)
         yield from self.notes
         yield f"Report: {self.folder / 'report.html'}"
 
@@ -95,11 +86,11 @@ class ValidationOutput:
 def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     """Validate and write every file of the report; gates are checked by `check`.
 
-    Raises `CalibrationError`, `ClusterError`, and what reading a recording raises. Finished work is kept in the
-    folder's `work`, so that the same command resumes.
+    Raises `CalibrationError`, `ClusterError`, and what reading a recording raises. Finished work is kept in the folders
+    of the sessions, so that the same command resumes.
     """
     for text in request.gates:
-        parse_gate(text)
+        tables.parse_gate(text)
     if request.tune_steps and not request.generators:
         raise CalibrationError("--tune", "needs a --generator to tune")
     curves = [read_curve(text) for text in request.curves]
@@ -110,28 +101,20 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
         sessions = [open_session(p, folder / WORK, request.calibration, request.fit) for p in request.places]
         one_source(sessions)
         kind = _kind(sessions, request)
-        extras = find_extras(sessions, request.extras) if kind == "press" else Extras()
+        extras = Extras()
+        if kind == "press":
+            extras = find_extras(sessions, request.loops, request.written, beside=request.beside)
     except BaseException:
         if not existed:
             _drop_empty(folder)
         raise
     if kind == "drag":
         return _drags(request, sessions, folder, progress)
-    options = Options(
-        request.models,
-        request.view,
-        tuple(generator_file(path) for path in request.generators),
-        request.ablations,
-        request.held_out,
-        request.tune_steps,
-    )
     (folder / WORK).mkdir(parents=True, exist_ok=True)
     with _locked(folder), cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler:
-        outcome = validate_presses(sessions, options, scheduler, folder / WORK, progress)
-        with outcome.store:
-            steps = similarity_by_strokes(outcome, scheduler, progress) if request.ablations else ()
-            report, notes = _write(outcome, folder, request, steps, curves, extras, progress)
-            return ValidationOutput(folder, report, notes=(*extras.notes, *notes))
+        outcome = validate_presses(sessions, request, scheduler, folder / WORK, progress)
+        report, notes = _write(outcome, folder, request, curves, extras, progress)
+        return ValidationOutput(folder, report, notes=(*extras.notes, *notes))
 
 
 def check(output: ValidationOutput, request: Request) -> None:
@@ -139,7 +122,22 @@ def check(output: ValidationOutput, request: Request) -> None:
     if request.gates and output.report is None:
         raise CalibrationError("--gate", "applies to presses; these are drags")
     if output.report is not None:
-        check_gates(output.report, [parse_gate(text) for text in request.gates])
+        tables.check_gates(output.report, [tables.parse_gate(text) for text in request.gates])
+
+
+def _summary(report: Report) -> Iterator[object]:
+    """Yield tables and lines for the terminal."""
+    names = ", ".join(session.session_id for session in report.sessions[:4])
+    yield f"{names}: {source_note(report.source)}"
+    yield findings.measured(report)
+    yield from tables.terminal_tables(report)
+    yield from findings.findings(report)
+    for point in findings.trust(report):
+        yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
+    for one in report.refused[:MAX_REFUSED]:
+        yield f"not used: {one.session_id} {one.stroke_id}: {one.why}"
+    if len(report.refused) > MAX_REFUSED:
+        yield f"and {len(report.refused) - MAX_REFUSED} more, in the report"
 
 
 def _drop_empty(folder: Path) -> None:
@@ -149,70 +147,64 @@ def _drop_empty(folder: Path) -> None:
             path.rmdir()
 
 
-def _kind(sessions: list[LoadedSession], request: Request) -> str:
+def _kind(sessions: Sequence[FittedSession], request: Request) -> str:
     """Kind of the strokes, `press` or `drag`."""
-    kinds = {kind for session in sessions for kind in session.kinds}
+    kinds = {session.kind for session in sessions}
     if len(kinds) > 1:
         raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
     [kind] = kinds
-    for option, paths in (("--loop", request.extras.loops), ("--written", request.extras.written)):
+    for option, paths in (("--loop", request.loops), ("--written", request.written)):
         if paths and kind == "drag":
             raise CalibrationError(option, "is for a report of presses; these are drags")
     return kind
 
 
 def _write(
-    outcome: Outcome,
-    folder: Path,
-    request: Request,
-    steps: tuple[Any, ...],
-    curves: Sequence[Any],
-    extras: Extras,
-    progress: Progress,
+    outcome: Outcome, folder: Path, request: Request, curves: Sequence[Curve], extras: Extras, progress: Progress
 ) -> tuple[Report, tuple[str, ...]]:
+    """Write the files of a report; returns it, and notes on what was not written."""
     what, parts = "parts of the report made", 3
     progress(what, 0, parts)
-    digest = write_csv(outcome, folder / SCORES)
+    digest = tables.write_csv(outcome, folder / SCORES)
     notes: list[str] = []
     beside = [SCORES]
     if request.parquet is not False:
         try:
-            write_parquet(outcome, folder / PARQUET)
+            tables.write_parquet(outcome, folder / PARQUET)
             beside.append(PARQUET)
         except CalibrationError as error:
             if request.parquet:
                 raise
             notes.append(f"no scores.parquet: {error.what}")
     progress(what, 1, parts)
-    report, extremes = report_of(outcome, request.command, digest, steps, extras)
+    report = report_of(outcome, request.command, digest, extras)
     progress(what, 2, parts)
-    files = {"summary.csv": summary_csv(report)}
+    files = {"summary.csv": tables.summary_csv(report)}
     if report.written:
-        files[TABLE_3] = table_3_csv(report)
+        files[TABLE_3] = tables.table_3_csv(report)
     else:
         (folder / TABLE_3).unlink(missing_ok=True)  # left by an earlier run with characters
-    refused = [(r.session_id, r.stroke_id, r.why) for r in report.refused]
-    files["failures.csv"] = csv_text(("session_id", "stroke_id", "why"), refused)
+    files["failures.csv"] = csv_text(Refused._fields, report.refused)
     pages = list(pages_beside(outcome.sessions, folder))
-    files["report.html"] = page_of(
-        outcome, report, extremes, curves, [*beside, *files, "report.json"], extras.figures, pages
-    )
+    beside += [*files, "report.json"]
+    files["report.html"] = page_of(outcome, report, curves, beside, extras.figures, pages)
     files["report.json"] = report.to_json()
     write_files(folder, files)
     progress(what, parts, parts)
     return report, tuple(notes)
 
 
-def _drags(request: Request, sessions: list[LoadedSession], folder: Path, progress: Progress) -> ValidationOutput:
+def _drags(request: Request, sessions: Sequence[FittedSession], folder: Path, progress: Progress) -> ValidationOutput:
     validated: list[DragValidation] = []
-    for one in sessions:
-        captures = counted(one.recording.captures(), f"{one.header.session_id}: measured", one.count, progress)
-        results = validate_drags(captures, Params.of(one.calibration))
+    for session in sessions:
+        what = f"{session.header.session_id}: measured"
+        captures = counted(session.recording.captures(), what, len(session.strokes), progress)
+        results = validate_drags(captures, Params.of(session.calibration))
         predictions = None
         if request.fit is not None:
-            predictions = predict_session(one.recording.path, request.fit, request.calibration, progress)
-        validation = DragValidation(one.header, one.recording.path, one.sha256, results, predictions)
-        target = folder / one.header.session_id if len(sessions) > 1 else folder
+            predictions = predict_session(session.recording.path, request.fit, request.calibration, progress)
+        validation = DragValidation(session.header, session.recording.path, session.sha256, results, predictions)
+        target = folder / session.header.session_id if len(sessions) > 1 else folder
         write_drags(validation, target, request.command)
         validated.append(validation)
     return ValidationOutput(folder, drags=tuple(validated))
@@ -229,12 +221,8 @@ def _folder(request: Request) -> Path:
 
 @contextmanager
 def _locked(folder: Path) -> Generator[None]:
-    lock = FileLock(folder / WORK / "lock")
     try:
-        lock.acquire(timeout=0)
+        with FileLock(folder / WORK / "lock", timeout=0):
+            yield
     except Timeout:
         raise CalibrationError(str(folder), "another validation is writing there") from None
-    try:
-        yield
-    finally:
-        lock.release()

@@ -1,0 +1,272 @@
+"""Findings of a report in sentences: what was measured, how well models predict it, and whether to trust it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+from brushloop.calibrate.compare.paper import ORDER
+from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.score import Polarity
+from brushloop.calibrate.loop.scores import AGAIN, LoopRecord
+from brushloop.calibrate.loop.scores import ANOTHER as ANOTHER_ORIGINAL
+from brushloop.calibrate.report import Point, source_point
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
+from brushloop.calibrate.validate.models import ANOTHER, BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT, PRESSES
+from brushloop.calibrate.validate.report import Report, Session, Stat
+from brushloop.calibrate.writing.scores import REFERENCE
+from brushloop.sessions.records import Source
+
+CLOSE = 0.5
+"""Points below which two models count as equal."""
+FEW_REPEATS = 3
+WIDE_SCALE = 0.005
+"""Relative width of pix2len's interval above which it matters: half a percent of every length."""
+MUCH_REFUSED = 0.05
+MOVED_MM = 0.3
+"""Difference between two zero touches of one session that exceeds their combined repeatability."""
+MISSED_MM = 0.1
+"""Difference between the commanded and the reached depth above which a report says so."""
+MAX_NAMED = 6
+MEASURED = {
+    Source.LOOPBACK: "The brush, the ink and the photographs are simulated",
+    Source.REAL: "A robot arm pressed them on paper, a camera photographed them",
+    Source.IMPORT: "They are photographs from elsewhere",
+    Source.IMPORT_SIMULATED: "They are pictures of simulated ink from elsewhere",
+}
+MEANING = {
+    Source.LOOPBACK: "The brush and its ink are simulated, so this tests the method and says nothing about paper.",
+    Source.REAL: "The ink is real: pressed by the arm and photographed, as the recording says.",
+    Source.IMPORT: "The photographs come from elsewhere; their scale and commands were not measured here.",
+    Source.IMPORT_SIMULATED: "The ink was simulated elsewhere, so this says nothing about paper.",
+}
+
+
+def measured(report: Report) -> str:
+    """Summary of the strokes and models that were compared."""
+    cells = {stat.cell for stat in report.stats if stat.cell is not None}
+    compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
+    sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
+    where = f" at {len(cells)} combinations of press depth H and brush tilt α" if cells else ""
+    brush = next((session.brush for session in report.sessions if session.brush), "a brush that is not named")
+    left = "" if compared == strokes else f", {strokes - compared} more could not be used"
+    models = sum(model.basis != PRESSES for model in report.models)
+    return (
+        f"{compared} brush presses{where}, from {sessions}, were compared with what {models} stroke models predict "
+        f"for them{left}. Each press is one vertical dab of {brush}. {MEASURED[report.source]} ({report.label})."
+    )
+
+
+def verdict(report: Report) -> Iterator[str]:
+    """The report in at most three sentences: how well the model shown predicts, beside what, and on what ink."""
+    shown, top, bezier, published = (_avg(report, name) for name in (report.shown, CEILING, BEZIER_REFITTED, "ccd-bsm"))
+    if shown is not None:
+        below = "" if top is None or shown.below_ceiling is None else f"{_below(shown)} of {top.avg:.1f} %"
+        unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
+        label = _label(report, report.shown)
+        yield f"{label} predicts presses{unseen} with an average CSIM of {shown.avg:.1f} %{below}."
+    others = [f"a Bézier stroke fitted to the same captures reaches {bezier.avg:.1f} %"] if bezier is not None else []
+    if published is not None and report.shown != "ccd-bsm":
+        others.append(f"CCD-BSM as published reaches {published.avg:.1f} %")
+    if others:
+        words = " and ".join(others)
+        yield f"{words[0].upper()}{words[1:]}."
+    yield MEANING[report.source]
+
+
+def findings(report: Report) -> Iterator[str]:
+    """How well the models predict: the ceiling, the best model that had not seen the strokes, the published one."""
+    again, top = _avg(report, ANOTHER), _avg(report, CEILING)
+    if again is not None and top is not None:
+        yield (
+            f"Repeatability of the brush: one press predicts another of the same H and α with a CSIM of "
+            f"{again.avg:.1f} %. A perfect model of this brush, which draws the best image of each cell, would reach "
+            f"{_interval(top)}: this is the ceiling, and no model can be expected to do better."
+        )
+    held, bezier, tuned = (_avg(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT))
+    if held is not None:
+        unseen = "on cells that the fit had not seen"
+        yield f"Calibrated to this brush, CCD-BSM reaches {_interval(held)}{_below(held)}, {unseen}."
+    if tuned is not None:
+        yield f"Tuned to this brush, CCD-BSMG reaches {_interval(tuned)}{_below(tuned)}, on cells that it had not seen."
+    if bezier is not None:
+        peer = ""
+        if held is not None:
+            peer = f": {abs(held.avg - bezier.avg):.1f} points {'less' if bezier.avg < held.avg else 'more'}"
+        yield f"A Bézier stroke fitted to the same captures reaches {_interval(bezier)}{peer}."
+    yield from _pressed_again(report)
+    yield from _characters(report)
+    published = [(model, _avg(report, model.name)) for model in report.models if model.name in ("ccd-bsmg", "ccd-bsm")]
+    for model, stat in published:
+        if stat is not None:
+            yield f"{model.label} {model.basis}, given only the brush's size, H and α, reaches {_interval(stat)}."
+    if published:
+        yield from _sizes(report)
+    if held is None and not report.source.imported:
+        yield "No model was calibrated to this brush: run “brushloop fit”, then validate again."
+
+
+def _pressed_again(report: Report) -> Iterator[str]:
+    for loop in report.loops:
+        again, other = (loop.row(what, Alignment.MM, Tone.BINARY) for what in (AGAIN, ANOTHER_ORIGINAL))
+        if again is None:
+            continue
+        others = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
+        yield (
+            f"Pressed again from their photographs alone ({loop.again}), {again.n} strokes match their "
+            f"originals with a CSIM of {again.csim[2]:.1f} %{others}."
+        )
+
+
+def _characters(report: Report) -> Iterator[str]:
+    for row in (row for record in report.written for row in record.table_3):
+        key = (row.pair, row.alignment, row.tone, row.polarity)
+        if key == (REFERENCE, Alignment.MM, Tone.BINARY, Polarity.INK):
+            yield (
+                f"{row.character}, written {row.n} times by the arm, matches its reference ({row.reference}) with "
+                f"a CSIM of {row.csim[2]:.1f} %."
+            )
+
+
+def _sizes(report: Report) -> Iterator[str]:
+    ratios = [
+        (session.length_ratio, session.width_ratio)
+        for session in report.sessions
+        if session.length_ratio is not None and session.width_ratio is not None
+    ]
+    if ratios:
+        length, width = (sum(side) / len(ratios) for side in zip(*ratios, strict=True))
+        yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM predicts."
+
+
+def order(report: Report) -> str:
+    """Whether the models rank in the paper's order, size-normalised and binary."""
+    stats = [(name, report.stat(name, Alignment.SIZE_NORMALISED, Tone.BINARY, "csim")) for name in ORDER]
+    csim = {name: stat.avg for name, stat in stats if stat is not None}
+    if len(csim) < 3:
+        return ""
+    wanted, ours = list(csim), sorted(csim, key=lambda name: -csim[name])
+    label = {name: _label(report, name) for name in csim}
+    words = " > ".join(f"{label[name]} {csim[name]:.1f}" for name in ours)
+    close = [f"{label[a]} and {label[b]}" for a, b in itertools.pairwise(ours) if csim[a] - csim[b] < CLOSE]
+    near = f" Too close to separate: {'; '.join(close)}." if close else ""
+    if ours == wanted:
+        return f"By average CSIM in the size-normalised alignment the models have the paper's order: {words}.{near}"
+    swapped = [f"{label[b]} before {label[a]}" for a, b in itertools.combinations(wanted, 2) if csim[b] > csim[a]]
+    return (
+        f"By average CSIM in the size-normalised alignment: {words}. The paper's order differs: here "
+        f"{', '.join(swapped)}. Uncalibrated models have the proportions of the paper's brush. If those of this brush "
+        "differ, a model can win by its size alone, and the order says little about the models." + near
+    )
+
+
+def trust(report: Report) -> Iterator[Point]:
+    """Points to check before trusting the numbers."""
+    yield source_point(report.source)
+    strokes = sum(s.strokes for s in report.sessions)
+    lost = len({(r.session_id, r.stroke_id) for r in report.refused if "does not predict it" not in r.why})
+    if lost:
+        words = f"{lost} of {strokes} strokes could not be used; each is named below, with the reason."
+        yield Point(lost <= MUCH_REFUSED * strokes, words)
+    else:
+        yield Point(True, "Every stroke that counted was used.")
+    for session in report.sessions:
+        yield from _collection(session)
+    cut = sum(len(session.cut) for session in report.sessions)
+    if cut:
+        yield Point(False, f"{cut} strokes are cut by the edge of their photograph or cell: their scores are too low.")
+    for session in report.sessions:
+        if (scale := session.calibration) is not None:
+            width = (scale.high - scale.low) / scale.mm_per_px
+            words = f"scale known to ±{50 * width:.3f} %, board seen to {scale.rms_px:.2f} px."
+            yield Point(width <= WIDE_SCALE, f"{session.session_id}: {words}")
+    yield from _models(report)
+    for loop in report.loops:
+        yield _loop(loop)
+    if any("in sample" in model.basis for model in report.models):
+        words = "Rows “in sample” were fitted to the very strokes that they predict: read the held-out rows instead."
+        yield Point(None, words)
+
+
+def _collection(session: Session) -> Iterator[Point]:
+    """Points that the recording alone does not show: planned strokes that were left out, and paper that moved."""
+    name, miss, collected = session.session_id, session.deepest_miss, session.collected
+    if miss is not None and abs(miss.reached_mm - miss.depth_mm) > MISSED_MM:
+        yield Point(
+            False,
+            f"{name}: commanded and reached depth differ by more than {MISSED_MM:g} mm, most at "
+            f"{miss.stroke_id}: {miss.depth_mm:g} mm was commanded, {miss.reached_mm:.2f} mm was reached.",
+        )
+    if collected is None:
+        return
+    if collected.left_out:
+        of = "" if collected.planned is None else f" of {collected.planned} planned"
+        names = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
+        words = f"{len(collected.left_out)}{of} strokes were left out during collection: {names}."
+        yield Point(False, f"{name}: {words}")
+    if collected.pressed_again:
+        takes = f"{len(collected.pressed_again)} of {collected.photographed} takes"
+        words = f"{takes} did not count and were pressed again: the remaining strokes are a selection."
+        yield Point(None, f"{name}: {words}")
+    if collected.moved_mm > MOVED_MM:
+        words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
+        yield Point(False, f"{name}: {words}: presses with the same H do not have the same depth.")
+
+
+def _models(report: Report) -> Iterator[Point]:
+    """How well the ceiling is known, and where the calibrated model stands."""
+    repeats = [stat.n for stat in report.stats if stat.cell is not None and stat.model == CEILING]
+    if not repeats:
+        words = "No cell was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
+        yield Point(False, words)
+    elif min(repeats) < FEW_REPEATS:
+        words = f"Some cells were pressed only {min(repeats)} times, so the ceiling is rough."
+        yield Point(None, f"{words} The paper presses ten times.")
+    held, bezier = (_avg(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED))
+    if held is not None and held.below_ceiling is not None:
+        low, high = held.below_low, held.below_high
+        near = is_near(held.below_ceiling, None if low is None or high is None else (low, high))
+        how = {True: "within", False: "not within", None: "not certainly within"}[near]
+        words = f"{NEAR_POINTS} points of the ceiling (mm, binary, CSIM): {_points(held)}."
+        yield Point(near, f"The calibrated model is {how} {words}")
+    if held is not None and bezier is not None and held.avg < bezier.avg:
+        yield Point(False, "The refitted Bézier predicts unseen cells better than the calibrated CCD-BSM.")
+
+
+def _loop(loop: LoopRecord) -> Point:
+    if not loop.verdicts:
+        return Point(None, f"{loop.again}: no original cell was pressed twice, so its repeatability is unknown.")
+    least = min(loop.verdicts, key=lambda verdict: verdict.difference)
+    failed = sum(not verdict.holds for verdict in loop.verdicts)
+    how = "at most" if not failed else f"in {failed} of {len(loop.verdicts)} comparisons more than"
+    sure = "" if all(verdict.certain for verdict in loop.verdicts) else ", not certain in all"
+    return Point(
+        not failed,
+        f"Strokes pressed again ({loop.again}) are {how} {loop.goal_points:g} point less similar to their originals "
+        f"than other presses of the same cell (least: {least.difference:+.2f} points{sure}).",
+    )
+
+
+def _avg(report: Report, model: str) -> Stat | None:
+    return report.stat(model, Alignment.MM, Tone.BINARY, "csim")
+
+
+def _span(low: float | None, high: float | None) -> str:
+    return "" if low is None or high is None else f" (95 % {low:.1f} to {high:.1f})"
+
+
+def _interval(stat: Stat) -> str:
+    return f"{stat.avg:.1f} %{_span(stat.avg_low, stat.avg_high)}"
+
+
+def _points(stat: Stat) -> str:
+    return f"{stat.below_ceiling:.1f} points{_span(stat.below_low, stat.below_high)}"
+
+
+def _below(stat: Stat) -> str:
+    return "" if stat.below_ceiling is None else f", {_points(stat)} below the ceiling"
+
+
+def _label(report: Report, name: str) -> str:
+    model = report.model(name)
+    return name if model is None else model.label

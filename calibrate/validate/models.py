@@ -1,0 +1,204 @@
+"""The models compared with captures: every registered one, the fitted brush, refits to other cells, generators."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.compare.paper import ROBOT_WRITING
+from brushloop.calibrate.compare.place import Field, Pixels, brush_of, loop_pixels, simulated_pixels
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.heldout import RefittedBezier
+from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.validate.inputs import FittedSession
+from brushloop.model.ccdbsm import Brush, DomainError
+from brushloop.model.fitted import NAME as FITTED
+from brushloop.model.fitted import FittedPress
+from brushloop.sessions.disk import file_sha256
+from brushloop.sessions.records import Condition
+
+if TYPE_CHECKING:
+    from brushloop.model.strokes import StrokeModel
+
+PUBLISHED = "as published"
+HELD_OUT = "fitted, held-out cells"
+PRESSES = "captured presses"
+FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
+GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
+HELD_OUT_NAMES = (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT)
+ANOTHER = "another press"
+"""A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
+REPEATED = ROBOT_WRITING
+"""A press compared with the stroke of another session that it repeats: the third row of the paper's Table 1."""
+LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
+"""Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
+ORDER = (
+    *("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED, FITTED_HELD_OUT, "bezier", BEZIER_REFITTED),
+    *("ellipse", "line", "circle"),
+)
+"""Of the paper's tables, calibrated next to uncalibrated."""
+
+
+class ModelInfo(Frozen):
+    """What a report says of a model, or of the kind of press that a press is compared with."""
+
+    name: str
+    label: str
+    definition: str
+    basis: str
+    """What it knows of these presses: `as published`, `fitted, in sample`, `fitted, held-out cells`, ..."""
+    sha256: str = ""
+    """Hash of a generator's file."""
+
+
+KINDS_OF_PRESS = (
+    ModelInfo(
+        name=ANOTHER,
+        label="another press",
+        definition="A capture predicted by other captures of its cell, averaged: how well the brush repeats a press. A "
+        "model can do better, because only one of two presses strays from its image.",
+        basis=PRESSES,
+    ),
+    ModelInfo(
+        name=REPEATED,
+        label="robot writing",
+        definition="A stroke pressed again with the depth and tilt that were recovered from it, against the original.",
+        basis=PRESSES,
+    ),
+    ModelInfo(
+        name=CEILING,
+        label=CEILING,
+        definition="The score of a perfect model, which draws the best image of each cell: estimated from the "
+        "similarity of other presses of the cell.",
+        basis=PRESSES,
+    ),
+)
+"""What stands in the tables beside the models."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A model to compare with the presses of one session: one row of the tables."""
+
+    info: ModelInfo
+    predict: Callable[[Condition], Pixels]
+    """(len(KEYS), 128, 128) of a condition; raises `DomainError` for a press that the model does not predict."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.info.name
+
+
+@dataclass(frozen=True, slots=True)
+class Refitted:
+    """What was fitted to the other cells of a session; None where they are too few for it."""
+
+    press: FittedPress | None
+    bezier: RefittedBezier | None
+
+
+def in_order(models: Sequence[Model]) -> list[Model]:
+    """Sort in the order of the paper's tables, all others last."""
+
+    def place(model: Model) -> int:
+        stem = "ccd-bsmg" if model.name.startswith("ccd-bsmg-") and model.name not in ORDER else model.name
+        return ORDER.index(stem) if stem in ORDER else len(ORDER)
+
+    return sorted(models, key=place)
+
+
+def known_models(
+    session: FittedSession, generators: Sequence[Path], view: Field, *, ablations: bool, chosen: Sequence[str]
+) -> list[Model]:
+    """The models that need no held-out fit. Raises `CalibrationError` if one of `chosen` is unknown."""
+    known = in_order([*_generators(session, generators, view), *_closed_forms(session, view, ablations=ablations)])
+    names = (*dict.fromkeys(model.name for model in known), *HELD_OUT_NAMES)
+    for name in chosen:
+        if name not in names:
+            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(names)}")
+    return known
+
+
+def _closed_forms(session: FittedSession, view: Field, *, ablations: bool) -> list[Model]:
+    """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
+    from brushloop.model.fitted import fitted_model
+    from brushloop.model.strokes import stroke_model, stroke_models
+
+    brush, fit = brush_of(session.header), session.fit
+    models = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
+    if fit is not None:
+        basis = "fitted, in sample" if fit.recording_sha256 == session.sha256 else f"fitted on {fit.session_id}"
+        models.insert(1, _of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
+    for name, lam in LAMBDAS.items() if ablations else ():
+        label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
+        models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name=name, label=label))
+    return models
+
+
+def _generators(session: FittedSession, files: Sequence[Path], view: Field) -> list[Model]:
+    """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
+    from brushloop.model.generator.stroke import load_generator
+
+    models: list[Model] = []
+    for number, file in enumerate(files):
+        model = load_generator(file, brush_of(session.header))
+        taken = any(model.name == other.name for other in models)
+        images = "trained on exact images of CCD-BSM"
+        basis = f"{images}, then tuned on captures" if model.fitted else images
+        named = {"name": f"{model.name}-{number + 1}"} if taken else {}
+        models.append(_of_model(model, basis, view, sha256=file_sha256(file), **named))
+    return models
+
+
+def held_out(fits: Mapping[Condition, Refitted], view: Field, *, fitted: bool) -> list[Model]:
+    """Models fitted without the cell that they predict: a Bezier, and CCD-BSM if it is `fitted`."""
+
+    def of(condition: Condition, part: str) -> FittedPress | RefittedBezier:
+        refitted = getattr(fits[condition], part) if condition in fits else None
+        if refitted is None:
+            why = "the other cells do not determine this press"
+            raise DomainError("depth_mm", condition.depth_mm, "other cells", why)
+        return refitted
+
+    def drawn(part: str) -> Callable[[Condition], Pixels]:
+        return lambda at: loop_pixels(of(at, part).outline(at.depth_mm, at.tilt_deg), view)
+
+    bezier = ModelInfo(
+        name=BEZIER_REFITTED,
+        label="Bezier refitted",
+        definition="Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other "
+        "cells.",
+        basis=HELD_OUT,
+    )
+    ours = ModelInfo(
+        name=FITTED_HELD_OUT,
+        label="CCD-BSM calibrated",
+        definition="CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other cells.",
+        basis=HELD_OUT,
+    )
+    return [*([Model(ours, drawn("press"))] if fitted else []), Model(bezier, drawn("bezier"))]
+
+
+def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field, number: int) -> Model:
+    """A generator tuned on all cells except the one it predicts."""
+    from brushloop.model.generator.stroke import load_generator
+
+    loaded = {file: load_generator(file, brush) for file in set(files.values())}
+    info = ModelInfo(
+        name=GENERATOR_HELD_OUT if number == 0 else f"{GENERATOR_HELD_OUT}-{number + 1}",
+        label="CCD-BSMG calibrated",
+        definition="The generator, fine-tuned on captures of other cells (left out by fifths) and on images of the "
+        "CCD-BSM that was fitted to them, if there is a fit; its outline.",
+        basis=HELD_OUT,
+    )
+    return Model(info, lambda at: simulated_pixels(loaded[files[at]], at.depth_mm, at.tilt_deg, view))
+
+
+def _of_model(model: StrokeModel, basis: str, view: Field, **changes: str) -> Model:
+    info = ModelInfo(name=model.name, label=model.label, definition=model.definition, basis=basis)
+    return Model(info.model_copy(update=changes), lambda at: simulated_pixels(model, at.depth_mm, at.tilt_deg, view))

@@ -1,1 +1,0 @@
-"""The report of a validation as data, tables, sentences, figures, page and files."""

@@ -1,0 +1,144 @@
+"""Presses against models: a capture drawn by a model must score 1 with that model, in both alignments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, pack, simulated, simulated_pixels
+from brushloop.calibrate.pool import threads
+from brushloop.calibrate.presses import PrepareJob, prepare_job
+from brushloop.calibrate.scores import Row, Scores
+from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.validate.inputs import open_session
+from brushloop.calibrate.validate.models import ANOTHER, REPEATED
+from brushloop.calibrate.validate.run import Options, ScoreJob, score_job, validate_presses
+from brushloop.model.ccdbsm import Brush
+from brushloop.model.raster.exact import coverage_at
+from brushloop.model.strokes import stroke_models
+from brushloop.sessions.messages import encode_png
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Condition, Stroke
+from tests.calibrate.given import CALIBRATION
+
+MODELS = stroke_models(Brush())
+ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
+MM, NORMAL = (Alignment.MM, Tone.BINARY), (Alignment.SIZE_NORMALISED, Tone.BINARY)
+
+
+def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
+    """A 100 x 80 mm page, photographed straight from above at 10 px/mm, with a model's mark at the anchor."""
+    axis_x = ANCHOR[0] + depth_mm * math.tan(math.radians(tilt_deg))
+    mark = coverage_at(MODELS[model].profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    return np.rint(230.0 * (1.0 - 0.92 * np.asarray(mark[0])[:800])).astype(np.uint8)
+
+
+def packed(page: np.ndarray) -> bytes:
+    """The press of a page, as it is compared."""
+    stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=CELL, anchor_mm=ANCHOR)
+    arrays = prepare_job(PrepareJob(Capture(stroke, encode_png(page), "test"), CALIBRATION, Field()))
+    return pack(np.rint(255 * arrays["images"]).astype(np.uint8))
+
+
+def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:
+    """(KEYS, 2) scores of every model's press of that command."""
+    images = tuple((pack(simulated_pixels(model, depth_mm, tilt_deg, Field())),) for model in MODELS.values())
+    return dict(zip(MODELS, score_job(ScoreJob(packed(page), images))["values"], strict=True))
+
+
+@pytest.mark.parametrize("model", ["ccd-bsm", "ellipse", "line"])
+@pytest.mark.parametrize(("depth_mm", "tilt_deg"), [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
+def test_a_mark_drawn_by_a_model_is_recognised_by_it(model: str, depth_mm: float, tilt_deg: float) -> None:
+    for name, values in scores_of(page_of(depth_mm, tilt_deg, model), depth_mm, tilt_deg).items():
+        if name == model:
+            assert min(values[KEYS.index(MM), 0], values[KEYS.index(NORMAL), 0]) > 0.985
+            assert values[KEYS.index(NORMAL), 1] > 0.94
+        else:
+            assert values[KEYS.index(MM), 0] < 0.98
+
+
+@pytest.mark.parametrize(
+    ("page", "command", "strict"),
+    [
+        (np.roll(page_of(15.0, 0.0), 10, axis=0), (15.0, 0.0), 0.95),  # a millimetre off
+        (page_of(20.0, 0.0), (10.0, 0.0), 0.8),  # twice as deep as commanded
+    ],
+)
+def test_a_wrong_place_or_size_is_forgiven_when_normalised_but_not_in_mm(
+    page: np.ndarray, command: tuple[float, float], strict: float
+) -> None:
+    values = scores_of(page, *command)["ccd-bsm"][:, 0]
+    assert values[KEYS.index(NORMAL)] > 0.985
+    assert values[KEYS.index(MM)] < strict
+
+
+def test_scores_of_several_images_are_averaged_and_of_none_are_missing() -> None:
+    near, far = packed(page_of(13.0, 5.0)), packed(page_of(15.0, 5.0))
+    one, other, both, none = score_job(ScoreJob(near, ((near,), (far,), (near, far), ())))["values"]
+    assert one == pytest.approx(1.0)
+    assert both == pytest.approx((one + other) / 2)
+    assert np.isnan(none).all()
+
+
+def test_the_field_holds_every_cell_of_the_grid() -> None:
+    for depth_mm, tilt_deg in ((11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)):
+        image = simulated(MODELS["ccd-bsm"], depth_mm, tilt_deg, Field())[Alignment.MM, Tone.GRAY]
+        assert np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).max() == 0.0
+        assert image.sum() * 0.3**2 == pytest.approx(
+            MODELS["ccd-bsm"].profile(depth_mm, tilt_deg).area_mm2[0], rel=1e-5
+        )
+
+
+def test_the_table_is_in_order_of_capture_and_its_cells_in_order_of_session_and_condition() -> None:
+    shallow, upright, tilted = Condition(20.0, 0.0), Condition(11.0, 0.0), Condition(11.0, 10.0)
+    order = [("b", shallow), ("b", upright), ("b", tilted), ("b", shallow), ("a", shallow), ("a", upright)]
+    rows = [
+        Row(
+            name,
+            Stroke(stroke_id=str(k), kind="press", still=k),
+            condition,
+            Measured(1.0, 1.0, 1.0, 1.0, 1.0),
+            False,
+            b"",
+        )
+        for k, (name, condition) in enumerate(order)
+    ]
+    scores = Scores(rows, ["line", "circle"])
+    assert [cell.tolist() for cell in scores.cells] == [[1], [2], [0, 3], [5], [4]]
+    assert scores.cell_of.tolist() == [2, 0, 1, 2, 4, 3]
+    assert {at: rows.tolist() for at, rows in scores.conditions().items()} == {
+        upright: [1, 5],
+        tilted: [2],
+        shallow: [0, 3, 4],
+    }
+    scores.values[4, 1] = 0.5
+    assert [(s.session, s.stroke_id, s.model, s.csim) for s in scores] == [("a", "4", "circle", 0.5)] * len(KEYS)
+
+
+def test_the_repetition_is_scored_against_its_original_only(
+    session: Path, make_session: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = make_session(tmp_path, "again", repeats=1, blank=False, seed=90)
+    records = Recording.stroke_records
+
+    def repeating(recording: Recording) -> list[Stroke]:
+        """As a replay protocol records it: each stroke of the second session repeats one of the first."""
+        strokes = list(records(recording))
+        if "again" not in str(recording.path):
+            return strokes
+        return [s.model_copy(update={"again_of": s.stroke_id, "stroke_id": f"again-{s.stroke_id}"}) for s in strokes]
+
+    monkeypatch.setattr(Recording, "stroke_records", repeating)
+    sessions = [open_session(str(place), tmp_path, None, None) for place in (session, again)]
+    with threads(1) as pool:
+        scores = validate_presses(sessions, Options(held_out=False), pool, tmp_path).scores
+    repeated = scores.of(REPEATED)[:, :, 0]
+    repeats = [row.session == "again" for row in scores.rows]
+    assert np.array_equal(np.isfinite(repeated).all(axis=1), repeats)
+    assert sum(repeats) == 5
+    # Two presses of one command by one brush: about as alike as the originals among themselves.
+    assert np.nanmean(repeated) == pytest.approx(np.nanmean(scores.of(ANOTHER)[:10, :, 0]), abs=0.05)
