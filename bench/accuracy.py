@@ -60,6 +60,7 @@ TWIN_POINTS, TWIN_REPEATS, TWIN_REPEAT_POINTS = 1.5, 3, 1.0
 BIG, SMALL_A, SMALL_B = "frida_bigbrush_tilt_16x20", "frida_smallbrush_16x20_a", "frida_smallbrush_16x20_b"
 DRAG_TEST, DRAG_SIZES, ADAPTED = 40, (20, 147), 10
 DRAG_GOALS = {20: (0.845, 0.735), 147: (0.86, 0.76)}
+SESSION_GOAL = (0.845, 0.725)
 WITHIN_POINTS = {"max": 4.0, "min": 4.0, "avg": 2.0}
 """Points by which an extreme and an average of the paper's brush may differ from Table 2."""
 
@@ -257,8 +258,8 @@ def drags(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
             fit_file = _drag_fit(train)
             known = _predicted(test, fit_file)
             adapted = _predicted(test, _drag_fit(test, "--prior", fit_file, "--strokes", str(ADAPTED)))
-        results += _drag_results(f"drags.{way}", [known], DRAG_GOALS[20], seed)
-        results += _drag_results(f"drags.{way}.adapted", [adapted], DRAG_GOALS[20], seed)
+        results += _drag_results(f"drags.{way}", [known], SESSION_GOAL, seed)
+        results += _drag_results(f"drags.{way}.adapted", [adapted], SESSION_GOAL, seed)
     return results
 
 

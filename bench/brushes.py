@@ -36,8 +36,8 @@ BRISTLE_SETS = ("bristle_presses_1", "bristle_presses_4")
 PX_MM, WIDTH_PX, HEIGHT_PX, TOUCH_PX = 10.0, 480, 300, (380, 150)
 """Scale and size of a photograph, and where the tip touches on it."""
 MOST_SHEETS = 40
-UNFINISHED, ASKS = 3, 4
-"""Exit codes: a collection finished without some strokes; the same command continues, here with a fresh sheet."""
+FINISHED = (0, 3)
+"""Exit codes: done, or a collection that finished without some strokes."""
 HEADER = "file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"
 Condition = tuple[float, float]
 """Depth in mm, tilt in deg."""
@@ -151,12 +151,12 @@ class SimulatedRig:
         """
         sheet: list[str] = []
         for _ in range(MOST_SHEETS):
-            ran = brushloop(*words, "--config", self.toml, "--no-tui", *sheet, ends=(0, UNFINISHED, ASKS))
-            if ran.returncode != ASKS:
+            ran = brushloop(*words, "--config", self.toml, "--no-tui", *sheet, ends=range(256))
+            if ran.returncode in FINISHED:
                 return
             asked = re.search(r"--sheet\s+(\d+)", ran.stderr)
             if asked is None:
-                raise BenchError(f"`brushloop {words[0]}` ended with {ASKS}: {ran.stderr.strip()[-400:]}")
+                raise BenchError(f"`brushloop {words[0]}` ended with {ran.returncode}: {ran.stderr.strip()[-400:]}")
             brushloop("fault", self.control, "fresh-sheet")
             sheet = ["--sheet", asked[1]]
         raise BenchError(f"`brushloop {words[0]}` has asked for {MOST_SHEETS} sheets")
