@@ -180,7 +180,7 @@ def invert(
     check_target(out, ".csv")
     Recording(session)  # a wrong path is refused before the models are loaded, which takes seconds
 
-    from brushloop.calibrate.invert.command import RecoverRequest, recover
+    from brushloop.calibrate.invert import RecoverRequest, recover
     from brushloop.sessions.terminal import show_work
 
     request = RecoverRequest(

@@ -24,17 +24,15 @@ from brushloop.calibrate.compare.place import (
     Field,
     Tone,
     brush_of,
-    covered,
-    prepare_press,
     simulated,
 )
 from brushloop.calibrate.compare.score import csim, ssim
-from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.fit.command import FitRequest, FitResult, fit_presses
-from brushloop.calibrate.presses import crop
-from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.presses import Refused, crop, read_presses
+from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate.command import Request, ValidationOutput, check
 from brushloop.calibrate.validate.command import validate as run_validation
 from brushloop.calibrate.validate.inputs import local_path
@@ -44,7 +42,7 @@ from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Condition, Header
 
 if TYPE_CHECKING:
-    from brushloop.calibrate.invert.command import Recovered
+    from brushloop.calibrate.invert import Recovered
     from brushloop.model.strokes import StrokeModel
 
 Gray = NDArray[np.uint8]
@@ -121,7 +119,10 @@ class RecordedPress:
     @cached_property
     def coverage(self) -> NDArray[np.float32]:
         """(128, 128) share of each pixel that is ink, on the field that `predict` draws on. Raises `CaptureRefused`."""
-        return covered(prepare_press(self._capture, self._session.applied, Field()))
+        refused: list[Refused] = []
+        for press in read_presses(self._session.opened, Field(), refused, chosen={self.name}):
+            return press.coverage
+        raise CaptureRefused(*refused[0])
 
     @property
     def poses(self) -> Poses:
@@ -135,7 +136,7 @@ class RecordedPress:
 
     @cached_property
     def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
-        return crop(self._capture, self._session.applied)[:2]
+        return crop(self._capture, self._session.opened.calibration)[:2]
 
 
 class Session:
@@ -170,10 +171,9 @@ class Session:
         return None if path is None else load_artefact(path, BrushFit)
 
     @cached_property
-    def applied(self) -> Calibration | None:
-        """The calibration that crops use; None for an import. Raises `CalibrationError` where it is missing."""
-        first = next(self.recording.stroke_records())
-        return calibration_of(self.recording, first, self.recording.sha256, None)
+    def opened(self) -> OpenSession:
+        """The session with the calibration that crops use. Raises `CalibrationError` where it is missing."""
+        return open_session(self.recording.path)
 
     @cached_property
     def quality(self) -> dict[str, str]:
@@ -285,8 +285,8 @@ def recover(session: Place, out: Path | None = None, **options: Any) -> Recovere
     Writes `recovered.csv` and the protocol that repeats the presses, beside the recording unless `out` says where.
     `options` are fields of `RecoverRequest`.
     """
-    from brushloop.calibrate.invert.command import RecoverRequest
-    from brushloop.calibrate.invert.command import recover as run
+    from brushloop.calibrate.invert import RecoverRequest
+    from brushloop.calibrate.invert import recover as run
 
     path = _path(session)
     return run(RecoverRequest(session=path, out=out or Recording(path).path.parent / "recovered.csv", **options))

@@ -68,7 +68,7 @@ RUNS = (
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
     "tests/calibrate/compare/": "comparing",
-    "tests/calibrate/invert/": "comparing",
+    "tests/calibrate/test_invert.py": "comparing",
     "tests/calibrate/fit/": "comparing",
     "tests/calibrate/loop/": "comparing",
     "tests/calibrate/writing/": "comparing",

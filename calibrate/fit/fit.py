@@ -85,7 +85,7 @@ class Drawn:
     above: NDArray[np.bool_]
     """Rows (len(y_mm),) on the upper side."""
     edges: Floats
-    """Derivatives of the edges, (P, 2 len(x_mm)): the upper edge, then the lower, mm."""
+    """Derivatives of the edges by P parameters, (P, 2 len(x_mm)): the upper edge, then the lower, mm."""
 
     def square(self) -> Floats:
         """J'J, (P, P)."""
@@ -100,14 +100,14 @@ class Drawn:
         return np.concatenate([image[self.above].sum(axis=0), image[~self.above].sum(axis=0)])
 
 
-def draw(press: FittedPress, depth_mm: float, tilt_deg: float, grid: Grid) -> Drawn:
-    """Draw a press with its derivatives; the edges are moved by a small step of each parameter."""
-    values = press.values + STEP * np.diag(spreads())
+def draw(press: FittedPress, depth_mm: float, tilt_deg: float, grid: Grid, free: Sequence[int] = ALL) -> Drawn:
+    """Draw a press with its derivatives by the free parameters; the edges are moved by a small step of each."""
+    values = press.values + STEP * np.diag(spreads())[list(free)]
     values = np.concatenate([press.values[None], values])
     edges = replace(press, values=values).edges_at(depth_mm, tilt_deg, grid.x_mm)
     ink = chance_within(edges[0], grid.y_mm, SPREAD_MM)
     moved = (edges[1:] - edges[0]) / STEP
-    return Drawn(ink, ink * (1.0 - ink) / SPREAD_MM, grid.y_mm > 0.0, moved.reshape(len(NAMES), -1))
+    return Drawn(ink, ink * (1.0 - ink) / SPREAD_MM, grid.y_mm > 0.0, moved.reshape(len(free), -1))
 
 
 def _minimise(
@@ -127,11 +127,11 @@ def _minimise(
 
     def equations(vector: Floats) -> Equations:
         trial = at_values(vector)
-        squares, gradients, cost = _normal(trial, strokes, grid)
+        squares, gradients, cost = _normal(trial, at, strokes, grid)
         pull = prior.precision @ prior.off(trial.values)
         cost += 0.5 * float(prior.off(trial.values) @ pull)
-        square = (squares.sum(axis=0) + prior.precision)[np.ix_(at, at)]
-        gradient = (gradients.sum(axis=0) + pull)[at]
+        square = squares.sum(axis=0) + prior.precision[np.ix_(at, at)]
+        gradient = gradients.sum(axis=0) + pull[at]
         # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
         held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
         square[held], square[:, held], gradient[held] = 0.0, 0.0, 0.0
@@ -157,13 +157,17 @@ def _minimise(
     return at_values(found.vector), found.at.cost
 
 
-def _normal(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple[Floats, Floats, float]:
-    """J'J and J'r of each stroke, and half the sum of squares, its strays integrated out.
+def _normal(
+    press: FittedPress, at: Sequence[int], strokes: Sequence[Pressed], grid: Grid
+) -> tuple[Floats, Floats, float]:
+    """J'J (P, P) and J'r (P,) of each stroke by the P parameters `at`, and half the sum of squares.
 
-    A cell is drawn once for all its strokes.
+    Strays are integrated out. A cell is drawn once for all its strokes.
     """
-    stray = [NAMES.index(name) for name in STRAYS]
-    sizes = np.array(list(STRAYS.values())) / spreads()[stray]
+    strays = [NAMES.index(name) for name in STRAYS]
+    sizes = np.array(list(STRAYS.values())) / spreads()[strays]
+    free = sorted({*at, *strays})
+    stray, kept = ([free.index(k) for k in chosen] for chosen in (strays, at))
     drawn: dict[tuple[float, float], tuple[Drawn, Floats, Floats, Floats]] = {}
     squares: list[Floats] = []
     gradients: list[Floats] = []
@@ -171,15 +175,15 @@ def _normal(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> tuple
     for stroke in strokes:
         cell = (stroke.depth_mm, stroke.tilt_deg)
         if cell not in drawn:
-            made = draw(press, *cell, grid)
-            square = made.square()
+            mark = draw(press, *cell, grid, free)
+            square = mark.square()
             inverse = np.asarray(np.linalg.inv(square[np.ix_(stray, stray)] + np.diag(sizes**-2.0)), np.float64)
             taken = inverse @ square[stray]
-            drawn[cell] = made, square - square[:, stray] @ taken, taken, inverse
-        made, square, taken, inverse = drawn[cell]
-        miss = made.ink - stroke.ink
-        pull = made.pull(miss)
-        squares.append(square)
-        gradients.append(pull - taken.T @ pull[stray])
+            drawn[cell] = mark, square - square[:, stray] @ taken, taken, inverse
+        mark, square, taken, inverse = drawn[cell]
+        miss = mark.ink - stroke.ink
+        pull = mark.pull(miss)
+        squares.append(square[np.ix_(kept, kept)])
+        gradients.append((pull - taken.T @ pull[stray])[kept])
         cost += 0.5 * float(np.vdot(miss, miss) - pull[stray] @ inverse @ pull[stray])
     return np.array(squares), np.array(gradients), cost

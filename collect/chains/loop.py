@@ -110,7 +110,7 @@ def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, 
     """Recover depth and tilt; the protocol is written last, so where it exists this stage is done."""
     protocol = request.out / PROTOCOL
     if not protocol.exists():
-        from brushloop.calibrate.invert.command import RecoverRequest, recover  # loads torch
+        from brushloop.calibrate.invert import RecoverRequest, recover  # loads torch
 
         wanted = RecoverRequest(
             folder,

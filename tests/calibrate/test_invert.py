@@ -13,8 +13,7 @@ import pytest
 
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.invert.command import PROTOCOL, Recovered, RecoverRequest, recover
-from brushloop.calibrate.invert.invert import Row, off_command
+from brushloop.calibrate.invert import PROTOCOL, Recovered, RecoverRequest, Row, off_command, recover
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.presses import ReplayConfig

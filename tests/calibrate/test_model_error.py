@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brushloop.calibrate.invert.invert import (
+from brushloop.calibrate.invert import (
     NO_MODEL_ERROR,
     NOT_INFORMATIVE,
     Row,
@@ -14,15 +14,16 @@ from brushloop.calibrate.invert.invert import (
     model_sd,
     with_model_error,
 )
+from brushloop.sessions.records import Condition
 
-CELLS = [(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
+CELLS = [Condition(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
 
 
-def rows(cells: list[tuple[float, float]], error_mm: float, error_deg: float) -> list[Row]:
+def rows(cells: list[Condition], error_mm: float, error_deg: float) -> list[Row]:
     rng = np.random.default_rng(0)
     return [
         Row(f"s{k}", h + error_mm * rng.normal(), a + error_deg * rng.normal(), 0.05, 0.2, 0.1, (), h, a)
-        for k, (h, a) in enumerate(cells * 20)
+        for k, (h, a) in enumerate((one.depth_mm, one.tilt_deg) for one in cells * 20)
     ]
 
 
@@ -40,7 +41,7 @@ def test_a_model_error_is_in_the_interval() -> None:
 
 def test_the_own_command_does_not_enter_the_interval() -> None:
     off = np.array([5.0, 0.1, 0.1, 0.1])
-    found = model_sd(off, np.full(4, 0.01), [(11.0, 0.0), (13.0, 0.0), (15.0, 0.0), (17.0, 0.0)])
+    found = model_sd(off, np.full(4, 0.01), [Condition(h, 0.0) for h in (11.0, 13.0, 15.0, 17.0)])
     assert found[0] == pytest.approx(0.1 * 3.182 / 1.96, rel=0.02)
     assert found[1] > 3.0
 

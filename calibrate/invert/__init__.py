@@ -1,1 +1,0 @@
-"""Depth and tilt recovered from photographs of presses."""
