@@ -174,7 +174,7 @@ def _facts(config: TrainConfig, report: dict[str, Any], path: Path) -> Iterator[
     target = config.target
     yield (
         "stroke model",
-        f"{target.model.name}, R {target.radius_mm:g} mm, L {target.length_mm:g} mm, λ {target.lam:.5g}",
+        f"{target.model}, R {target.radius_mm:g} mm, L {target.length_mm:g} mm, λ {target.lam:.5g}",
     )
     yield "network", ", ".join(f"{name} {value}" for name, value in config.layers.model_dump().items())
     yield "training", f"{config.batch} images a step, seed {config.seed}, highest rate {config.learning_rate:g}"

@@ -148,7 +148,7 @@ def _generators(session: FittedSession, files: Sequence[Path], view: Field) -> l
     for number, file in enumerate(files):
         model = load_generator(file, brush_of(session.header))
         taken = any(model.name == other.name for other in models)
-        images = "trained on exact images of CCD-BSM"
+        images = f"trained on exact images of {model.target.stroke_model.label}"
         basis = f"{images}, then tuned on captures" if model.fitted else images
         named = {"name": f"{model.name}-{number + 1}"} if taken else {}
         models.append(_of_model(model, basis, view, sha256=file_sha256(file), **named))

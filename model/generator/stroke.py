@@ -122,7 +122,7 @@ class GeneratorModel(StrokeModel):
 
 
 def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorModel:
-    """Load `generator.safetensors` as a stroke model; CCD-BSM's is the paper's CCD-BSMG.
+    """Load `generator.safetensors` as a stroke model.
 
     Raises TrainError for a file that cannot be used, and if it was trained for another brush than this.
     """
@@ -136,7 +136,12 @@ def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorMod
 
 
 def generator_model(file: GeneratorFile) -> GeneratorModel:
-    """The stroke model of a generator; `fitted` if it was tuned on captures, or its brush was fitted to some."""
+    """The stroke model of a generator: the paper's CCD-BSMG for CCD-BSM, else called `<model>-generator`.
+
+    It is `fitted` if it was tuned on captures, or its brush was fitted to some.
+    """
+    learned = file.target.stroke_model
+    paper = learned.name == "ccd-bsm"
     tuned = ", then tuned on captured strokes" if file.tuned else ""
 
     def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
@@ -145,9 +150,10 @@ def generator_model(file: GeneratorFile) -> GeneratorModel:
         return traced(file.images(inputs), file.target.origin_mm(inputs), file.target.px_mm)
 
     return GeneratorModel(
-        name="ccd-bsmg",
-        label="CCD-BSMG",
-        definition=f"A network trained on exact images of CCD-BSM{tuned}; its outline is traced at half coverage.",
+        name="ccd-bsmg" if paper else f"{learned.name}-generator",
+        label="CCD-BSMG" if paper else f"{learned.label} generator",
+        definition=f"A network trained on exact images of {learned.label}{tuned}; its outline is traced at half "
+        "coverage.",
         profile=profile,
         fitted=file.tuned or file.target.fitted_brush,
         file=file,

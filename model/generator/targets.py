@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.outline import Outline
 from brushloop.model.raster import centred_origin, coverage
-from brushloop.model.strokes import StrokeModel, stroke_model
+from brushloop.model.strokes import StrokeModel, UnknownModelError, stroke_model
 
 Floats = NDArray[np.floating[Any]]
 Range = tuple[float, float]
@@ -33,10 +33,12 @@ class Placement(StrEnum):
 
 
 class Target(BaseModel):
-    """CCD-BSM's presses of one brush, with the ranges of the inputs and the placement of strokes in the image."""
+    """Presses of one brush by a stroke model, the ranges of the inputs, and the placement of strokes in the image."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    model: Annotated[str, Field(max_length=64)] = "ccd-bsm"
+    """Name of the stroke model; with `qbc` or `bezier`, the paper's figure 12."""
     radius_mm: Annotated[float, Field(gt=0, le=100)] = 6.0
     length_mm: Annotated[float, Field(gt=0, le=400)] = 48.0
     lam: Annotated[float, Field(gt=0, le=10)] = math.pi
@@ -57,15 +59,15 @@ class Target(BaseModel):
             if not low < high:
                 raise ValueError(f"{name} = [{low:g}, {high:g}] must grow")
         try:
-            self.model.profile(np.array(self.depth_mm), np.array(self.tilt_deg))
-        except DomainError as error:
+            self.stroke_model.profile(np.array(self.depth_mm), np.array(self.tilt_deg))
+        except (DomainError, UnknownModelError) as error:
             raise ValueError(str(error)) from error
         return self
 
     @property
-    def model(self) -> StrokeModel:
-        """The stroke model that is drawn."""
-        return stroke_model("ccd-bsm", Brush(self.radius_mm, self.length_mm), self.lam, fitted=self.fitted_brush)
+    def stroke_model(self) -> StrokeModel:
+        """The stroke model of the brush."""
+        return stroke_model(self.model, Brush(self.radius_mm, self.length_mm), self.lam, fitted=self.fitted_brush)
 
     def check(self, inputs: Floats) -> None:
         """Raise DomainError for the first of (N, 2) inputs that lies outside its range; NaN counts as outside."""
@@ -82,7 +84,7 @@ class Target(BaseModel):
         """
         depth, tilt = np.asarray(inputs, np.float64).T
         if self.placement is Placement.CENTRED:
-            drawn = outline or self.model.profile(depth, tilt)
+            drawn = outline or self.stroke_model.profile(depth, tilt)
             return centred_origin(drawn, size_px=self.size_px, px_mm=self.px_mm)
         side_mm = self.size_px * self.px_mm
         x = ANCHOR_SHARE[0] * side_mm + depth * np.tan(np.radians(tilt))
@@ -93,7 +95,7 @@ class Target(BaseModel):
 
         May raise DomainError.
         """
-        outline = (model or self.model).profile(*np.asarray(inputs, np.float64).T)
+        outline = (model or self.stroke_model).profile(*np.asarray(inputs, np.float64).T)
         return coverage(outline, self.origin_mm(inputs, outline), size_px=self.size_px, px_mm=self.px_mm)
 
     def draw(self, count: int, seed: tuple[int, ...]) -> NDArray[np.float32]:

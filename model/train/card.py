@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 from collections.abc import Iterable, Sequence
@@ -101,25 +100,14 @@ def load_samples(folder: Path) -> Samples:
     return Samples(inputs, *(images.astype(np.float32) / np.float32(255) for images in (targets, drawn)))
 
 
-def write_curves(folder: Path, losses: Sequence[float], validations: Sequence[Sequence[float]], title: str) -> None:
-    """Write `loss.png` (the paper's figure 9), and its numbers as `loss.csv` and `validation.csv`. Raises OSError."""
-    from matplotlib.figure import Figure
-
-    steps, checks = np.arange(1, len(losses) + 1), np.reshape(validations, (-1, len(COLUMNS)))
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.semilogy(steps, losses, color="0.75", linewidth=0.6, label="each step")
-    if len(losses) > 50:
-        smooth = np.convolve(losses, np.full(50, 1 / 50), "valid")
-        left.semilogy(steps[49:], smooth, color="black", linewidth=1, label="mean of 50 steps")
-    left.set(title="(a) training loss", xlabel="step", ylabel="MSE, Eq. 6")
-    left.legend()
-    right.semilogy(checks[:, 0], checks[:, 1], color="black", marker=".", linewidth=1)
-    right.set(title="(b) validation loss", xlabel="step", ylabel="MSE")
-    figure.suptitle(title)
-    _save_figure(folder / "loss.png", figure)
-    write_whole(folder / "loss.csv", _table(("step", "loss"), zip(steps.tolist(), losses, strict=True)))
-    write_whole(folder / "validation.csv", _table(COLUMNS, validations))
+def write_curves(folder: Path, losses: Sequence[float], validations: Sequence[Sequence[float]]) -> None:
+    """Write the numbers of the paper's figure 9 as `loss.csv` and `validation.csv`. Raises OSError."""
+    for name, head, rows in (
+        ("loss.csv", ("step", "loss"), enumerate(losses, 1)),
+        ("validation.csv", COLUMNS, validations),
+    ):
+        lines = [head, *rows]
+        write_whole(folder / name, "".join(f"{','.join(map(str, line))}\n" for line in lines).encode())
 
 
 def read_curves(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -148,21 +136,9 @@ def write_pictures(path: Path, samples: Samples) -> None:
             axes[row, k].set(xticks=[], yticks=[])
     axes[0, 0].set_ylabel("target")
     axes[1, 0].set_ylabel("generator")
-    _save_figure(path, figure)
-
-
-def _save_figure(path: Path, figure: Any) -> None:
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=100)
     write_whole(path, out.getvalue())
-
-
-def _table(head: tuple[str, ...], rows: Iterable[Any]) -> bytes:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return out.getvalue().encode()
 
 
 def write_card(path: Path, config: TrainConfig, report: dict[str, Any]) -> None:
@@ -178,7 +154,7 @@ def card_text(path: Path, config: TrainConfig, report: dict[str, Any]) -> str:
         f"# {path.name}",
         "",
         f"A network that draws the press of a brush, trained on exact area coverage of the stroke model "
-        f"`{target.model.name}`{' and tuned on captured strokes' if tuning else ''}.",
+        f"`{target.model}`{' and tuned on captured strokes' if tuning else ''}.",
         "",
         f"- Content: sha256 `{sha256(path)}`",
         f"- Image: {target.size_px} x {target.size_px} px of {target.px_mm:g} mm ({side_mm:g} mm a side), ink 1 on 0, "

@@ -121,15 +121,6 @@ def checked(where: Path | str, fields: Any) -> TrainConfig:
 
 
 def differences(old: TrainConfig, new: TrainConfig) -> list[str]:
-    """List the differences between two configurations as `field: old -> new`."""
-    lines: list[str] = []
-
-    def walk(a: Any, b: Any, path: str) -> None:
-        if isinstance(a, dict) and isinstance(b, dict):
-            for key in sorted(a.keys() | b.keys()):
-                walk(a.get(key), b.get(key), f"{path}.{key}" if path else key)
-        elif a != b:
-            lines.append(f"{path}: {a} -> {b}")
-
-    walk(old.model_dump(mode="json"), new.model_dump(mode="json"), "")
-    return lines
+    """List the fields in which two configurations differ as `field: old -> new`."""
+    pairs = ((name, getattr(old, name), getattr(new, name)) for name in TrainConfig.model_fields)
+    return [f"{name}: {before} -> {after}" for name, before, after in pairs if before != after]

@@ -298,7 +298,7 @@ class _Training:
         weights = {name: np.ascontiguousarray(value.cpu().numpy()) for name, value in state.items()}
         metadata = {"format": FORMAT, "config": config.model_dump_json(), "report": json.dumps(report)}
         write_whole(path, save(weights, metadata))
-        write_curves(self.folder, self.losses, self.validations, f"CCD-BSM, seed {config.seed}")
+        write_curves(self.folder, self.losses, self.validations)
         numbers = np.linspace(0, len(self.sets[1]) - 1, min(MOST_SAMPLES, len(self.sets[1]))).round().astype(int)
         inputs, targets = self.sets[1].pick(numbers)
         save_samples(self.folder, Samples(inputs, targets, self._images(inputs)))

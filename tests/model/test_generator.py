@@ -36,7 +36,7 @@ def test_every_preset_draws_strokes_that_fit_the_image(name: str) -> None:
     target.check(inputs)
     images = target.images(inputs)
     assert images.shape == (64, 128, 128)
-    areas = target.model.profile(*inputs.T).area_mm2
+    areas = target.stroke_model.profile(*inputs.T).area_mm2
     assert (images.sum((1, 2)) * target.px_mm**2).tolist() == pytest.approx(areas.tolist(), rel=1e-3)
 
 
@@ -57,7 +57,7 @@ def test_placements_are_those_of_the_validation() -> None:
         ({"tilt_deg": (-5, 10)}, "tilt_deg = -5 is outside"),
         ({"depth_mm": (11, 60)}, "depth_mm = 60 is outside"),
         ({"lam": 30}, "less than or equal to 10"),
-        ({"model": "qbc"}, "Extra inputs are not permitted"),
+        ({"model": "spline"}, "unknown stroke model 'spline'"),
     ],
 )
 def test_a_target_that_makes_no_sense_is_refused(fields: dict, words: str) -> None:
