@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.sessions.records import Source
+from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]
 PAPER = "#fbf9f4"
@@ -30,6 +30,20 @@ BLUE, ORANGE = "#0072B2", "#D55E00"
 """Colours of Okabe and Ito for a plot's lines and points."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
 """Longest side and quality of a photograph in a page: about 500 kB at most."""
+ORIGIN = {
+    Source.LOOPBACK: "simulated brush, ink and camera; not a result on paper",
+    Source.REAL: "ink on paper, pressed by the arm named below",
+    Source.IMPORT: "not collected by brushloop; scale and commands come from their table",
+    Source.IMPORT_SIMULATED: "simulated ink, as declared when it was imported; not a result on paper",
+}
+"""Where the ink comes from."""
+MEANING = {
+    Source.LOOPBACK: "Loopback rig: the numbers test the software and the method. They say nothing about ink on paper.",
+    Source.REAL: "Real capture: the recording says so itself, and its hash is below.",
+    Source.IMPORT: "Imported photographs: scale and commands come from their table, not measured.",
+    Source.IMPORT_SIMULATED: "Imported simulation: the numbers say nothing about ink on paper.",
+}
+"""What that says about the numbers."""
 REMARK = re.compile(r"\(([^()]+)\)(?:, R = [^()]*)?$")
 """Finds the remark in brackets that ends the name of a described brush; the brush's size may follow it."""
 
@@ -52,6 +66,20 @@ def render(template: str, **values: Any) -> str:
     Names, licences and origins come from other people's files, so everything is escaped.
     """
     return _templates().get_template(template).render(**values)
+
+
+def write_page(path: Path, template: str, **values: Any) -> Path:
+    """Write a page rendered from a template; returns its path. Raises OSError."""
+    write_whole(path, render(template, **values))
+    return path
+
+
+def about(header: Header) -> dict[str, str]:
+    """The `label` and the `note` of a page about one recording."""
+    return {
+        "label": source_label(header.source, [header.brush]),
+        "note": source_note(header.source, header.brush),
+    }
 
 
 @functools.cache
@@ -85,22 +113,13 @@ def source_label(source: Source, brushes: Iterable[str] = ()) -> str:
 
     A remark is what a described brush (`brushloop sim --brush FILE`) has in brackets at the end of its name.
     """
-    found = [REMARK.search(brush) for brush in brushes] if source is Source.LOOPBACK else []
-    return ", ".join((str(source), *dict.fromkeys(f"brush {one[1]}" for one in found if one)))
+    remarks = [REMARK.search(brush) for brush in brushes] if source is Source.LOOPBACK else []
+    return ", ".join((str(source), *dict.fromkeys(f"brush {remark[1]}" for remark in remarks if remark)))
 
 
 def source_note(source: Source, brush: str = "") -> str:
     """One sentence on where the ink comes from."""
-    match source:
-        case Source.LOOPBACK:
-            remark = source_label(source, (brush,)).removeprefix(str(source))
-            return f"loopback rig: simulated brush, ink and camera; not a result on paper{remark}"
-        case Source.REAL:
-            return "real capture: ink on paper, pressed by the arm named below"
-        case Source.IMPORT:
-            return "imported photographs: not collected by brushloop; scale and commands come from their table"
-        case Source.IMPORT_SIMULATED:
-            return "imported simulation: simulated ink, as declared when it was imported; not a result on paper"
+    return f"{source}: {ORIGIN[source]}{source_label(source, (brush,)).removeprefix(str(source))}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,16 +132,7 @@ class Point:
 
 def source_point(source: Source) -> Point:
     """What the source of a recording says about its numbers."""
-    match source:
-        case Source.LOOPBACK:
-            words = "Loopback rig: the numbers test the software and the method. They say nothing about ink on paper."
-        case Source.REAL:
-            words = "Real capture: the recording says so itself, and its hash is below."
-        case Source.IMPORT:
-            words = "Imported photographs: scale and commands come from their table, not measured."
-        case Source.IMPORT_SIMULATED:
-            words = "Imported simulation: the numbers say nothing about ink on paper."
-    return Point(True if source is Source.REAL else None, words)
+    return Point(True if source is Source.REAL else None, MEANING[source])
 
 
 def png_uri(data: bytes) -> str:
@@ -179,11 +189,12 @@ def plot(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
 
 
 def dress(axis: Any, title: str, x: str, y: str = "", *, grid: str = "both", legend: bool = False) -> None:
-    """Give a plot its title, the names of its axes, and a grid."""
+    """Give a plot its title, the names of its axes, and grid lines of `both` axes, of one or of none."""
     axis.set_title(title, fontsize=10, parse_math=False)
     axis.set_xlabel(x)
     axis.set_ylabel(y)
-    axis.grid(axis=grid, alpha=0.3)
+    if grid:
+        axis.grid(axis=grid, alpha=0.3)
     if legend:
         axis.legend()
 
@@ -191,6 +202,12 @@ def dress(axis: Any, title: str, x: str, y: str = "", *, grid: str = "both", leg
 def printable(text: str) -> str:
     """A name or label for the text of a plot, with `?` for every character that no font draws."""
     return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def shortened(text: str, most: int) -> str:
+    """The text for a plot, at most so long."""
+    short = printable(text)
+    return short if len(short) <= most else f"{short[: most - 1]}…"
 
 
 def plot_uri(figure: Any) -> str:

@@ -15,22 +15,21 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX
 from brushloop.calibrate.board.lens import Floats, Gray, rms
 from brushloop.calibrate.board.pix2len import local_scale
-from brushloop.calibrate.board.spec import BoardSpec, describe
+from brushloop.calibrate.board.spec import describe
 from brushloop.calibrate.board.view import LEAST_PX_PER_MM, NO_BOARD, WORST_INTERVAL, paper_mm, sheet_of
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
     Point,
+    about,
+    dress,
     photograph_uri,
     plot,
     plot_uri,
-    render,
-    source_label,
-    source_note,
     source_point,
+    write_page,
 )
 from brushloop.calibrate.session import FITTED
 from brushloop.sessions.messages import decode_gray
@@ -57,24 +56,21 @@ def write_calibration_page(recording: Recording, path: Path) -> Path:
     dropped = np.zeros(len(size), np.bool_)
     dropped[np.argsort(-size)[: made.corners_dropped]] = True
     sheet_mm = sheet_of(recording)
-    header = recording.header
-    label = source_label(header.source, [header.brush])
-    text = render(
+    frame = about(recording.header)
+    label = frame["label"]
+    return write_page(
+        path.with_suffix(".html"),
         "calibration.html.j2",
-        session=header.session_id,
-        label=label,
-        note=source_note(header.source, header.brush),
+        **frame,
+        session=recording.header.session_id,
         picture=_picture(image, seen.pixels, expected, off, dropped, made, sheet_mm),
         verdict=list(_verdict(made)),
-        trust=[source_point(header.source), *_trust(made)],
+        trust=[source_point(recording.header.source), *_trust(made)],
         residuals=_residuals(off, dropped, label),
         scale=_scale(made, image.shape[1], image.shape[0], sheet_mm, label),
         worst=_worst(seen.ids.tolist(), size, dropped),
-        facts=list(_facts(made, made.board, path)),
+        facts=list(_facts(made, path)),
     )
-    page = path.with_suffix(".html")
-    write_whole(page, text)
-    return page
 
 
 def _photograph(recording: Recording, made: Calibration, where: str) -> Gray:
@@ -185,10 +181,7 @@ def _residuals(off: Floats, dropped: np.ndarray[Any, np.dtype[np.bool_]], label:
     axis.plot(kept[:, 0], kept[:, 1], ".", ms=4, alpha=0.6, color=ORANGE)
     axis.set_aspect("equal")
     axis.invert_yaxis()
-    axis.set_xlabel("to the right, px")
-    axis.set_ylabel("down, px")
-    axis.set_title(f"residual of each corner ({label})", fontsize=10)
-    axis.grid(alpha=0.3)
+    dress(axis, f"residual of each corner ({label})", "to the right, px", "down, px")
     return plot_uri(figure)
 
 
@@ -205,9 +198,7 @@ def _scale(made: Calibration, width: int, height: int, sheet_mm: tuple[float, fl
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
     axis.set_aspect("equal")
-    axis.set_xlabel("px")
-    axis.set_ylabel("px")
-    axis.set_title(f"mm per pixel across the photograph ({label})", fontsize=10)
+    dress(axis, f"mm per pixel across the photograph ({label})", "px", "px", grid="")
     return plot_uri(figure)
 
 
@@ -216,12 +207,12 @@ def _worst(ids: list[int], size: Floats, dropped: np.ndarray[Any, np.dtype[np.bo
     return [(str(name), f"{px:.2f}", "left out" if out else "used") for name, px, out in rows[:10]]
 
 
-def _facts(made: Calibration, board: BoardSpec, path: Path) -> Iterator[tuple[str, str]]:
+def _facts(made: Calibration, path: Path) -> Iterator[tuple[str, str]]:
     yield "session", made.session_id
     yield "source", made.source
     yield "recording", f"sha256 {made.recording_sha256}"
     yield "photograph of the board", f"sha256 {made.still_sha256}"
-    yield "board", describe(board)
+    yield "board", describe(made.board)
     yield "lens", f"{made.lens.source}; k1 {made.lens.distortion[0]:+.4f}"
     yield "95 % interval", f"{made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f} mm/px"
     yield "calibrated with", made.software

@@ -12,8 +12,17 @@ import numpy as np
 from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.intrinsics import GRID, GRID_WORDS, LensFile, residuals
 from brushloop.calibrate.board.lens import Gray, Lens, rms
-from brushloop.calibrate.files import write_whole
-from brushloop.calibrate.report import BLUE, ORANGE, Point, photograph_uri, plot, plot_uri, printable, render
+from brushloop.calibrate.report import (
+    BLUE,
+    ORANGE,
+    Point,
+    dress,
+    photograph_uri,
+    plot,
+    plot_uri,
+    printable,
+    write_page,
+)
 
 LABEL = "photographs as given"
 NOTE = "photographs do not say which camera took them, or whether they were simulated"
@@ -48,7 +57,8 @@ def write_lens_page(
     `views` are all boards that were found, by name as in `file`; `thumbnails` are of any photographs.
     """
     kept = [view for view in views if view.name in file.residuals_px]
-    text = render(
+    return write_page(
+        path.with_suffix(".html"),
         "lens.html.j2",
         label=LABEL,
         note=NOTE,
@@ -62,9 +72,6 @@ def write_lens_page(
         not_shown=max(0, len(file.photographs) - MAX_THUMBNAILS),
         facts=list(_facts(file, path)),
     )
-    page = path.with_suffix(".html")
-    write_whole(page, text)
-    return page
 
 
 def _coverage(lens: Lens, kept: Sequence[BoardView]) -> dict[str, Any]:
@@ -137,9 +144,7 @@ def _residuals(file: LensFile) -> str:
     axis.barh(range(len(rows)), [px for _, px in rows], color=colours)
     axis.set_yticks(range(len(rows)), [_short(name) for name, _ in rows], fontsize=8, parse_math=False)
     axis.axvline(file.rms_limit_px, color="0.4", lw=1.0, ls="--")
-    axis.set_xlabel("residual, px")
-    axis.set_title(f"residual of each photograph ({LABEL})", fontsize=10)
-    axis.grid(axis="x", alpha=0.3)
+    dress(axis, f"residual of each photograph ({LABEL})", "residual, px", grid="x")
     return plot_uri(figure)
 
 
@@ -161,10 +166,8 @@ def _bend(lens: Lens) -> str:
     figure, axis = plot(1, 1, (5.6, 3.2))
     axis.axhline(0.0, color="0.6", lw=0.8)
     axis.plot(radius, moved, color=BLUE, lw=1.5)
-    axis.set_xlabel("distance from the middle of the lens, px")
-    axis.set_ylabel("outward (+) or inward (−), px")
-    axis.set_title(f"how far the lens moves a point ({LABEL})", fontsize=10)
-    axis.grid(alpha=0.3)
+    title = f"how far the lens moves a point ({LABEL})"
+    dress(axis, title, "distance from the middle of the lens, px", "outward (+) or inward (−), px")
     return plot_uri(figure)
 
 

@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.score import csim
-from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
     Image,
     Point,
+    dress,
     ink_uri,
     overlay_uri,
     plot,
     plot_uri,
-    printable,
-    render,
+    shortened,
+    write_page,
 )
 from brushloop.model.generator.stroke import read_generator
 from brushloop.model.generator.targets import INPUTS
@@ -48,7 +48,8 @@ def write_training_page(folder: Path) -> Path:
     config, report = config_of(path, file), file.report
     losses, checks = read_curves(folder)
     label = config.tuning.source if config.tuning else EXACT
-    text = render(
+    return write_page(
+        folder / PAGE,
         "training.html.j2",
         label=label,
         note=_note(config),
@@ -66,9 +67,6 @@ def write_training_page(folder: Path) -> Path:
         ),
         facts=list(_facts(config, report, path)),
     )
-    page = folder / PAGE
-    write_whole(page, text)
-    return page
 
 
 def _note(config: TrainConfig) -> str:
@@ -138,11 +136,7 @@ def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str
         )
     if len(checks):
         axis.semilogy(checks[:, 0], checks[:, 1], ".-", color=ORANGE, lw=1.2, label="validation, MSE")
-    axis.set_xlabel("step")
-    axis.set_ylabel("loss")
-    axis.set_title(f"losses ({_short(label)})", fontsize=10, parse_math=False)
-    axis.grid(alpha=0.3)
-    axis.legend()
+    dress(axis, f"losses ({shortened(label, 60)})", "step", "loss", legend=True)
     return plot_uri(figure)
 
 
@@ -150,17 +144,8 @@ def _likeness(checks: NDArray[np.float64], label: str) -> str:
     figure, axis = plot(1, 1, (6.4, 3.4))
     for column, name, colour in ((3, "CSIM", BLUE), (2, "IoU", ORANGE)):
         axis.plot(checks[:, 0], 100.0 * checks[:, column], ".-", color=colour, lw=1.2, label=name)
-    axis.set_xlabel("step")
-    axis.set_ylabel("percent")
-    axis.set_title(f"likeness on held-out strokes ({_short(label)})", fontsize=10, parse_math=False)
-    axis.grid(alpha=0.3)
-    axis.legend()
+    dress(axis, f"likeness on held-out strokes ({shortened(label, 60)})", "step", "percent", legend=True)
     return plot_uri(figure)
-
-
-def _short(text: str) -> str:
-    short = printable(text)
-    return short if len(short) <= 60 else f"{short[:59]}…"
 
 
 def _numbers(report: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -156,14 +156,6 @@ def test_presses_that_this_run_scores_itself_are_not_listed_twice(
     assert [row.n for row in tables.robot_writing(scored, NORMAL)] == [10]
 
 
-def test_without_a_loop_or_characters_the_page_names_the_commands(place: Path) -> None:
-    invoke(place)
-    page = " ".join((place / "validation" / "report.html").read_text().split())
-    assert "“brushloop loop SESSION --config RIG” presses recovered strokes again" in page
-    assert "<code>brushloop write 字 --config RIG</code> writes characters" in page
-    assert not (place / "validation" / "table3.csv").exists()
-
-
 @pytest.mark.parametrize(
     ("changes", "edit", "words"),
     [
@@ -199,12 +191,6 @@ def test_a_loop_that_is_edited_or_of_something_else_is_refused_by_name(
 def test_what_is_no_loop_at_all_is_refused(place: Path, text: str) -> None:
     path = put(place / "loop", text)
     assert refused(place).startswith(f"{path}: ")
-
-
-def test_a_file_too_large_is_not_read(place: Path, a_loop: Callable[..., LoopRecord]) -> None:
-    path = put(place / "loop", a_loop().to_json() + " " * 9_000_000)
-    assert "is larger than" in refused(place, "--loop", path)
-    assert "no such file" in refused(place, "--loop", place / "nowhere.json")
 
 
 def test_table_3_has_the_papers_rows_beside_and_figure_13(lab: Path, place: Path) -> None:

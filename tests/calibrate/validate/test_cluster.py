@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -67,38 +66,6 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """For all tests here, in their order: the last of them kills a worker."""
     with cluster_of_two(tmp_path_factory.mktemp("cluster")) as made:
         yield made
-
-
-def validate(session: Path, out: Path, *more: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "brushloop", "validate", str(session), "--out", str(out), "--no-held-out", *more]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, **quiet)
-
-
-@pytest.mark.soak
-def test_two_workers_give_the_numbers_of_this_machine_also_when_one_is_lost(
-    make_session: object, tmp_path: Path
-) -> None:
-    with cluster_of_two(tmp_path) as cluster:
-        two_workers_one_of_them_lost(cluster, make_session, tmp_path)
-
-
-def two_workers_one_of_them_lost(cluster: Cluster, make_session: object, tmp_path: Path) -> None:
-    session = make_session(tmp_path, "many", repeats=5)  # pyright: ignore[reportCallIssue]
-    here = validate(session, tmp_path / "here")
-    _, errors = here.communicate()
-    assert here.returncode == 0, errors
-
-    shutil.rmtree(session / "work")
-    there = validate(session, tmp_path / "there", "--scheduler", cluster.address)
-    wait_until(lambda: len(list((session / "work").glob("*.gz"))) > 2, "the first results", process=there)
-    cluster.workers[0].kill()
-    cluster.workers[0].wait()
-    _, errors = there.communicate()
-    assert there.returncode == 0, errors
-    assert cluster.workers[0].returncode is not None
-    for name in FILES:
-        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "there" / name).read_bytes()
 
 
 def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> None:

@@ -16,8 +16,7 @@ from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.validate.inputs import FittedSession
 from brushloop.calibrate.validate.report import load_report
 from brushloop.calibrate.validate.tuning import align_captures
-from brushloop.model.ccdbsm import Brush
-from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
+from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.generator.stroke import load_generator, read_generator
 from brushloop.model.train.data import load_captures
 from brushloop.sessions.records import Source
@@ -145,11 +144,6 @@ def test_captures_go_through_the_file_into_a_tuning(
         for path in (generator, tuned / "generator.safetensors")
     )
     assert after < 0.8 * before
-
-
-def test_a_generator_for_another_brush_is_refused(generator: Path) -> None:
-    with pytest.raises(TrainError, match="was trained for a brush with radius_mm = 6, not 5"):
-        load_generator(generator, Brush(radius_mm=5.0, length_mm=48.0))
 
 
 def test_captures_of_a_described_brush_keep_its_remark() -> None:

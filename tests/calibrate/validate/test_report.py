@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 import shutil
 from pathlib import Path
@@ -133,25 +132,6 @@ def test_every_score_of_a_twin_is_labelled_as_one() -> None:
     outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], scores=[score])
     labels = {one[SCORE_COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
     assert labels == {"loopback rig, brush twin of monday, simulated"}
-
-
-def test_averages_of_the_report_are_those_of_the_scores(folder: Path, report: Report) -> None:
-    with (folder / "scores.csv").open() as file:
-        mine = [
-            float(row["ssim"])
-            for row in csv.DictReader(file)
-            if (row["model"], row["alignment"], row["tone"]) == ("ellipse", "mm", "gray")
-        ]
-    stat = report.stat("ellipse", Alignment.MM, Tone.GRAY, "ssim")
-    assert stat is not None
-    assert stat.avg == pytest.approx(100 * sum(mine) / len(mine), abs=1e-5)
-
-
-def test_json_is_printed_whole(session: Path, folder: Path) -> None:
-    ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(folder), "--json"])
-    said = json.loads(ran.stdout)
-    assert said["source"] == "imported photographs"
-    assert Report.model_validate(said).intact
 
 
 def test_an_edited_report_is_not_read(folder: Path, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app, main
 from brushloop.calibrate.session import calibrate_session
-from brushloop.calibrate.validate.inputs import open_session
 from brushloop.calibrate.validate.report import load_report
 from brushloop.sessions.records import Stroke
 from tests.calibrate.simulated_rigs import sheet
@@ -147,9 +146,3 @@ def test_without_credentials_it_says_so(
     said = refusal(monkeypatch, capsys, "validate", "s3://lab/grid-01", "--out", str(tmp_path / "out"))
     assert "credentials" in said.lower(), said
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("bucket")
-def test_it_is_fetched_once(tmp_path: Path, calibrated: Path) -> None:
-    opened = [open_session("s3://lab/grid-01", tmp_path, None, None) for _ in range(2)]
-    assert {one.sha256 for one in opened} == {hashlib.sha256((calibrated / "grid-01.mcap").read_bytes()).hexdigest()}

@@ -53,7 +53,7 @@ def test_a_url_with_its_checksum_opens_like_a_folder(session: Path, remote: str,
         opened = open_session(url, tmp_path, None, None)
         assert opened.sha256 == digest(session)
         assert len(opened.strokes) == 11
-        assert opened.kinds == {"press"}
+        assert opened.kind == "press"
 
 
 def test_the_checksum_may_lie_beside(session: Path, remote: str, tmp_path: Path) -> None:
@@ -123,11 +123,6 @@ def test_a_recording_larger_than_allowed_is_refused(
     monkeypatch.setattr(inputs, "MAX_DOWNLOAD_BYTES", 1000)
     with pytest.raises(CalibrationError, match="larger than 1000 bytes"):
         open_session(f"{remote}#sha256={digest(session)}", tmp_path, None, None)
-
-
-def test_a_file_url_is_a_url_too(session: Path, tmp_path: Path) -> None:
-    url = f"file://{session / 'presses.mcap'}#sha256={digest(session)}"
-    assert len(open_session(url, tmp_path, None, None).strokes) == 11
 
 
 @contextmanager
