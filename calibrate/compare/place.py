@@ -209,36 +209,22 @@ def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
     return prepare(raster, None, capture.where, Params(**(calibration.preprocess | whole)))
 
 
-def captured_images(stroke_id: str, prepared: Prepared) -> dict[Key, Image]:
-    """A prepared press in every alignment and tone, (128, 128) each. Raises `CaptureRefused` if one would be blank."""
-    images: dict[Key, Image] = {}
-    for alignment, tone in KEYS:
-        image = (captured_mm if alignment is Alignment.MM else captured_normalised)(prepared, tone)
-        if not to_pixels(image).any():
-            raise CaptureRefused(stroke_id, f"is too thin to be seen at the scale of {alignment} ({tone})")
-        images[alignment, tone] = image
-    return images
-
-
 def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
     """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.ccdbsm.DomainError`."""
-    gray = drawn(model.profile(depth_mm, tilt_deg), axis_mm(depth_mm, tilt_deg), field)
+    return images_of(model.profile(depth_mm, tilt_deg), axis_mm(depth_mm, tilt_deg), field)
+
+
+def images_of(mark: Outline, origin_x_mm: float, field: Field) -> dict[Key, Image]:
+    """A mark in every alignment and tone, (128, 128) each.
+
+    `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
+    """
+    gray = drawn(mark, origin_x_mm, field)
     return {(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS}
 
 
-def simulated_pixels(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> Pixels:
-    """(len(KEYS), 128, 128) predictions of a press. May raise `model.ccdbsm.DomainError`."""
-    return key_pixels(simulated(model, depth_mm, tilt_deg, field))
-
-
-def loop_pixels(loop: Outline, field: Field) -> Pixels:
-    """(len(KEYS), 128, 128) of a mark whose x is from the zero-touch point."""
-    gray = drawn(loop, 0.0, field)
-    return key_pixels({(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS})
-
-
-def key_pixels(images: dict[Key, Image]) -> Pixels:
-    """Images of every key as levels, (len(KEYS), 128, 128)."""
+def levels_of(images: dict[Key, Image]) -> Pixels:
+    """Images of every key in 256 levels, (len(KEYS), 128, 128)."""
     return np.stack([to_pixels(images[key]) for key in KEYS])
 
 

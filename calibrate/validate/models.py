@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.paper import ROBOT_WRITING
-from brushloop.calibrate.compare.place import Field, Pixels, brush_of, loop_pixels, simulated_pixels
+from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of, levels_of, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.heldout import RefittedBezier
 from brushloop.calibrate.stats import CEILING
@@ -166,7 +166,7 @@ def held_out(fits: Mapping[Condition, Refitted], view: Field, *, fitted: bool) -
         return refitted
 
     def drawn(part: str) -> Callable[[Condition], Pixels]:
-        return lambda at: loop_pixels(of(at, part).outline(at.depth_mm, at.tilt_deg), view)
+        return lambda at: levels_of(images_of(of(at, part).outline(at.depth_mm, at.tilt_deg), 0.0, view))
 
     bezier = ModelInfo(
         name=BEZIER_REFITTED,
@@ -196,9 +196,11 @@ def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field, number: in
         "CCD-BSM that was fitted to them, if there is a fit; its outline.",
         basis=HELD_OUT,
     )
-    return Model(info, lambda at: simulated_pixels(loaded[files[at]], at.depth_mm, at.tilt_deg, view))
+    return Model(info, lambda at: levels_of(simulated(loaded[files[at]], at.depth_mm, at.tilt_deg, view)))
 
 
 def _of_model(model: StrokeModel, basis: str, view: Field, **changes: str) -> Model:
     info = ModelInfo(name=model.name, label=model.label, definition=model.definition, basis=basis)
-    return Model(info.model_copy(update=changes), lambda at: simulated_pixels(model, at.depth_mm, at.tilt_deg, view))
+    return Model(
+        info.model_copy(update=changes), lambda at: levels_of(simulated(model, at.depth_mm, at.tilt_deg, view))
+    )

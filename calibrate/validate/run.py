@@ -12,8 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, brush_of, loop_pixels, pack, unpack
-from brushloop.calibrate.compare.place import to_pixels as levels
+from brushloop.calibrate.compare.place import (
+    KEYS,
+    Alignment,
+    Field,
+    Tone,
+    brush_of,
+    images_of,
+    levels_of,
+    pack,
+    to_pixels,
+    unpack,
+)
 from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.captures import Pressed, grid_of
@@ -145,7 +155,7 @@ def _rows(
     """Yield the presses of a session that can be compared."""
     name, left_out = session.header.session_id, list[tuple[str, str]]()
     for press in read_presses(session, view, left_out, uncommanded, too_thin, scheduler=scheduler, progress=progress):
-        packed = pack(np.stack([levels(image) for image in (*press.images.values(), press.coverage)]))
+        packed = pack(np.stack([to_pixels(image) for image in (*press.images.values(), press.coverage)]))
         yield Row(name, press.stroke, press.condition, press.measured, press.cut, packed)
     refused += (Refused(name, *reason) for reason in left_out)
 
@@ -331,7 +341,7 @@ def _on_others(
 ) -> list[Values]:
     """(2,) CSIM and SSIM in millimetres, binary, of each row."""
     cells = {row.condition for row in rows}
-    images = {at: pack(loop_pixels(model.outline(at.depth_mm, at.tilt_deg), view)) for at in cells}
+    images = {at: pack(levels_of(images_of(model.outline(at.depth_mm, at.tilt_deg), 0.0, view))) for at in cells}
     jobs = [ScoreJob(row.packed, ((images[row.condition],),)) for row in rows]
     unique = {job.key: job for job in jobs}
     results = dict(finished(scheduler, session.store, score_job, unique.items()))

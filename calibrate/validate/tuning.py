@@ -37,7 +37,6 @@ from brushloop.sessions.terminal import Progress
 if TYPE_CHECKING:
     from brushloop.model.train.train import Validation
 
-MAX_STROKES = 100_000
 FOLDS = 5
 """Number of folds: cells are left out by fifths, since a tuning takes a minute."""
 LEARNING_RATE = 2e-3
@@ -93,8 +92,6 @@ def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedS
                 continue
             aligned.inputs.append(values)
             aligned.cells.append(Condition(stroke.depth_mm, stroke.tilt_deg))
-            if len(aligned.cells) > MAX_STROKES:
-                raise CalibrationError(str(session.recording.path), f"more than {MAX_STROKES} strokes to tune on")
     return aligned
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, pack, simulated, simulated_pixels
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, levels_of, pack, simulated
 from brushloop.calibrate.pool import threads
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.calibrate.scores import Row, Scores
@@ -46,7 +46,7 @@ def packed(page: np.ndarray) -> bytes:
 
 def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:
     """(KEYS, 2) scores of every model's press of that command."""
-    images = tuple((pack(simulated_pixels(model, depth_mm, tilt_deg, Field())),) for model in MODELS.values())
+    images = tuple((pack(levels_of(simulated(model, depth_mm, tilt_deg, Field()))),) for model in MODELS.values())
     return dict(zip(MODELS, score_job(ScoreJob(packed(page), images))["values"], strict=True))
 
 
