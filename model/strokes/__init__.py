@@ -20,6 +20,8 @@ from brushloop.model.outline import Outline
 # The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
 DEPTHS = tuple(depth_mm / 48 for depth_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
 TILTS_DEG = (0.0, 5.0, 10.0)
+Profile = Callable[[Array, Array], Outline]
+"""Outlines of presses to depths H in mm at tilts alpha in deg, scalars or (B,); may raise DomainError."""
 
 
 class UnknownModelError(LookupError):
@@ -41,8 +43,7 @@ class StrokeModel:
     """The name as a report prints it."""
     definition: str
     """What the shape is, in one sentence."""
-    profile: Callable[[Array, Array], Outline]
-    """Outlines of presses to depths H in mm at tilts alpha in deg, scalars or (B,); may raise DomainError."""
+    profile: Profile
     fitted: bool = False
     """Whether any parameter was fitted to captures; a report must state this with each score."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from brushloop.model.arrays import Array, library, like
 from brushloop.model.ccdbsm import CcdBsm
 from brushloop.model.outline import Outline, closed, rounded
-from brushloop.model.strokes import Basis, StrokeModel
+from brushloop.model.strokes import Basis, Profile, StrokeModel
 
 BEZIER_PIECES = 128
 """Parabolas per side of a Bezier stroke: the error is below 1e-6 of a pixel for strokes of the default image."""
@@ -22,21 +22,36 @@ BEZIER_PIECES = 128
 
 def models(basis: Basis) -> tuple[StrokeModel, ...]:
     """CCD-BSM, the bounding ellipse of its mark, a circle, a line, and a Bezier stroke regressed on its marks."""
-    sizes = basis.regressed(bezier_sizes)
-    half = f"Half an ellipse at the heel and two parabolas to the tip (Eq. 1-5), dilation {basis.lam:.4g}."
-    regressed = "Two mirrored cubic Bezier curves; tip, belly, base and shoulder are regressed on (H, alpha) "
-    regressed += "from CCD-BSM's marks at the paper's 15 cells."
-    box = "The bounding ellipse of the CCD-BSM mark: same length and width."
-    disc = "The circle whose diameter is the length of the CCD-BSM mark."
-    capsule = "The capsule with the length and width of the CCD-BSM mark."
-    mark, fitted = basis.mark, basis.fitted
-    return (
-        StrokeModel("ccd-bsm", "CCD-BSM", half, lambda h, a: mark(h, a).outline(), fitted),
-        StrokeModel("bezier", "Bezier", regressed, lambda h, a: bezier(**sizes(h, a)), fitted),
-        StrokeModel("ellipse", "ellipse", box, lambda h, a: bounding_ellipse(mark(h, a)), fitted),
-        StrokeModel("circle", "circle", disc, lambda h, a: circle(mark(h, a)), fitted),
-        StrokeModel("line", "line", capsule, lambda h, a: line(mark(h, a)), fitted),
-    )
+    sizes, mark = basis.regressed(bezier_sizes), basis.mark
+    shapes: dict[str, tuple[str, str, Profile]] = {
+        "ccd-bsm": (
+            "CCD-BSM",
+            f"Half an ellipse at the heel and two parabolas to the tip (Eq. 1-5), dilation {basis.lam:.4g}.",
+            lambda h, a: mark(h, a).outline(),
+        ),
+        "bezier": (
+            "Bezier",
+            "Two mirrored cubic Bezier curves; tip, belly, base and shoulder are regressed on (H, alpha) "
+            "from CCD-BSM's marks at the paper's 15 cells.",
+            lambda h, a: bezier(**sizes(h, a)),
+        ),
+        "ellipse": (
+            "ellipse",
+            "The bounding ellipse of the CCD-BSM mark: same length and width.",
+            lambda h, a: bounding_ellipse(mark(h, a)),
+        ),
+        "circle": (
+            "circle",
+            "The circle whose diameter is the length of the CCD-BSM mark.",
+            lambda h, a: circle(mark(h, a)),
+        ),
+        "line": (
+            "line",
+            "The capsule with the length and width of the CCD-BSM mark.",
+            lambda h, a: line(mark(h, a)),
+        ),
+    }
+    return tuple(StrokeModel(name, *shape, basis.fitted) for name, shape in shapes.items())
 
 
 def ellipse(centre_mm: Array, semi_x_mm: Array, semi_y_mm: Array) -> Outline:
