@@ -44,7 +44,7 @@ bench: $(STAMP)-dev  ## speed and memory beside named peers, some 25 minutes, ke
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m bench --table
 
 docs: $(STAMP)-dev  ## the documentation as a site, in build/site/index.html; warnings are errors
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 soak: $(STAMP)-dev  ## long kill and load loops, and property tests on new examples
 	$(BIN)/python -m pytest -m soak --timeout 3600

@@ -81,9 +81,10 @@ def test_the_moving_picture_is_made_of_the_pictures_of_the_screens() -> None:
 
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs")
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
+    # Not --quiet: with it mkdocs counts no warnings, and being strict means nothing.
+    command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(tmp_path / "site")]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+    assert ran.returncode == 0, ran.stderr
     page = (tmp_path / "site" / "reference" / "commands.html").read_text(encoding="utf-8")
     assert "brushloop sessions export" in page
     pages = "".join(path.read_text(encoding="utf-8") for path in (tmp_path / "site").rglob("*.html"))
