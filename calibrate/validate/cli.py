@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
-
-if TYPE_CHECKING:
-    from brushloop.calibrate.validate.diff import Difference
-
 
 app = typer.Typer(
     cls=PathOrCommand,
@@ -104,14 +100,9 @@ def diff(
 
     difference = compare(before, after)
     if json:
-        from dataclasses import asdict
-        from json import dumps
-
-        changes = [asdict(change) | {"verdict": change.verdict} for change in difference.changes]
-        said = {"paired_by": difference.paired_by, "source": difference.before.label, "changes": changes}
-        say(*dumps(said, indent=1, ensure_ascii=False).split("\n"))
-        return
-    _print_difference(difference)
+        say(*difference.to_json().split("\n"))
+    else:
+        say(*difference.sentences(), difference.table())
 
 
 @app.command()
@@ -148,28 +139,3 @@ def captures(
     if cells:
         say(f"left out, as requested: {len(aligned.cells) - count} presses of {len(cells)} cells")
     say(f"{count} presses ({aligned.source}): {out}")
-
-
-def _print_difference(difference: Difference) -> None:
-    from rich.table import Table
-
-    from brushloop.calibrate.validate.diff import sentences
-
-    say(*sentences(difference))
-    title = f"after minus before, points of percent ({difference.before.label})"
-    out = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
-    for change in difference.changes:
-        name, alignment, tone, measure = change.series
-        span = change.test.interval
-        out.add_row(
-            name,
-            f"{alignment}, {tone}",
-            measure.upper(),
-            f"{change.before:.2f}",
-            f"{change.after:.2f}",
-            f"{change.test.mean:+.3f}",
-            "" if span is None else f"{span[0]:+.2f} to {span[1]:+.2f}",
-            f"{change.p_holm:.3f}",
-            change.verdict,
-        )
-    say(out)

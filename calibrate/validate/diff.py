@@ -7,21 +7,21 @@ options); the averages of the same cell in two sessions.
 from __future__ import annotations
 
 import csv
-import hashlib
+import json
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.table import Table
 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import Paired, holm, paired
-from brushloop.calibrate.validate.report import Report, load_report
-from brushloop.sessions.disk import as_text
+from brushloop.calibrate.validate.report import MEASURES, Report, load_report
+from brushloop.sessions.disk import as_text, file_sha256
 
 SIGNIFICANT = 0.05
-MEASURES = ("csim", "ssim")
 Series = tuple[str, str, str, str]
 """Model, alignment, tone, measure."""
 Strokes = dict[tuple[str, ...], float]
@@ -62,6 +62,44 @@ class Difference:
     """Models that only one of the two reports has."""
     only_after: list[str]
 
+    def sentences(self) -> Iterator[str]:
+        """What is compared."""
+        named = [", ".join(session.session_id for session in side.sessions[:4]) for side in (self.before, self.after)]
+        versions = [side.software.get("brushloop", "?") for side in (self.before, self.after)]
+        yield f"Before: {named[0]}, brushloop {versions[0]}. After: {named[1]}, {versions[1]}."
+        what = "the same stroke" if self.paired_by == "stroke" else "the average of the same (H, α)"
+        test = self.changes[0].test
+        yield (
+            f"Paired by {what}, n = {test.n} in {test.groups} cells; p by flipping the signs of whole cells, corrected "
+            f"by Holm for {len(self.changes)} series ({self.before.label})."
+        )
+        if self.paired_by == "cell":
+            yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
+        if self.only_before:
+            yield f"Only before: {', '.join(self.only_before)}."
+        if self.only_after:
+            yield f"Only after: {', '.join(self.only_after)}."
+
+    def table(self) -> Table:
+        """The changes, for the terminal."""
+        title = f"after minus before, points of percent ({self.before.label})"
+        table = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
+        for change in self.changes:
+            name, alignment, tone, measure = change.series
+            span = change.test.interval
+            table.add_row(
+                *(name, f"{alignment}, {tone}", measure.upper(), f"{change.before:.2f}", f"{change.after:.2f}"),
+                *(f"{change.test.mean:+.3f}", "" if span is None else f"{span[0]:+.2f} to {span[1]:+.2f}"),
+                *(f"{change.p_holm:.3f}", change.verdict),
+            )
+        return table
+
+    def to_json(self) -> str:
+        """Every series, as text."""
+        changes = [asdict(change) | {"verdict": change.verdict} for change in self.changes]
+        contents = {"paired_by": self.paired_by, "source": self.before.label, "changes": changes}
+        return json.dumps(contents, indent=1, ensure_ascii=False)
+
 
 def compare(before: Path, after: Path) -> Difference:
     """Compare two reports, or two validated sessions. Raises `CalibrationError` if they are not comparable."""
@@ -93,30 +131,29 @@ def compare(before: Path, after: Path) -> Difference:
     return Difference(a, b, "stroke" if by_stroke else "cell", changes, *only)
 
 
-def report_path(given: Path) -> Path:
+def report_path(place: Path) -> Path:
     """Find report.json: the file given, or the one in a report's or session's folder, or next to a recording.
 
     If there is none, raises `CalibrationError` that names the command to run.
     """
-    if not given.exists():
-        raise CalibrationError(str(given), "does not exist: give a report.json, or a session that was validated")
-    if given.is_file() and given.suffix == ".json":
-        return given
+    if not place.exists():
+        raise CalibrationError(str(place), "does not exist: give a report.json, or a session that was validated")
+    if place.is_file() and place.suffix == ".json":
+        return place
     # Search only a recording's own folder: a report next to a session's folder may be about several sessions.
-    folder = given.parent if given.is_file() else given
-    for place in (folder / "report.json", folder / "validation" / "report.json"):
-        if place.is_file():
-            return place
-    why = f"was not validated: run `brushloop validate {shlex.quote(str(given))}` first, or give a report.json"
-    raise CalibrationError(str(given), why)
+    folder = place.parent if place.is_file() else place
+    for path in (folder / "report.json", folder / "validation" / "report.json"):
+        if path.is_file():
+            return path
+    why = f"was not validated: run `brushloop validate {shlex.quote(str(place))}` first, or give a report.json"
+    raise CalibrationError(str(place), why)
 
 
 def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
     """Read scores by cell, recording and stroke, or averaged by cell. Raises `CalibrationError` for an edited table."""
     table = path.with_name("scores.csv")
     try:
-        with table.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        digest = file_sha256(table)
     except OSError as error:
         raise CalibrationError(str(table), error.strerror or str(error)) from None
     if digest != report.scores_sha256:
@@ -132,24 +169,3 @@ def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, 
                 total, count = series.get(key, (0.0, 0))
                 series[key] = total + float(row[measure]), count + 1
     return {name: {key: total / count for key, (total, count) in series.items()} for name, series in sums.items()}
-
-
-def sentences(found: Difference) -> Iterator[str]:
-    """Sentences that say what is compared."""
-    versions = [side.software.get("brushloop", "?") for side in (found.before, found.after)]
-    yield f"Before: {_named(found.before)}, brushloop {versions[0]}. After: {_named(found.after)}, {versions[1]}."
-    what = "the same stroke" if found.paired_by == "stroke" else "the average of the same (H, α)"
-    yield (
-        f"Paired by {what}, n = {found.changes[0].test.n} in {found.changes[0].test.groups} cells; p by flipping the "
-        f"signs of whole cells, corrected by Holm for {len(found.changes)} series ({found.before.label})."
-    )
-    if found.paired_by == "cell":
-        yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
-    if found.only_before:
-        yield f"Only before: {', '.join(found.only_before)}."
-    if found.only_after:
-        yield f"Only after: {', '.join(found.only_after)}."
-
-
-def _named(report: Report) -> str:
-    return ", ".join(session.session_id for session in report.sessions[:4])
