@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.compare.score import csim
-from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, predictor
 from brushloop.calibrate.fit.run import Fitted
@@ -18,13 +17,13 @@ from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
     Point,
+    about,
+    dress,
     ink_uri,
     plot,
     plot_uri,
-    render,
-    source_label,
-    source_note,
     source_point,
+    write_page,
 )
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
 from brushloop.model.ccdbsm import DomainError
@@ -41,30 +40,27 @@ COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 def write_fit_page(captures: Captures, fitted: Fitted, path: Path) -> Path:
     """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
     header = captures.header
-    label = source_label(header.source, [header.brush])
+    frame = about(header)
     cells = by_cell(captures.strokes)
     published = FittedPress(captures.radius_mm, captures.length_mm)
     step = max(1, -(-len(cells) // MAX_CELLS))
-    text = render(
+    return write_page(
+        path.with_suffix(".html"),
         "fit.html.j2",
+        **frame,
         session=header.session_id,
-        label=label,
-        note=source_note(header.source, header.brush),
         window=_window(captures, (fitted.press, published)),
         cells=[_cell(cell, cells[cell], fitted.press, published, captures.grid) for cell in list(cells)[::step]],
         left_out=len(cells) - len(range(0, len(cells), step)),
         verdict=list(_verdict(captures, fitted, len(cells))),
         trust=[source_point(header.source), *_trust(captures, fitted)],
-        sizes=_sizes(captures, fitted.press, label),
+        sizes=_sizes(captures, fitted.press, frame["label"]),
         measured=fitted.sizes,
         middle="{:g} mm, {:g}°".format(*middle(captures.strokes)),
         held_out=fitted.held_out,
         refused=captures.refused,
         facts=[(name, text) for name, text in _facts(captures, fitted, path) if text],
     )
-    page = path.with_suffix(".html")
-    write_whole(page, text)
-    return page
 
 
 def _window(captures: Captures, presses: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
@@ -145,10 +141,7 @@ def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
             axis.plot(seen[:, 0], seen[:, 1 + column], "o", ms=4, alpha=0.7, color=colour)
             axis.plot(heights, drawn[:, column], color=colour, lw=1.5, label=f"α {tilt:g}°")
     for axis, what in zip(axes, ("length", "width"), strict=True):
-        axis.set_xlabel("commanded depth H, mm")
-        axis.set_ylabel(f"{what} of the mark, mm")
-        axis.set_title(f"{what} ({label})", fontsize=10)
-        axis.grid(alpha=0.3)
+        dress(axis, f"{what} ({label})", "commanded depth H, mm", f"{what} of the mark, mm")
     axes[0].legend()
     return plot_uri(figure)
 

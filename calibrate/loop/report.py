@@ -32,6 +32,7 @@ from brushloop.calibrate.report import (
     BLUE,
     Point,
     Written,
+    dress,
     ink_uri,
     overlay,
     overlay_uri,
@@ -286,10 +287,7 @@ def _recovered(loop: LoopComparison, label: str) -> str:
         margin = 0.05 * (high - low) or 0.5
         axis.plot([low - margin, high + margin], [low - margin, high + margin], color="0.6", lw=1.0)
         axis.plot([x for x, _ in points], [y for _, y in points], "o", ms=4, alpha=0.6, color=BLUE)
-        axis.set_xlabel(f"commanded {name}")
-        axis.set_ylabel(f"recovered {name}")
-        axis.set_title(f"{name.split(',')[0]} ({label})", fontsize=10)
-        axis.grid(alpha=0.3)
+        dress(axis, f"{name.split(',')[0]} ({label})", f"commanded {name}", f"recovered {name}")
     return plot_uri(figure)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from brushloop.calibrate.compare.place import Alignment, Image, Tone
 from brushloop.calibrate.compare.score import SSIM_SETTINGS, Polarity
 from brushloop.calibrate.report import (
+    about,
     ink_uri,
     overlay,
     overlay_uri,
@@ -19,8 +20,6 @@ from brushloop.calibrate.report import (
     render,
     save_picture,
     show_picture,
-    source_label,
-    source_note,
     write_files,
 )
 from brushloop.calibrate.writing.compare import WritingComparison
@@ -49,8 +48,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
     picture = (folder / PICTURE).read_bytes()
     page = render(
         "written.html.j2",
-        label=source_label(written.header.source, [written.header.brush]),
-        note=source_note(written.header.source, written.header.brush),
+        **about(written.header),
         names=" ".join(one.name for one in written.characters),
         writings=sum(len(one.captured) for one in written.characters),
         model=written.plan.model,
