@@ -1,4 +1,5 @@
-"""Compiled loops of `model.drag`: the lag along a path, signed distances, and the normal equations of a fit."""
+"""Compiled loops of `model.drag` and `model.footprint`: how a brush is pulled along its path, signed distances of its
+mark, and the normal equations of a fit."""
 
 import math
 
@@ -7,6 +8,8 @@ import numpy as np
 
 _compile = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 _FAR = 6.0  # distance in edge spreads beyond which a pixel's slope is below 3e-3 of the maximum
+_SHORTEST = 0.3  # length of a footprint's stick that is pulled square across, as a share
+_STICK = 10  # values of a footprint that belong to its stick, before those of the discs
 
 
 @_compile
@@ -47,6 +50,52 @@ def follow(path, ends, p, out, starts):
         out[n, 0] = out[n - 1, 0] + p[12] * (path[last, 0] - x)
         out[n, 1] = out[n - 1, 1] + p[12] * (path[last, 1] - y)
         out[n, 2] = out[n - 1, 2] * p[13]
+
+
+@_compile
+def _quadratic(p, at, depth):
+    return p[at] + p[at + 1] * depth + p[at + 2] * depth * depth
+
+
+@_compile
+def pull(path, ends, values, out):
+    """Fill `out` with three discs (x, y, half width) for every node of paths of x, y, depth, heading in deg.
+
+    `values` (paths, 28) are those of the footprint that follows each path, in the order of `model.footprint.NAMES`.
+    """
+    for i in range(len(ends) - 1):
+        first, last = ends[i], ends[i + 1]
+        p = values[i]
+        turn = math.radians(path[first, 3])
+        depth, travel = path[first, 2], 0.0
+        back = _quadratic(p, 3, depth)
+        x = path[first, 0] - back * math.cos(turn)
+        y = path[first, 1] - back * math.sin(turn)
+        for k in range(first, last):
+            before, depth, askew = depth, path[k, 2], 0.0
+            if depth > before:
+                slid = _quadratic(p, 3, depth) - _quadratic(p, 3, before)
+                x -= slid * math.cos(turn)
+                y -= slid * math.sin(turn)
+            dx, dy = path[k, 0] - x, path[k, 1] - y
+            far = math.sqrt(dx * dx + dy * dy)
+            pulled = far - max(_quadratic(p, 0, depth), 0.05)
+            if pulled > 0.0:
+                x += pulled * dx / far
+                y += pulled * dy / far
+                toward = math.atan2(dy, dx)
+                askew = (toward - turn + math.pi) % (2.0 * math.pi) - math.pi
+                askew *= math.exp(-pulled / max(p[6] + p[7] * depth, 0.05))
+                turn = toward - askew
+            if k > first:
+                travel += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+            cos, sin = math.cos(turn), math.sin(turn)
+            length = max(_SHORTEST, math.cos(askew))
+            for j in range(3):
+                ahead = length * _quadratic(p, _STICK + 6 * j, depth)
+                out[3 * k + j, 0] = x + cos * ahead - sin * p[8]
+                out[3 * k + j, 1] = y + sin * ahead + cos * p[8]
+                out[3 * k + j, 2] = _quadratic(p, _STICK + 6 * j + 3, depth) - p[9] * travel
 
 
 @_compile

@@ -22,13 +22,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brushloop.model.damped import Equations, descend
-from brushloop.model.drag import distances
+from brushloop.model.drag import Drawings, Floats, Indices, distances, fit_to_ink
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 DISCS = 3
 STEP_MM = 0.5
 """Longest distance of the tip between two footprints of a mark."""
@@ -59,7 +55,6 @@ EACH_SCALE = 0.5
 """The same for footprints of single strokes, as a share."""
 SPREADS_MM = (0.8, 0.3)
 """Softness of the edge in a fit: first wide, so that ink that is far off still pulls, then narrow."""
-ROUNDS = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +96,8 @@ class Footprint:
 
 def inked(footprints: Sequence[Footprint], paths: Sequence[Floats], x_mm: Floats, y_mm: Floats) -> Floats:
     """The same as `Footprint.distance`, with a footprint for each path."""
-    made = marks([sampled(path) for path in paths], np.array([footprint.values for footprint in footprints]))
-    return distances(made.discs, made.starts, x_mm, y_mm, np.array([0, len(made.starts) - 1]))[0]
+    at = marks([sampled(path) for path in paths], np.array([footprint.values for footprint in footprints]))
+    return distances(at.discs, at.starts, x_mm, y_mm, np.array([0, len(at.starts) - 1]))[0]
 
 
 def _quadratic(of: Floats, depth_mm: Floats) -> Floats:
@@ -140,9 +135,9 @@ def marks(paths: Sequence[Floats], values: Floats) -> Marks:
 
     `values` are those of one footprint, (28,), or of one for each path, (paths, 28).
     """
-    from brushloop.model import footprint_kernel  # numba takes a fifth of a second to import
+    from brushloop.model import drag_kernel  # numba takes a fifth of a second to import
 
-    kernel: Any = footprint_kernel
+    kernel: Any = drag_kernel
     ends = np.cumsum([0, *(len(path) for path in paths)])
     discs = np.empty((int(ends[-1]) * DISCS, 3))
     each = np.ascontiguousarray(np.broadcast_to(values, (len(paths), len(NAMES))))
@@ -150,99 +145,35 @@ def marks(paths: Sequence[Floats], values: Floats) -> Marks:
     return Marks(discs, DISCS * np.arange(int(ends[-1]) + 1), ends)
 
 
-def fit_footprint(
-    paths: Sequence[Floats],
-    groups: Indices,
-    ink: NDArray[np.float32],
-    x_mm: Floats,
-    y_mm: Floats,
-    start: Footprint | None = None,
-) -> Footprint:
-    """Fit the footprint to (B, len(y_mm), len(x_mm)) images of ink.
-
-    Paths `groups[i]` to `groups[i + 1]`, each (N, 4), are the strokes of image i. From a `start`, values change half as
-    freely and only the narrow edge is used. Raises ValueError if the sizes do not match.
-    """
-    same = np.zeros(len(paths), np.int64)
+def fit_footprint(drawings: Drawings, start: Footprint | None = None) -> Footprint:
+    """Fit the footprint to drawings. From a `start`, values change half as freely and only the narrow edge is used."""
+    same = np.zeros(len(drawings.paths), np.int64)
     if start is None:
-        return _fitted(paths, groups, ink, x_mm, y_mm, START, same, 1.0, SPREADS_MM)[0]
-    return _fitted(paths, groups, ink, x_mm, y_mm, start.values, same, 0.5, SPREADS_MM[-1:])[0]
+        return _fitted(drawings, START, same, 1.0, SPREADS_MM)[0]
+    return _fitted(drawings, start.values, same, 0.5, SPREADS_MM[-1:])[0]
 
 
-def fit_each(
-    paths: Sequence[Floats],
-    groups: Indices,
-    ink: NDArray[np.float32],
-    x_mm: Floats,
-    y_mm: Floats,
-    start: Footprint,
-) -> list[Footprint]:
-    """Fit a footprint to each stroke, all near `start`; the arguments are those of `fit_footprint`."""
-    own = np.arange(len(paths))
-    return _fitted(paths, groups, ink, x_mm, y_mm, start.values, own, EACH_SCALE, SPREADS_MM[-1:])
+def fit_each(drawings: Drawings, start: Footprint) -> list[Footprint]:
+    """Fit a footprint to each stroke, all near `start`."""
+    own = np.arange(len(drawings.paths))
+    return _fitted(drawings, start.values, own, EACH_SCALE, SPREADS_MM[-1:])
 
 
 def _fitted(
-    paths: Sequence[Floats],
-    groups: Indices,
-    ink: NDArray[np.float32],
-    x_mm: Floats,
-    y_mm: Floats,
-    start: tuple[float, ...],
-    of: Indices,
-    share: float,
-    spreads_mm: Sequence[float],
+    drawings: Drawings, start: tuple[float, ...], of: Indices, share: float, spreads_mm: Sequence[float]
 ) -> list[Footprint]:
     """The footprints 0 to max(of), where number `of[i]` follows path i; values change by `share` of `SCALE`."""
-    if ink.shape != (len(groups) - 1, len(y_mm), len(x_mm)) or groups[-1] != len(paths):
-        raise ValueError(f"{len(groups) - 1} images of {len(paths)} strokes, ink {ink.shape}: not alike")
-    ways = [sampled(path) for path in paths]
+    nodes = [sampled(path) for path in drawings.paths]
     first, scale = np.array(start), share * np.array(SCALE)
-    shape = (int(of.max()) + 1, len(NAMES))
+    scaled = np.zeros((int(of.max()) + 1) * len(NAMES))
 
-    def at(scaled: Floats) -> Marks:
-        return marks(ways, (first + scale * scaled.reshape(shape))[of])
+    def values(vector: Floats) -> Floats:
+        return first + scale * vector.reshape(-1, len(NAMES))
 
-    def equations(scaled: Floats, spread_mm: float) -> Equations:
-        made = at(scaled)
-        slopes = np.zeros((len(made.discs), 3, *shape))
-        rows = np.arange(len(made.discs))
-        owner = np.repeat(of, DISCS * np.diff(made.strokes))
-        for k, unit in enumerate(np.eye(len(NAMES))):
-            changed = at(scaled + 1e-4 * np.tile(unit, shape[0])).discs
-            slopes[rows, :, owner, k] = (changed - made.discs) / 1e-4
-        flat = slopes.reshape(len(rows), 3, len(scaled))
-        found = ink_equations(made, made.strokes[groups], flat, ink, x_mm, y_mm, spread_mm)
-        cost = found.cost + 0.5 * float(scaled @ scaled)
-        return Equations(cost, found.square + np.eye(len(scaled)), found.gradient + scaled)
+    def trails_at(vector: Floats) -> tuple[Floats, Indices, Indices]:
+        at = marks(nodes, values(vector)[of])
+        return at.discs, at.starts, at.strokes[drawings.groups]
 
-    moved = np.zeros(shape[0] * shape[1])
     for spread_mm in spreads_mm:
-        moved = descend(lambda v, s=spread_mm: equations(v, s), moved, rounds=ROUNDS, most=2.0, gain=1e-3).vector
-    return [Footprint(tuple(values)) for values in (first + scale * moved.reshape(shape)).tolist()]
-
-
-def ink_equations(
-    made: Marks,
-    images: Indices,
-    slopes: Floats,
-    ink: NDArray[np.float32],
-    x_mm: Floats,
-    y_mm: Floats,
-    spread_mm: float,
-    added_mm: Floats | None = None,
-) -> Equations:
-    """Normal equations of the modelled less the given ink. `slopes` are derivatives of the discs (rows, 3, P);
-    `added_mm` (len(y_mm), len(x_mm)) is added to the signed distances."""
-    from brushloop.model import drag_kernel
-
-    kernel: Any = drag_kernel
-    count = slopes.shape[2]
-    square, gradient = np.zeros((count, count)), np.zeros(count)
-    added = np.zeros((1, *ink.shape[1:])) if added_mm is None else np.ascontiguousarray(added_mm[None], np.float64)
-    target, weights = np.ascontiguousarray(ink, np.float32), np.ones(len(ink))
-    x_mm, y_mm = np.ascontiguousarray(x_mm), np.ascontiguousarray(y_mm)
-    cost = kernel.normal_equations(
-        made.discs, made.starts, images, slopes, x_mm, y_mm, target, added, weights, spread_mm, square, gradient
-    )
-    return Equations(float(cost), np.tril(square) + np.tril(square, -1).T, gradient)
+        scaled = fit_to_ink(trails_at, scaled, drawings, spread_mm).vector
+    return [Footprint(tuple(each)) for each in values(scaled).tolist()]

@@ -1,16 +1,21 @@
-"""Drags of a session as commanded paths with their captured ink, for `calibrate.drags.fit`.
+"""Drags of a session: found in their photographs, measured, and laid with their commanded paths on one grid.
 
 The protocol in a recording holds the trajectories that were drawn. Imported photographs come with numbers:
 `length_mm` along x from the start, a depth (`depth_mm`, ...), and optionally `bend_mm` (the distance of both inner
 control points of a cubic Bezier curve to the left of the line) and the depth at both ends, reached from the middle
 over a third of the length: `depth_ends_mm`, or `z_frac_ends`, as a share of the travel like `z_frac_mid`.
+
+A stroke with a defect (torn into parts, hollow, under glare) is still used. Its parts lie farther apart than drops
+beside a press, so more of them are taken for the stroke. A press model does not predict a drag. Both depend on how wide
+the brush opens at a depth, so the fitted slope of width against depth can be compared with the one that CCD-BSM gives.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,68 +25,72 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import prepare_cell
-from brushloop.calibrate.drags.measure import FLAGGED_WEIGHT, LENGTH_NAME, depth_of, prepare_drag
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import calibration_of
-from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stats import Line, fit_line
+from brushloop.calibrate.stroke.measure import Measured, measure, outline
+from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params
+from brushloop.calibrate.stroke.preprocess import Prepared, components, fill_holes, preprocess, touches_edge
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
+from brushloop.model.drag import Drawings, Floats
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Header, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
-Floats = NDArray[np.float64]
 MARGIN_MM = 16.0
 """Margin around an imported stroke's path: wider than any mark."""
 NODES = 28
-COMMANDS = ("length_mm", "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
+LENGTH_NAME = "length_mm"
+DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal")
+COMMANDS = (LENGTH_NAME, "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
 ENDS, SHARE_ENDS, SHARE_MID = "depth_ends_mm", "z_frac_ends", "z_frac_mid"
+JOIN_MM = 6.0
+"""Parts this close to the stroke belong to it."""
+TORN_SHARE = 0.03
+"""Share of the ink outside the largest part from which a stroke is torn."""
+HOLLOW_SHARE = 0.75
+"""Share of its outline that ink covers, below which a stroke is hollow: dry bristles, or glare on wet ink."""
+FLAGGED_WEIGHT = 0.3
+"""Weight in a fit of a stroke with any of these defects: its shape says less about the brush."""
+THUMB_PX = 160
+LEVEL_DEG = 20.0
+"""Bent strokes along x have a rectangle that is a little tilted: only strokes of another direction are turned."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Drags on one grid of pixel centres, mm, y upward."""
+    """The usable drags of a session, or the figures that were drawn in it."""
 
     header: Header
     recording_sha256: str
     calibration: Calibration | None
-    x_mm: Floats
-    y_mm: Floats
-    paths: list[Floats]
-    """The paths of all images in order, (n, 4) each: x, y, depth in mm, heading in deg."""
-    groups: NDArray[np.int64]
-    """(B + 1,): paths `groups[i]` to `groups[i + 1]` are the strokes of image i."""
-    ink: NDArray[np.float32]
-    """(B, len(y_mm), len(x_mm)) from 0 to 1."""
+    drawings: Drawings
     stroke_ids: list[str]
     refused: list[tuple[str, str]]
     """(stroke, why): captures that cannot be used, or that are cut by the edge of their photograph."""
     commands: Floats | None
     """(B, 5) `COMMANDS` of imported strokes; None for figures, which no five numbers describe."""
     flags: list[tuple[str, ...]]
-    """Defects of each image (`calibrate.drags.measure.defects`)."""
+    """Defects of each image, as `defects` words them."""
     ends: str
     """The column that gave the depth at the ends; empty where there was none."""
 
     @property
-    def weights(self) -> Floats:
-        """(B,) weight of each image in a fit: flagged ones count less."""
-        return np.array([FLAGGED_WEIGHT if flags else 1.0 for flags in self.flags])
-
-    @property
     def conditions(self) -> NDArray[np.int64]:
         """(B,) number of each image's condition: its command, or the paths of its figure."""
-        commands = np.zeros((len(self.ink), 0)) if self.commands is None else self.commands
+        groups, paths = self.drawings.groups, self.drawings.paths
+        commands = np.zeros((len(groups) - 1, 0)) if self.commands is None else self.commands
         keys = [
-            b"".join(values.tobytes() for values in (command, *self.paths[begin:end]))
-            for command, begin, end in zip(commands, self.groups, self.groups[1:], strict=False)
+            b"".join(values.tobytes() for values in (command, *paths[begin:end]))
+            for command, begin, end in zip(commands, groups, groups[1:], strict=False)
         ]
         return np.unique(keys, return_inverse=True)[1]
 
     @property
     def mm_per_px(self) -> float:
         """The pixel's side."""
-        return float(self.x_mm[1] - self.x_mm[0])
+        return float(self.drawings.x_mm[1] - self.drawings.x_mm[0])
 
 
 def read_drags(
@@ -96,55 +105,40 @@ def read_drags(
     calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     figures = figures_of(recording.header) if calibration is not None else {}
     ends, travel_mm = _ends(strokes)
-    if calibration is not None:
-        x_mm, y_mm = _cell_grid(strokes, mm_per_px, where)
-    else:
-        x_mm, y_mm = _grid(strokes, mm_per_px, travel_mm, where)
-    paths: list[list[Floats]] = []
-    commands: list[tuple[float, ...]] = []
-    flags: list[tuple[str, ...]] = []
-    images: list[NDArray[np.float32]] = []
-    names: list[str] = []
+    x_mm, y_mm = (
+        _grid(strokes, mm_per_px, travel_mm, where) if calibration is None else _patch_grid(strokes, mm_per_px, where)
+    )
+    paths: list[Floats] = []
+    groups, commands = [0], list[tuple[float, ...]]()
+    flags, images, names = list[tuple[str, ...]](), list[NDArray[np.float32]](), list[str]()
     refused: list[tuple[str, str]] = []
     for capture in counted(recording.captures(), "drags read", len(strokes), progress):
-        name = capture.stroke.stroke_id
         try:
             if calibration is not None:
-                drawn, (image, found) = _figure(capture, calibration, figures, x_mm, y_mm)
+                drawn, mask, found = *_figure(capture, calibration, figures), ()
             else:
                 command = command_of(capture.stroke, travel_mm)
-                drawn, (image, found) = [commanded_path(*command[:4])], _photograph(capture, x_mm, y_mm)
+                drawn, (mask, found) = [commanded_path(*command[:4])], _photograph(capture, x_mm, y_mm)
                 commands.append(command)
         except (CaptureRefused, SessionDamaged) as error:
-            refused.append((name, error.what))
+            refused.append((capture.stroke.stroke_id, error.what))
             continue
-        paths.append(drawn)
-        images.append(image)
+        paths += drawn
+        groups.append(len(paths))
+        size = (len(x_mm), len(y_mm))
+        images.append(np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32))
         flags.append(found)
-        names.append(name)
+        names.append(capture.stroke.stroke_id)
     if not images:
         raise CalibrationError(where, f"holds no usable stroke: {refused[0][0]}: {refused[0][1]}")
-    groups = np.cumsum([0, *(len(one) for one in paths)])
-    flat = [path for one in paths for path in one]
-    return Drawn(
-        recording.header,
-        digest,
-        calibration,
-        x_mm,
-        y_mm,
-        flat,
-        groups,
-        np.array(images),
-        names,
-        refused,
-        np.array(commands) if commands else None,
-        flags,
-        ends,
-    )
+    weights = np.array([FLAGGED_WEIGHT if found else 1.0 for found in flags])
+    drawings = Drawings(paths, np.array(groups), np.array(images), x_mm, y_mm, weights)
+    known = np.array(commands) if commands else None
+    return Drawn(recording.header, digest, calibration, drawings, names, refused, known, flags, ends)
 
 
 def figures_of(header: Header) -> dict[str, list[Floats]]:
-    """Map each figure to its strokes, (n, 4) in cell coordinates, from the protocol. Raises `CalibrationError`."""
+    """The strokes (n, 4) of each figure of the recorded protocol. Raises `CalibrationError`."""
     try:
         protocol: dict[str, Any] = json.loads(header.protocol)
         return {
@@ -171,8 +165,7 @@ def command_of(stroke: Stroke, travel_mm: float | None) -> tuple[float, float, f
 
     Raises `CaptureRefused` without length or depth.
     """
-    commanded = dict(stroke.commanded)
-    depth = depth_of(stroke)
+    commanded, depth = dict(stroke.commanded), depth_of(stroke)
     if LENGTH_NAME not in commanded or depth is None:
         raise CaptureRefused(stroke.stroke_id, f"has no {LENGTH_NAME} or no depth")
     ends = commanded.get(ENDS)
@@ -180,6 +173,14 @@ def command_of(stroke: Stroke, travel_mm: float | None) -> tuple[float, float, f
         share = commanded.get(SHARE_ENDS)
         ends = depth if share is None or travel_mm is None else share * travel_mm
     return commanded[LENGTH_NAME], commanded.get("bend_mm", 0.0), depth, ends, stroke.tilt_deg or 0.0
+
+
+def depth_of(stroke: Stroke) -> float | None:
+    """The commanded depth of a stroke, mm, under whichever name its table gives it."""
+    if stroke.depth_mm is not None:
+        return stroke.depth_mm
+    commanded = dict(stroke.commanded)
+    return next((commanded[name] for name in DEPTH_NAMES if name in commanded), None)
 
 
 def _ends(strokes: list[Stroke]) -> tuple[str, float | None]:
@@ -195,9 +196,7 @@ def _ends(strokes: list[Stroke]) -> tuple[str, float | None]:
     return (SHARE_ENDS, float(np.median(travels))) if travels else ("", None)
 
 
-def _figure(
-    capture: Capture, calibration: Calibration, figures: dict[str, list[Floats]], x_mm: Floats, y_mm: Floats
-) -> tuple[list[Floats], tuple[NDArray[np.float32], tuple[str, ...]]]:
+def _figure(capture: Capture, calibration: Calibration, figures: dict[str, list[Floats]]) -> tuple[list[Floats], Mask]:
     stroke = capture.stroke
     paths = figures.get(stroke.stroke_id.rpartition("-r")[0])
     if paths is None:
@@ -207,10 +206,11 @@ def _figure(
     prepared = prepare_cell(capture, calibration)
     if prepared.cut:
         raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
-    return paths, (_shrunk(prepared.mask, x_mm, y_mm), ())
+    return paths, prepared.mask
 
 
-def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> tuple[Mask, tuple[str, ...]]:
+    """A stroke's ink, cropped to the grid, and its defects."""
     stroke = capture.stroke
     if stroke.px_per_mm is None or stroke.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no scale or no start (start_x_px, start_y_px)")
@@ -224,16 +224,39 @@ def _photograph(capture: Capture, x_mm: Floats, y_mm: Floats) -> tuple[NDArray[n
     top = round(anchor[1] - (y_mm[0] + half) * PX_PER_MM)
     height, width = (round(2 * half * len(axis) * PX_PER_MM) for axis in (y_mm, x_mm))
     pad = max(height, width) + abs(left) + abs(top)
-    mask = np.pad(whole, pad)[top + pad : top + pad + height, left + pad : left + pad + width]
-    return _shrunk(mask, x_mm, y_mm), flags
+    return np.pad(whole, pad)[top + pad : top + pad + height, left + pad : left + pad + width], flags
 
 
-def _shrunk(mask: NDArray[np.bool_], x_mm: Floats, y_mm: Floats) -> NDArray[np.float32]:
-    size = (len(x_mm), len(y_mm))
-    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
+def prepare_drag(
+    raster: Gray, anchor_px: tuple[float, float] | None, where: str, params: Params
+) -> tuple[Prepared, Mask, tuple[str, ...]]:
+    """Find a drag on its raster: its connected part, all parts of it, and its defects. It is cut if any part is.
+
+    Raises `CaptureRefused` as `prepare` does.
+    """
+    steps = preprocess(raster, anchor_px, where, params)
+    wide = replace(params, join_mm=max(params.join_mm, JOIN_MM))
+    whole = fill_holes(components(steps.ink, anchor_px, wide).mask, params)
+    glare = tuple(flag for flag in steps.prepared.flags if flag.startswith("glare"))
+    return replace(steps.prepared, cut=touches_edge(whole)), whole, (*defects(whole), *glare)
 
 
-def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
+def defects(mask: Mask) -> tuple[str, ...]:
+    """Describe what is wrong with a stroke's ink, one phrase for each defect; empty for a sound stroke."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    ink = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    count, _, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)
+    areas = np.asarray(stats[1:, cv2.CC_STAT_AREA], np.float64)
+    found: list[str] = []
+    if areas.max() < (1.0 - TORN_SHARE) * areas.sum():
+        found.append(f"torn: {count - 1} parts, the largest holds {100 * areas.max() / areas.sum():.0f} % of the ink")
+    covered = float(np.count_nonzero(ink)) / float(np.count_nonzero(outline(ink)))
+    if covered < HOLLOW_SHARE:
+        found.append(f"hollow: ink covers {100 * covered:.0f} % of the outline")
+    return tuple(found)
+
+
+def _patch_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
     sizes = {stroke.cell_mm[2:] for stroke in strokes if stroke.cell_mm is not None}
     if len(sizes) != 1:
         raise CalibrationError(where, "its figures have no cells, or cells of several sizes")
@@ -244,7 +267,10 @@ def _cell_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Flo
 
 
 def _grid(strokes: list[Stroke], mm_per_px: float, travel_mm: float | None, where: str) -> tuple[Floats, Floats]:
-    paths = list(_paths(strokes, travel_mm))
+    paths: list[Floats] = []
+    for stroke in strokes:
+        with contextlib.suppress(CaptureRefused):
+            paths.append(commanded_path(*command_of(stroke, travel_mm)[:4]))
     if not paths:
         raise CalibrationError(where, f"no stroke has {LENGTH_NAME} and a depth: its path is unknown")
     places = np.concatenate(paths)
@@ -255,9 +281,110 @@ def _grid(strokes: list[Stroke], mm_per_px: float, travel_mm: float | None, wher
     return np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64)
 
 
-def _paths(strokes: list[Stroke], travel_mm: float | None) -> Iterator[Floats]:
-    for stroke in strokes:
+@dataclass(frozen=True, slots=True)
+class Drag:
+    """One drag, with its commanded and measured values."""
+
+    stroke_id: str
+    commanded: dict[str, float]
+    measured: Measured
+    cut: bool
+    """True where the photograph cuts the stroke."""
+    flags: tuple[str, ...]
+    """Defects, as `defects` words them."""
+    thumbnail: NDArray[np.uint8]
+    """(160, 160) gray photograph with the stroke's outline drawn in."""
+
+    @property
+    def weight(self) -> float:
+        """Weight in a fit: a stroke with a defect counts less."""
+        return FLAGGED_WEIGHT if self.flags else 1.0
+
+    @property
+    def depth_mm(self) -> float | None:
+        """The commanded depth, under whichever name the source gives it."""
+        return next((self.commanded[name] for name in DEPTH_NAMES if name in self.commanded), None)
+
+
+@dataclass(slots=True)
+class DragResults:
+    """Everything that the report of an imported session needs."""
+
+    strokes: list[Drag] = field(default_factory=list[Drag])
+    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    width_on_depth: Line | None = None
+    length_on_commanded: Line | None = None
+
+
+def validate_drags(captures: Iterator[Capture], params: Params) -> DragResults:
+    """Measure every stroke, then fit width on depth and length on commanded length over those that are not cut.
+
+    Strokes with a defect count less, as in a fit.
+    """
+    results = DragResults()
+    for capture in captures:
         try:
-            yield commanded_path(*command_of(stroke, travel_mm)[:4])
-        except CaptureRefused:
-            continue
+            results.strokes.append(_measure(capture, params))
+        except (CaptureRefused, SessionDamaged) as error:
+            results.refused.append((capture.stroke.stroke_id, error.what))
+    whole = [drag for drag in results.strokes if not drag.cut]
+    deep = [(drag.depth_mm, drag.measured.mid_width_mm, drag.weight) for drag in whole if drag.depth_mm is not None]
+    results.width_on_depth = fit_line([d for d, _, _ in deep], [w for _, w, _ in deep], [w for _, _, w in deep])
+    long = [drag for drag in whole if LENGTH_NAME in drag.commanded]
+    results.length_on_commanded = fit_line(
+        [drag.commanded[LENGTH_NAME] for drag in long],
+        [drag.measured.length_mm for drag in long],
+        [drag.weight for drag in long],
+    )
+    return results
+
+
+def _measure(capture: Capture, params: Params) -> Drag:
+    stroke = capture.stroke
+    if stroke.px_per_mm is None:
+        raise CaptureRefused(stroke.stroke_id, "has no scale (px_per_mm)")
+    raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
+    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
+    prepared, _, flags = prepare_drag(raster, anchor, capture.where, params)
+    commanded = dict(stroke.commanded)
+    if stroke.depth_mm is not None:
+        commanded["depth_mm"] = stroke.depth_mm
+    if stroke.tilt_deg is not None:
+        commanded["tilt_deg"] = stroke.tilt_deg
+    # A start in the table means a commanded path, which runs along x. Scanned strokes have neither.
+    size = measure(along_axis(prepared.mask) if anchor is None else prepared.mask)
+    return Drag(stroke.stroke_id, commanded, size, prepared.cut, flags, _thumbnail(raster, prepared.mask))
+
+
+def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask turned until the stroke's longer axis, that of its smallest enclosing rectangle, is the x axis.
+
+    A mask whose axis is within `LEVEL_DEG` of x is returned as it is.
+    """
+    points = cv2.findNonZero(mask.astype(np.uint8))
+    centre, (width, height), angle = cv2.minAreaRect(points)
+    turn = angle if width >= height else angle - 90.0
+    turn = (turn + 90.0) % 180.0 - 90.0
+    if abs(turn) < LEVEL_DEG:
+        return mask
+    side = int(np.hypot(*mask.shape)) + 2
+    matrix = cv2.getRotationMatrix2D(centre, turn, 1.0)
+    matrix[:, 2] += 0.5 * side - np.array(centre)
+    turned = cv2.warpAffine(255 * mask.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_LINEAR)
+    return np.asarray(turned > 127, np.bool_)
+
+
+def _thumbnail(raster: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    side = round(1.15 * max(rows[-1] - rows[0], columns[-1] - columns[0])) + 8
+    centre = ((rows[0] + rows[-1]) // 2, (columns[0] + columns[-1]) // 2)
+    # Padded by `side`, so that a square of that size around the stroke always fits.
+    rows_shown, columns_shown = (slice(c + side // 2, c + side // 2 + side) for c in centre)
+    crop = np.pad(raster, side, mode="edge")[rows_shown, columns_shown]
+    inside = np.pad(mask.astype(np.uint8), side)[rows_shown, columns_shown]
+    small = cv2.resize(crop, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+    shape = cv2.resize(inside, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+    outline = cv2.morphologyEx((shape > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
+    small[outline & (small > 90)] = 150
+    small[outline & (small <= 90)] = 230
+    return small.astype(np.uint8)

@@ -1,7 +1,12 @@
-"""The report of drags: one self-contained HTML file, a CSV of the measurements, a terminal summary."""
+"""The report of drags: one self-contained HTML file, a CSV of the measurements, a terminal summary.
+
+With a fit of drags, of this session or another, it also holds what the fit predicts of every stroke. Scores are CSIM
+and IoU of ink as 0 or 1 at the commanded place; no shift is searched for.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import platform
 from collections.abc import Iterator
@@ -10,10 +15,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Column, Table
 
-from brushloop.calibrate.drags.measure import DEPTH_NAMES, LENGTH_NAME, DragResults
-from brushloop.calibrate.drags.predicted import OURS, Predictions
+from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.compare.score import binary_scores
+from brushloop.calibrate.drags.brush import STAMPS, DragArtefact, correction_helps, ends_sentence
+from brushloop.calibrate.drags.captures import DEPTH_NAMES, LENGTH_NAME, DragResults, Drawn, read_drags
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
@@ -25,17 +33,130 @@ from brushloop.calibrate.report import (
     source_note,
     write_files,
 )
-from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
+from brushloop.model.drag import Floats
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Header
+from brushloop.sessions.terminal import Progress, unseen
 
 MAX_THUMBNAILS = 60
 MAX_WORST = 12
+OURS, LAG = "predicted", "bristle lag alone"
 LIMITS = (
     "These strokes travel along the paper, and the radius and bundle length of their brush are not known. CCD-BSM "
     "describes one vertical press, so its length, outline, CSIM and SSIM cannot be compared with these strokes and "
     "are not given. What can be compared is how the width grows with depth."
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Predictions:
+    """Every usable stroke of a session beside its predictions, and the fit that predicted it."""
+
+    artefact: DragArtefact
+    drawn: Drawn
+    scores: dict[str, Floats]
+    """(n, 2) CSIM and IoU by row of the report; NaN where a stroke has none."""
+    seen: NDArray[np.bool_]
+    """(n, rows, columns) predicted ink."""
+    fitted: NDArray[np.bool_]
+    """(n,) whether the fit was fitted to the stroke."""
+    corrected: bool = True
+    """Whether the correction was used, as the strokes of the session that were seen decide."""
+
+    @property
+    def scored(self) -> NDArray[np.int64]:
+        """The strokes that the means are over: those that the fit has not seen, or all if it has seen all."""
+        return np.flatnonzero(~self.fitted | self.fitted.all())
+
+    def means(self) -> dict[str, tuple[float, float, float, int]]:
+        """Mean CSIM, mean IoU, standard deviation of CSIM and number of strokes by row of the report."""
+        found: dict[str, tuple[float, float, float, int]] = {}
+        for name, scores in self.scores.items():
+            each = scores[self.scored]
+            each = each[np.isfinite(each[:, 0])]
+            if len(each):
+                found[name] = (float(each[:, 0].mean()), float(each[:, 1].mean()), float(each[:, 0].std()), len(each))
+        return found
+
+    def rows(self) -> Iterator[tuple[str, float, float, bool, str]]:
+        """Stroke, CSIM, IoU, whether it was fitted, and its flags."""
+        for k, name in enumerate(self.drawn.stroke_ids):
+            csim, iou = self.scores[OURS][k].tolist()
+            yield name, csim, iou, bool(self.fitted[k]), "; ".join(self.drawn.flags[k])
+
+    def worst(self) -> list[int]:
+        """Positions of the strokes with the lowest CSIM among those scored, the worst first."""
+        return sorted(self.scored.tolist(), key=lambda k: self.scores[OURS][k, 0])[:MAX_WORST]
+
+    def to_json(self) -> str:
+        """All scores as JSON, with where ink and fit come from."""
+        header, fit, drawn = self.drawn.header, self.artefact, self.drawn
+        table = {
+            name: {"csim": round(csim, 6), "iou": round(iou, 6), "csim_sd": round(sd, 6), "strokes": n}
+            for name, (csim, iou, sd, n) in self.means().items()
+        }
+        rows: list[dict[str, object]] = [
+            {
+                "stroke_id": name,
+                "in_sample": bool(self.fitted[k]),
+                "flags": list(drawn.flags[k]),
+                "scores": {
+                    row: {"csim": round(float(scores[k, 0]), 6), "iou": round(float(scores[k, 1]), 6)}
+                    for row, scores in self.scores.items()
+                    if np.isfinite(scores[k, 0])
+                },
+            }
+            for k, name in enumerate(drawn.stroke_ids)
+        ]
+        contents: dict[str, object] = {
+            "session_id": header.session_id,
+            "source": str(header.source),
+            "recording_sha256": drawn.recording_sha256,
+            "fit": fit.digest,
+            "fit_session": fit.session_id,
+            "fit_source": fit.source,
+            "prior": fit.prior,
+            "mm_per_px": fit.mm_per_px,
+            "depth_at_the_ends": drawn.ends,
+            "in_sample": bool(self.fitted.all()),
+            "over_all": table,
+            "left_out": [{"stroke_id": name, "why": why} for name, why in drawn.refused],
+            "strokes": rows,
+        }
+        return json.dumps(contents, indent=1, ensure_ascii=False) + "\n"
+
+
+def predict_session(
+    session: Path, fit: Path, calibration: Path | None = None, progress: Progress = unseen
+) -> Predictions:
+    """Predict every usable stroke of a session. Raises `CalibrationError` for a file that is no fit of drags."""
+    artefact = load_artefact(fit, DragArtefact)
+    drawn = read_drags(session, artefact.mm_per_px, calibration, progress)
+    predictor, every = artefact.predictor(str(fit), drawn.recording_sha256), np.arange(len(drawn.stroke_ids))
+    truth = drawn.drawings.ink > 0.5
+    own = artefact.recording_sha256 == drawn.recording_sha256
+    fitted = np.array([own and name in artefact.fitted_strokes for name in drawn.stroke_ids])
+    corrected, alone = predictor.ink_both_ways(drawn, every)
+    helps = not artefact.prior or correction_helps(corrected[fitted], alone[fitted], truth[fitted])
+    seen = corrected if helps else alone
+    scores = {OURS: binary_scores(seen, truth)}
+    if predictor.correction is not None and drawn.commands is not None:
+        scores[LAG] = binary_scores(alone, truth)
+    scores[STAMPS] = binary_scores(artefact.stamps.predictor().ink(drawn, every), truth)
+    if drawn.commands is not None:
+        scores[CEILING] = _ceiling(drawn.conditions, truth)
+    return Predictions(artefact, drawn, scores, seen, fitted, helps)
+
+
+def _ceiling(conditions: NDArray[np.int64], truth: NDArray[np.bool_]) -> Floats:
+    """(n, 2) `ceiling_values` of CSIM and IoU, from 0 to 1; NaN for a stroke whose command was not repeated."""
+    pairs = np.full((len(truth), 2), np.nan)
+    for number in np.unique(conditions):
+        at = np.flatnonzero(conditions == number)
+        alike = truth[at]
+        pairs[at] = pair_means(len(at), lambda k, others, a=alike: binary_scores(a[others], a[[k] * len(others)]))
+    return 0.01 * np.apply_along_axis(ceiling_values, 0, 100.0 * pairs, conditions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +192,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         flagged=[(d.stroke_id, "; ".join(d.flags)) for d in results.strokes if d.flags],
         predictions=validation.predictions,
         predicted_by=list(prediction_sentences(validation.predictions)) if validation.predictions else [],
-        worst=_worst(validation.predictions) if validation.predictions else [],
+        worst=list(_worst(validation.predictions)) if validation.predictions else [],
     )
     files = {"measured.csv": drags_csv(results, validation.header.source), "report.html": page}
     if validation.predictions is not None:
@@ -105,39 +226,26 @@ def prediction_sentences(predictions: Predictions) -> Iterator[str]:
     )
     if not predictions.corrected:
         yield "The correction of the other session is left out: seen strokes are predicted better without it."
-    if predictions.in_sample:
+    if predictions.fitted.all():
         yield "In sample: the fit was fitted to every one of these strokes."
-    elif len(predictions.scored) < len(predictions.strokes):
-        fitted = len(predictions.strokes) - len(predictions.scored)
-        yield f"The means leave out {fitted} strokes that the fit was fitted to."
+    elif predictions.fitted.any():
+        yield f"The means leave out {predictions.fitted.sum()} strokes that the fit was fitted to."
     if CEILING not in predictions.means():
         yield "No command was repeated, so the ceiling (the score of a perfect model) is not known."
     if predictions.drawn.commands is not None:
         yield ends_sentence(predictions.drawn.ends)
 
 
-def _worst(predictions: Predictions) -> list[tuple[str, float, float, str]]:
+def _worst(predictions: Predictions) -> Iterator[tuple[str, float, float, str]]:
     """Name, CSIM, IoU and overlay of the worst predicted strokes."""
-    out: list[tuple[str, float, float, str]] = []
-    for k in predictions.worst(MAX_WORST):
-        stroke, seen, ink = predictions.strokes[k], predictions.seen[k], predictions.drawn.ink[k]
+    for k in predictions.worst():
+        seen, ink = predictions.seen[k], predictions.drawn.drawings.ink[k]
         both = seen | (ink > 0.5)
         rows, columns = np.flatnonzero(both.any(axis=1)), np.flatnonzero(both.any(axis=0))
         window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-        csim, iou = stroke.scores[OURS]
+        csim, iou = predictions.scores[OURS][k].tolist()
         uri = overlay_uri(ink[window].astype(np.float64), seen[window].astype(np.float64))
-        out.append((stroke.stroke_id, csim, iou, uri))
-    return out
-
-
-def ends_sentence(ends: str) -> str:
-    """Where the depth at both ends of a stroke comes from."""
-    if not ends:
-        return (
-            "The table gives no depth at the ends (depth_ends_mm, or z_frac_ends beside z_frac_mid): "
-            "the depth is taken as constant."
-        )
-    return f"The depth at both ends is that of the column {ends}."
+        yield predictions.drawn.stroke_ids[k], csim, iou, uri
 
 
 def fit_sentences(results: DragResults) -> Iterator[str]:
@@ -234,10 +342,9 @@ def _predicted(predictions: Predictions) -> Iterator[Table]:
         out.add_row(name, str(count), f"{100 * csim:.2f}", f"{100 * sd:.2f}", f"{100 * iou:.2f}")
     yield out
     out = Table("worst", "CSIM", "IoU", "flags", title="predicted worst, percent")
-    for k in predictions.worst(MAX_WORST):
-        stroke = predictions.strokes[k]
-        csim, iou = stroke.scores[OURS]
-        out.add_row(stroke.stroke_id, f"{100 * csim:.2f}", f"{100 * iou:.2f}", "; ".join(stroke.flags))
+    rows = list(predictions.rows())
+    for name, csim, iou, _, flags in (rows[k] for k in predictions.worst()):
+        out.add_row(name, f"{100 * csim:.2f}", f"{100 * iou:.2f}", flags)
     yield out
 
 

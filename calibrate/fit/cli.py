@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.sessions.terminal import say
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from brushloop.calibrate.drags.artefact import DragArtefact
-    from brushloop.calibrate.drags.captures import Drawn
 
 DRAG_MM_PER_PX = 0.4
 """Scale of the images that drags are fitted to."""
@@ -63,9 +57,8 @@ def _fit_drags(
     session: Path, mm_per_px: float | None, calibration: Path | None, prior: Path | None, strokes: int | None
 ) -> None:
     from brushloop.calibrate.artefact import load_artefact, put_to_use
-    from brushloop.calibrate.drags.artefact import DragArtefact
+    from brushloop.calibrate.drags.brush import FOLDER, DragArtefact, fit_drawn, refit_drawn
     from brushloop.calibrate.drags.captures import read_drags
-    from brushloop.calibrate.drags.run import FOLDER, fit_drawn, refit_drawn
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
 
@@ -74,48 +67,7 @@ def _fit_drags(
     with shown() as progress:
         drawn = read_drags(session, scale, calibration, progress)
         if before is not None:
-            fitted = refit_drawn(drawn, before, str(prior), strokes if strokes is not None else len(drawn.ink))
+            fitted = refit_drawn(drawn, before, str(prior), strokes or len(drawn.stroke_ids))
         else:
             fitted = fit_drawn(drawn, progress)
-    say(*_drag_tables(drawn, fitted.artefact))
-    say(f"Fit: {put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)}")
-
-
-def _drag_tables(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
-    from rich.table import Table
-
-    from brushloop.calibrate.drags.report import ends_sentence
-    from brushloop.calibrate.report import source_label, source_note
-
-    label = source_label(drawn.header.source, [drawn.header.brush])
-    yield (
-        f"{source_note(drawn.header.source, drawn.header.brush)}; "
-        f"{artefact.strokes} dragged strokes in {artefact.images} images; condition number {artefact.condition:.3g}"
-    )
-    for name, why in drawn.refused:
-        yield f"left out: {name}: {why}"
-    for name, flags in zip(drawn.stroke_ids, drawn.flags, strict=True):
-        if flags:
-            yield f"counts less: {name}: {'; '.join(flags)}"
-    if drawn.commands is not None:
-        yield ends_sentence(drawn.ends)
-    if artefact.prior:
-        adapted = ", ".join(artefact.refitted)
-        yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these parameters adapted: {adapted}."
-    out = Table("parameter", "fitted", "95 %", title=f"drag model, mm ({label})")
-    for name, found in artefact.parameters.items():
-        interval = "not determined" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
-        if artefact.prior and name not in artefact.refitted:
-            interval = "as before"
-        out.add_row(name, f"{found.value:.3f}", interval)
-    yield out
-    if artefact.kept is not None:
-        yield f"A pixel is ink above a probability of {artefact.ink_above:g}, chosen by the training strokes."
-    if artefact.held_out:
-        title = f"a fifth left out in turn, where the command put it, percent ({label})"
-        out = Table("model", "n", "CSIM", "IoU", title=title)
-        for name, score in artefact.held_out.items():
-            out.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
-        yield out
-    elif not artefact.prior:
-        yield "Fewer than five images: too few to leave some out."
+    say(*fitted.lines(), f"Fit: {put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)}")

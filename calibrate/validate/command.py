@@ -9,9 +9,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from brushloop.calibrate.drags.measure import validate_drags
-from brushloop.calibrate.drags.predicted import predict_session
-from brushloop.calibrate.drags.report import DragValidation, write_drags
+from brushloop.calibrate.drags.captures import validate_drags
+from brushloop.calibrate.drags.report import DragValidation, predict_session, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder

@@ -19,9 +19,6 @@ def plan(
     ] = "ccd-bsm",
     radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
     length_mm: Annotated[float, typer.Option(min=5, max=200, help="Length L of the brush.")] = 48.0,
-    drag: Annotated[
-        Path | None, typer.Option(help="Result of `fit --drags`: strokes that travel are drawn with its bristle lag.")
-    ] = None,
     footprint: Annotated[
         Path | None,
         typer.Option(help="Result of `write fit`: the plan leads the brush by the footprint of its own drags."),
@@ -41,31 +38,22 @@ def plan(
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 1,
 ) -> None:
     """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
-    from brushloop.calibrate.writing.command import PlanRequest
-    from brushloop.calibrate.writing.command import plan as run
+    from brushloop.calibrate.writing.plan import PlanRequest
+    from brushloop.calibrate.writing.plan import plan as run
+    from brushloop.calibrate.writing.record import PlannedBy
     from brushloop.sessions.terminal import show_work
 
-    request = PlanRequest(
-        what=what,
-        out=out,
+    by = PlannedBy(
+        model=model,
         radius_mm=radius_mm,
         length_mm=length_mm,
-        data=data,
-        model=model,
-        drag=drag,
-        footprint=footprint,
         lam=lam,
-        cell_mm=cell_mm,
-        margin_mm=margin_mm,
         depth_range_mm=depth_range,
         tilt_range_deg=tilt_range,
-        tilt_deg=tilt,
         speed_mm_s=speed_mm_s,
         wrist_deg_s=wrist_deg_s,
-        steps=steps,
-        repeats=repeats,
     )
-    show_work(run, request)
+    show_work(run, PlanRequest(what, out, by, data, footprint, cell_mm, margin_mm, tilt, steps, repeats))
 
 
 def compare(
@@ -81,8 +69,8 @@ def compare(
     """Compare written characters with the simulated image and with the reference, in both polarities (Table 3)."""
     import sys
 
-    from brushloop.calibrate.writing.command import CompareRequest
-    from brushloop.calibrate.writing.command import compare as run
+    from brushloop.calibrate.writing.report import CompareRequest
+    from brushloop.calibrate.writing.report import compare as run
     from brushloop.sessions.terminal import show_work
 
     command = " ".join(["brushloop", *sys.argv[1:]])
@@ -100,8 +88,8 @@ def learn(
     ] = None,
 ) -> None:
     """Make the next plan from what the ink of this one showed, phase by phase."""
-    from brushloop.calibrate.writing.command import LearnRequest
-    from brushloop.calibrate.writing.command import learn as run
+    from brushloop.calibrate.writing.learn import LearnRequest
+    from brushloop.calibrate.writing.learn import learn as run
     from brushloop.sessions.terminal import show_work
 
     show_work(run, LearnRequest(session, plan, out, gain, repeats, settled_repeats))
@@ -120,18 +108,26 @@ def practice(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the strokes.")] = 1,
 ) -> None:
     """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged."""
-    from brushloop.calibrate.writing.command import PracticeRequest
-    from brushloop.calibrate.writing.command import practice as run
+    from brushloop.calibrate.writing.learn import PracticeRequest
+    from brushloop.calibrate.writing.learn import practice as run
+    from brushloop.calibrate.writing.record import PlannedBy
     from brushloop.sessions.terminal import show_work
 
-    show_work(run, PracticeRequest(out, radius_mm, length_mm, cell_mm, depth_range, speed_mm_s, wrist_deg_s, seed))
+    by = PlannedBy(
+        radius_mm=radius_mm,
+        length_mm=length_mm,
+        depth_range_mm=depth_range,
+        speed_mm_s=speed_mm_s,
+        wrist_deg_s=wrist_deg_s,
+    )
+    show_work(run, PracticeRequest(out, by, cell_mm, seed))
 
 
 def fit(
     session: Annotated[Path, typer.Argument(help="A calibrated session of a practice sheet, or of any figures.")],
 ) -> None:
     """Fit the footprint of the dragged brush, for `write plan --footprint`."""
-    from brushloop.calibrate.writing.command import fit as run
+    from brushloop.calibrate.writing.learn import fit as run
     from brushloop.sessions.terminal import show_work
 
     show_work(run, session)

@@ -1,6 +1,7 @@
-"""The next plan of characters, from what the ink of the last one showed.
+"""`brushloop write practice`, `fit` and `learn`: how a brush is dragged, from what it has written.
 
-Every round does three things. The footprint of the brush is fitted again to the captured characters, then to each of
+A practice sheet shows how the brush is dragged: the footprint that is fitted to it leads the brush in plans. Every
+round of learning then does three things. The footprint is fitted again to the captured characters, then to each of
 their strokes. What these footprints still miss is measured phase by phase: the distance by which the edge of the ink
 lies off the predicted edge. Then the points are moved until prediction and miss together give the wanted image, near
 where they are, since the miss was measured there. This is iterative learning control with the drawing model as its
@@ -12,25 +13,48 @@ A character whose last round was no better than the best one goes back to the be
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from brushloop.calibrate.compare.place import Image, Tone
+from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
+from brushloop.calibrate.compare.place import SIZE_PX, Image, Tone
+from brushloop.calibrate.compare.score import binary_scores
+from brushloop.calibrate.drags.captures import read_drags
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing.compare import WritingComparison, as_ink
-from brushloop.calibrate.writing.plan_files import as_points, encoded, ways_of
-from brushloop.calibrate.writing.plan_record import FigureRecord, PlannedBy, PlanRecord, Round, arrays
-from brushloop.calibrate.writing.scores import HEADLINE, Character, compare_ink
-from brushloop.model.characters.brush import Reach
+from brushloop.calibrate.files import check_folder
+from brushloop.calibrate.report import Written
+from brushloop.calibrate.writing.record import (
+    FigureRecord,
+    PlannedBy,
+    PlanRecord,
+    Round,
+    as_points,
+    encoded,
+    load_plan,
+    write_plan,
+)
+from brushloop.calibrate.writing.scores import (
+    HEADLINE,
+    Character,
+    WritingComparison,
+    as_ink,
+    compare_ink,
+    compare_written,
+)
 from brushloop.model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
-from brushloop.model.characters.phases import Phase, phase_map
-from brushloop.model.characters.plan import grid, without_tilt
+from brushloop.model.characters.plan import Phase, Reach, StrokePath, directions, grid, phase_map, without_tilt
+from brushloop.model.drag import Drawings
 from brushloop.model.footprint import NAMES, Footprint, fit_each, fit_footprint
+from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
 MOST_MM = 1.5
@@ -46,56 +70,200 @@ LEAST_GAIN_PERCENT = 0.2
 """A round that gains less CSIM than this has not helped: two writings of one plan differ by about as much."""
 WORSE = 0.5
 """Factor on the correction in each phase that became worse."""
+FOLDER = "footprint"
+MM_PER_PX = 0.5
+LEAST = 3
+"""Least number of strokes: fewer do not distinguish the discs."""
+FIGURES, PER_FIGURE = 10, 2
+MARGIN = 0.22
+"""Share of the patch at each side that is kept free: ink lands behind its command, and must not reach the edge."""
+DEEPEST = 0.3
+"""Greatest depth as a share of the brush's length."""
+MM_BETWEEN = 2.0
+TILT_DEG = 5.0
+NAME = "practice"
+
+
+class FootprintArtefact(SessionFit):
+    """A fitted footprint on disk. Equal inputs give an equal file."""
+
+    values: dict[str, Annotated[float, Field(allow_inf_nan=False)]]
+    images: int
+    strokes: int
+    csim_percent: float
+    """Mean agreement with the ink that it was fitted to, ink = 1: an upper bound of what it predicts."""
+
+    def footprint(self) -> Footprint:
+        """The fitted footprint."""
+        return Footprint(tuple(self.values[name] for name in NAMES))
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if set(self.values) != set(NAMES):
+            raise ValueError(
+                f"values: expected the {len(NAMES)} of this version; fit the session again with `brushloop write fit`"
+            )
+        return self
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
-    """What a round found for one character."""
+class PracticeRequest:
+    """What a practice sheet holds."""
 
-    name: str
-    found: Round
-    settled: bool
-
-
-def learned(written: WritingComparison, gain: float = 0.7) -> tuple[PlanRecord, list[Lesson]]:
-    """The next plan of the characters that were captured, and what was found. Raises `CalibrationError`."""
-    plan = written.plan
-    writings = {one.name: one for one in written.characters}
-    captured = {name: one.mean_ink() for name, one in writings.items()}
-    for figure in plan.figures:
-        if figure.name not in captured:
-            raise CalibrationError(str(written.recording), f"shows no {figure.name!r}: nothing is learned for it")
-    footprint = _refitted(plan, captured)
-    reach = reach_of(plan.planned_by)
-    figures: list[FigureRecord] = []
-    lessons: list[Lesson] = []
-    for figure in plan.figures:
-        found = round_of(figure, writings[figure.name], plan.cell_mm)
-        after = _after(figure, found)
-        if not after.settled:
-            after = _corrected(after, captured[figure.name], footprint, reach, plan.cell_mm, gain)
-        figures.append(after)
-        lessons.append(Lesson(figure.name, found, after.settled))
-    by = plan.planned_by.model_copy(update={"footprint": footprint.values})
-    made = plan.model_copy(update={"planned_by": by, "figures": tuple(figures), "software": written.software})
-    return made, lessons
+    out: Path
+    by: PlannedBy = field(default_factory=PlannedBy)
+    cell_mm: float = 70.0
+    seed: int = 1
 
 
 def reach_of(by: PlannedBy) -> Reach:
-    """The reach that a plan was made with."""
-    return Reach(by.depth_range_mm, by.tilt_range_deg, turn_deg_mm=by.turn_deg_mm)
+    """The reach that a plan is made with. Raises ValueError for ranges that make no sense."""
+    return Reach(by.depth_range_mm, by.tilt_range_deg, turn_deg_mm=by.wrist_deg_s / by.speed_mm_s)
 
 
-def _refitted(plan: PlanRecord, captured: dict[str, Image]) -> Footprint:
-    """The footprint that fits the captured characters, from that of the plan where it has one."""
-    known = plan.planned_by.footprint
-    strokes = [[without_tilt(points) for points in arrays(figure.commanded)] for figure in plan.figures]
-    groups = np.cumsum([0, *(len(one) for one in strokes)])
-    ink = np.stack([captured[figure.name] for figure in plan.figures])
-    x_mm, y_mm = grid(plan.cell_mm, ink.shape[1])
-    # a plan of an earlier version holds the values of another model of the footprint: the fit begins afresh
-    start = None if known is None or len(known) != len(NAMES) else Footprint(known)
-    return fit_footprint([path for one in strokes for path in one], groups, ink, x_mm, y_mm, start)
+def fit(session: Path, progress: Progress = unseen) -> Written:
+    """Fit the footprint to the figures of a session and put it to use.
+
+    Raises `CalibrationError` if the session holds too few strokes that travel.
+    """
+    drawn = read_drags(session, MM_PER_PX, progress=progress)
+    drawings = drawn.drawings
+    if drawn.calibration is None:
+        raise CalibrationError(str(session), "is an import: a footprint is fitted to figures that the arm wrote")
+    if len(drawings.paths) < LEAST:
+        raise CalibrationError(str(session), f"holds {len(drawings.paths)} strokes, at least {LEAST} are needed")
+    found = fit_footprint(drawings)
+    each = [drawings.only(np.array([k])).paths for k in range(len(drawings.ink))]
+    predicted = np.array([found.distance(paths, drawings.x_mm, drawings.y_mm) > 0.0 for paths in each])
+    agreement = binary_scores(predicted, drawings.ink > 0.5)[:, 0]
+    artefact = FootprintArtefact(
+        session_id=drawn.header.session_id,
+        source=str(drawn.header.source),
+        recording_sha256=drawn.recording_sha256,
+        calibration=drawn.calibration.digest,
+        software=made_by(),
+        values=dict(zip(NAMES, found.values, strict=True)),
+        images=len(drawings.ink),
+        strokes=len(drawings.paths),
+        csim_percent=round(100.0 * float(agreement.mean()), 3),
+    )
+    path = put_to_use(artefact, session, FOLDER)
+    words = (
+        f"footprint of {artefact.strokes} strokes on {artefact.images} cells ({artefact.source}): draws them with CSIM "
+        f"{artefact.csim_percent:.1f} %, ink = 1"
+    )
+    return Written(path, (words, str(path)))
+
+
+def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
+    """Write the protocol of a practice sheet, each stroke on a patch of its own. Raises `CalibrationError`."""
+    check_folder(request.out)
+    try:
+        strokes = practice_strokes(request.cell_mm, reach_of(request.by), request.by.length_mm, request.seed)
+    except ValueError as error:
+        raise CalibrationError("write practice", str(error)) from None
+    blank = encoded(np.zeros((SIZE_PX, SIZE_PX), np.float32))
+    figures = tuple(
+        FigureRecord(
+            name=f"{NAME}-{number + 1:02d}",
+            source=f"practice strokes, seed {request.seed}",
+            commanded=as_points(strokes[number * PER_FIGURE : (number + 1) * PER_FIGURE]),
+            wanted_png=blank,
+            simulated_png=blank,
+        )
+        for number in range(FIGURES)
+    )
+    record = PlanRecord(
+        model="none: practice", planned_by=request.by, cell_mm=request.cell_mm, software=made_by(), figures=figures
+    )
+    protocol = write_plan(record, 1, request.out)
+    return Written(protocol, (str(protocol),))
+
+
+def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float, seed: int = 1) -> list[Floats]:
+    """`FIGURES` x `PER_FIGURE` trajectories (N, 5) on a patch of that side; every third has a sharp turn.
+
+    None is deeper than `DEEPEST` of the brush's length.
+    """
+    rng = np.random.default_rng(seed)
+    deepest_mm = min(reach.depth_mm[1], math.floor(DEEPEST * brush_length_mm))
+    room_mm = (1.0 - 2.0 * MARGIN) * side_mm
+    out: list[Floats] = []
+    while len(out) < FIGURES * PER_FIGURE:
+        length_mm = rng.uniform(0.2, 1.0) * room_mm
+        count = max(4, round(length_mm / MM_BETWEEN))
+        heading = rng.uniform(-180.0, 180.0) + np.cumsum(rng.normal(0.0, 8.0, count))
+        if len(out) % 3 == 0:
+            heading[count // 2 :] += rng.choice([-1.0, 1.0]) * rng.uniform(50.0, 150.0)
+        places = np.cumsum(directions(heading) * length_mm / count, axis=0)
+        low, high = places.min(axis=0), places.max(axis=0)
+        places += MARGIN * side_mm - low + rng.uniform(0.0, 1.0, 2) * np.maximum(room_mm - (high - low), 0.0)
+        depths = rng.uniform(0.1, 1.0, 3) * deepest_mm
+        depth = np.interp(np.linspace(0.0, 1.0, count), (0.0, 0.5, 1.0), depths)
+        points = np.column_stack((places, depth, np.full(count, TILT_DEG), heading))
+        stroke = reach.spaced(np.round(reach.within(points, side_mm), 3))
+        if len(stroke) >= 3:
+            out.append(stroke)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class LearnRequest:
+    """From which session the next plan is made."""
+
+    session: Path
+    plan: Path
+    """The plan that was written: its folder, or its plan.json."""
+    out: Path
+    gain: float = 0.7
+    """Share of the miss that is corrected."""
+    repeats: int = 1
+    settled_repeats: int | None = None
+    """The same, used once every character is settled."""
+
+
+def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
+    """Make the next plan from what the ink of this one showed. Raises `CalibrationError`."""
+    check_folder(request.out)
+    following = learned(compare_written(request.session, load_plan(request.plan), {}, progress), request.gain)
+    settled = request.settled_repeats is not None and all(figure.settled for figure in following.figures)
+    repeats = (request.settled_repeats if settled else None) or request.repeats
+    protocol = write_plan(following, repeats, request.out)
+    said = [
+        f"{figure.name}: CSIM {figure.rounds[-1].csim_percent:.2f}, ink = 1, mm; lost in "
+        + lost_in_words(figure.rounds[-1])
+        + ("; settled: the best round is kept" if figure.settled else "")
+        for figure in following.figures
+    ]
+    return Written(protocol, (*said, str(protocol)))
+
+
+def learned(written: WritingComparison, gain: float = 0.7) -> PlanRecord:
+    """The next plan of the characters that were captured. Raises `CalibrationError`."""
+    plan = written.plan
+    writings = {character.name: character for character in written.characters}
+    for figure in plan.figures:
+        if figure.name not in writings:
+            raise CalibrationError(str(written.recording), f"shows no {figure.name!r}: nothing is learned for it")
+    ink = {name: character.mean_ink() for name, character in writings.items()}
+    known, drawings = plan.planned_by.footprint, _drawings(plan.figures, ink, plan.cell_mm)
+    footprint = fit_footprint(drawings, None if known is None else Footprint(known))
+    reach = reach_of(plan.planned_by)
+    figures: list[FigureRecord] = []
+    for figure in plan.figures:
+        after = _after(figure, round_of(figure, writings[figure.name], plan.cell_mm))
+        figures.append(after if after.settled else _corrected(after, ink, footprint, reach, plan.cell_mm, gain))
+    by = plan.planned_by.model_copy(update={"footprint": footprint.values})
+    return plan.model_copy(update={"planned_by": by, "figures": tuple(figures), "software": made_by()})
+
+
+def _drawings(figures: Sequence[FigureRecord], ink: dict[str, Image], side_mm: float) -> Drawings:
+    """What was commanded, and the mean ink (128, 128) of each figure."""
+    strokes = [[without_tilt(points) for points in figure.strokes] for figure in figures]
+    groups = np.cumsum([0, *(len(paths) for paths in strokes)])
+    images = np.stack([ink[figure.name] for figure in figures])
+    paths = [path for paths in strokes for path in paths]
+    return Drawings(paths, groups, images, *grid(side_mm, images.shape[1]), np.ones(len(images)))
 
 
 def _after(figure: FigureRecord, found: Round) -> FigureRecord:
@@ -104,7 +272,7 @@ def _after(figure: FigureRecord, found: Round) -> FigureRecord:
     best = figure.commanded if found.csim_percent > before or not figure.best else figure.best
     rounds = (*figure.rounds, found)
     settled = figure.settled or not _helped(rounds)
-    update = {"rounds": rounds, "best": best, "settled": settled, "commanded": best, "intended": best}
+    update = {"rounds": rounds, "best": best, "settled": settled, "commanded": best}
     return figure.model_copy(update=update)
 
 
@@ -115,17 +283,16 @@ def _helped(rounds: Sequence[Round]) -> bool:
 
 
 def _corrected(
-    figure: FigureRecord, ink: Image, footprint: Footprint, reach: Reach, side_mm: float, gain: float
+    figure: FigureRecord, ink: dict[str, Image], footprint: Footprint, reach: Reach, side_mm: float, gain: float
 ) -> FigureRecord:
-    commanded = arrays(figure.commanded)
-    size_px = len(ink)
-    paths, groups = [without_tilt(points) for points in commanded], np.array([0, len(commanded)])
-    footprints = fit_each(paths, groups, ink[None], *grid(side_mm, size_px), footprint)
-    miss = missed(ink, drawn(footprints, commanded, side_mm, size_px), side_mm)
+    strokes, captured = figure.strokes, ink[figure.name]
+    size_px = len(captured)
+    footprints = fit_each(_drawings([figure], ink, side_mm), footprint)
+    miss = missed(captured, drawn(footprints, strokes, side_mm, size_px), side_mm)
     miss *= gain * _trust(figure, side_mm, size_px)
     moved = lead(
         footprints,
-        commanded,
+        strokes,
         figure.wanted(),
         side_mm,
         reach,
@@ -134,8 +301,7 @@ def _corrected(
         held=HELD,
     )
     simulated = covered(drawn(footprints, moved, side_mm, size_px) + miss, side_mm)
-    points = as_points(moved)
-    return figure.model_copy(update={"commanded": points, "intended": points, "simulated_png": encoded(simulated)})
+    return figure.model_copy(update={"commanded": as_points(moved), "simulated_png": encoded(simulated)})
 
 
 def missed(ink: Image, predicted_mm: Floats, side_mm: float) -> Floats:
@@ -144,7 +310,7 @@ def missed(ink: Image, predicted_mm: Floats, side_mm: float) -> Floats:
     finer = cv2.resize(ink, (FINER * size_px, FINER * size_px), interpolation=cv2.INTER_CUBIC) > 0.5
     if not finer.any():
         return np.zeros(ink.shape)
-    seen = captured_distance([finer], side_mm / (FINER * size_px))[0]
+    seen = captured_distance(finer[None], side_mm / (FINER * size_px))[0]
     seen_mm = np.asarray(cv2.resize(seen, (size_px, size_px), interpolation=cv2.INTER_AREA), np.float64)
     off = np.clip(seen_mm - predicted_mm, -MOST_MM, MOST_MM) * (np.abs(seen_mm) < NEAR_MM)
     return np.asarray(cv2.GaussianBlur(off, (0, 0), SMOOTH_PX), np.float64)
@@ -159,14 +325,20 @@ def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
     for k, phase in enumerate(Phase):
         if now.get(phase, 0.0) > before.get(phase, 0.0):
             factors[k] = WORSE
-    return factors[phase_map(ways_of(figure), side_mm, size_px)]
+    return factors[phase_map(paths_of(figure), side_mm, size_px)]
 
 
-def round_of(figure: FigureRecord, one: Character, side_mm: float) -> Round:
+def paths_of(figure: FigureRecord) -> list[StrokePath]:
+    """The medians of a figure."""
+    arrays = (np.array(median, np.float64) for median in figure.medians)
+    return [StrokePath(median[:, :2], median[:, 2]) for median in arrays]
+
+
+def round_of(figure: FigureRecord, character: Character, side_mm: float) -> Round:
     """What the writings of a figure show on average."""
-    reference = as_ink(figure.wanted())
-    scores = [compare_ink(reference, ink, HEADLINE)[0] for ink in one.captured.values()]
-    lost = [lost_by_phase(figure, ink[Tone.BINARY], side_mm) for ink in one.captured.values()]
+    reference, writings = as_ink(figure.wanted()), character.captured.values()
+    scores = [compare_ink(reference, ink, HEADLINE)[0] for ink in writings]
+    lost = [lost_by_phase(figure, ink[Tone.BINARY], side_mm) for ink in writings]
     mean = {phase: round(float(np.mean([share[phase] for share in lost])), 2) for phase in lost[0]}
     return Round(csim_percent=round(100.0 * float(np.mean(scores)), 3), lost_percent=mean)
 
@@ -176,7 +348,7 @@ def lost_by_phase(figure: FigureRecord, ink: Image, side_mm: float) -> dict[str,
     if not figure.medians:
         return {}
     wanted = figure.wanted() > 0.5
-    where = phase_map(ways_of(figure), side_mm, len(ink))
+    where = phase_map(paths_of(figure), side_mm, len(ink))
     wrong = np.bincount(where[wanted != (ink > 0.5)], minlength=len(Phase))
     share = 100.0 * wrong / max(1, np.count_nonzero(wanted))
     present = np.unique(where)
@@ -189,7 +361,7 @@ def phase_table(rounds: Sequence[Round]) -> list[tuple[str, list[float]]]:
     return [(phase, [one.lost_percent.get(phase, 0.0) for one in rounds]) for phase in present]
 
 
-def lost_in_words(rounds: Sequence[Round]) -> str:
-    """The phases of the last round in which most is lost, most first."""
-    lost = sorted(rounds[-1].lost_percent.items(), key=lambda item: -item[1]) if rounds else []
+def lost_in_words(found: Round) -> str:
+    """The phases in which most is lost, most first."""
+    lost = sorted(found.lost_percent.items(), key=lambda item: -item[1])
     return ", ".join(f"{phase} {share:.1f} %" for phase, share in lost[:3])

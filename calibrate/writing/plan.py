@@ -1,9 +1,10 @@
-"""Plans the writing of characters: reads them, makes and refines their trajectories, and scores the simulated image."""
+"""`brushloop write plan`: reads what is to be written, makes and refines its trajectories, and writes the plan."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -11,133 +12,204 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.compare.score import csim, ssim
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import read_bounded
-from brushloop.model.characters.brush import Reach
-from brushloop.model.characters.glyph import MAX_CHARS, Glyph, GlyphError, parse_glyph
-from brushloop.model.characters.hand import parse_csv, parse_json
-from brushloop.model.characters.ink import Image, reference, swept, written
+from brushloop.calibrate.files import check_folder, read_bounded
+from brushloop.calibrate.report import Written, picture_grid, save_picture
+from brushloop.calibrate.writing.learn import FootprintArtefact, reach_of
+from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, write_plan
+from brushloop.model.ccdbsm import Brush, DomainError
+from brushloop.model.characters.glyph import (
+    MAX_GLYPH_CHARS,
+    Glyph,
+    GlyphError,
+    parse_csv,
+    parse_glyph,
+    parse_json,
+    paths_of,
+)
+from brushloop.model.characters.ink import Image, reference, refine, swept, written
 from brushloop.model.characters.lead import covered, drawn, first_lead, lead
-from brushloop.model.characters.plan import Cell, paths_of, trajectory
-from brushloop.model.characters.plan import Path as Way
-from brushloop.model.characters.refine import refine
-from brushloop.model.drag import DragModel
+from brushloop.model.characters.plan import Patch, Phase, Reach, StrokePath, phases_of, trajectory
 from brushloop.model.footprint import Footprint
-from brushloop.model.strokes import StrokeModel
+from brushloop.model.strokes import StrokeModel, UnknownModelError, stroke_model
+from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
+PICTURE = "plan.png"
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
+STEP_MM = 2.0
+"""Approximate distance of neighbouring points."""
 MAX_FILE_BYTES = 4 * 1024 * 1024
 MAX_GRAPHICS_BYTES = 64 * 1024 * 1024
 """makemeahanzi's file has a size of 30 MB."""
 MAX_FIGURES = 20
+MOST_TILT_DEG = 30.0
+BLUE = "#2d72ff"
+COLOURS = {
+    Phase.INITIATION_HIDDEN: "#117733",
+    Phase.INITIATION_EXPOSED: "#44aa99",
+    Phase.EXECUTION: "#888888",
+    Phase.TURNING: "#e69f00",
+    Phase.FOLDING: "#d1341f",
+    Phase.TERMINATION_HIDDEN: "#332288",
+    Phase.TERMINATION_EXPOSED: "#cc79a7",
+}
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """How characters are written. `tilt_deg` is the initial tilt; refinement may change it within reach."""
+class PlanRequest:
+    """Which characters are planned, and how."""
 
-    cell: Cell = field(default_factory=Cell)
-    reach: Reach = field(default_factory=Reach)
+    what: str
+    """Characters, or a .csv or .json trajectory."""
+    out: Path
+    by: PlannedBy = field(default_factory=PlannedBy)
+    data: Path | None = None
+    """Folder of hanzi-writer files, or makemeahanzi's graphics.txt."""
+    footprint: Path | None = None
+    """Result of `write fit`: the plan leads the brush by it; replaces the stroke model and `steps`."""
+    cell_mm: float = 70.0
+    margin_mm: float = 6.0
     tilt_deg: float = 5.0
-    step_mm: float = 2.0
-    """Approximate distance of neighbouring points."""
+    """The initial tilt; refinement may change it within reach."""
     steps: int = 60
     """Steps of refinement; 0 keeps the first plan."""
-    drag: DragModel | None = None
-    """Draws travelling strokes with bristle lag; None superimposes presses."""
-    footprint: Footprint | None = None
-    """Leads the brush so that the ink of this footprint follows the character; replaces model, `steps` and `drag`."""
+    repeats: int = 1
 
 
 @dataclass(frozen=True, slots=True)
-class FigureRequest:
+class Wanted:
     """A figure to write: its name, its paths with half widths, and the image they should produce."""
 
     name: str
     source: str
-    ways: list[Way]
+    paths: list[StrokePath]
     image: Image
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFigure:
-    """One figure: trajectories (N, 5) in order, the wanted image, and the model's image before and after refinement."""
+    """One figure: trajectories (N, 5) in order, and the model's image before and after refinement."""
 
-    request: FigureRequest
+    wanted: Wanted
     strokes: list[Floats]
     first: Image
     simulated: Image
 
-    def scores(self) -> tuple[float, float, float, float]:
+    def scores(self) -> str:
         """CSIM and SSIM of the first plan, then of the refined one, against the wanted image."""
-        image = self.request.image
+        image, (before, after) = self.wanted.image, (self.first, self.simulated)
         return (
-            csim(image, self.first),
-            ssim(image, self.first),
-            csim(image, self.simulated),
-            ssim(image, self.simulated),
+            f"CSIM {csim(image, before):.4f} -> {csim(image, after):.4f}, "
+            f"SSIM {ssim(image, before):.4f} -> {ssim(image, after):.4f}"
+        )
+
+    def record(self) -> FigureRecord:
+        """The figure as plan.json holds it."""
+        wanted = self.wanted
+        medians = (np.column_stack((path.points, path.half_width_mm)).round(4).tolist() for path in wanted.paths)
+        return FigureRecord(
+            name=wanted.name,
+            source=wanted.source,
+            commanded=as_points(self.strokes),
+            wanted_png=encoded(wanted.image),
+            simulated_png=encoded(self.simulated),
+            medians=tuple(tuple((x, y, half) for x, y, half in median) for median in medians),
         )
 
 
-def plan(what: str, data: Path | None, model: StrokeModel, settings: Settings) -> list[PlannedFigure]:
-    """Plan each character of a text, or a trajectory file (.csv, .json). Raises `CalibrationError`."""
-    return [_planned(request, model, settings) for request in read_requests(what, data, settings)]
+def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
+    """Plan each character of a text, or a trajectory file, and write protocol, plan and picture.
+
+    Raises `CalibrationError` that names option, or file and field.
+    """
+    check_folder(request.out)
+    fitted = load_artefact(request.footprint, FootprintArtefact) if request.footprint is not None else None
+    by = request.by if fitted is None else request.by.model_copy(update={"footprint": fitted.footprint().values})
+    low, high = by.tilt_range_deg
+    try:
+        if high > MOST_TILT_DEG or by.depth_range_mm[0] <= 0:
+            raise ValueError(f"tilts end at {MOST_TILT_DEG:g} deg, depths begin above 0 mm")
+        reach, patch = reach_of(by), Patch(request.cell_mm, request.margin_mm)
+        model = stroke_model(by.model, Brush(by.radius_mm, by.length_mm), math.pi if by.lam is None else by.lam)
+        model.profile(by.depth_range_mm[1], high)
+    except (ValueError, UnknownModelError, DomainError) as error:
+        raise CalibrationError("write plan", str(error)) from None
+    if not low <= request.tilt_deg <= high:
+        raise CalibrationError("--tilt", f"{request.tilt_deg:g} deg is outside {low:g} to {high:g}")
+    each = read_wanted(request.what, request.data, patch)
+    if fitted is None:
+        label = model.label
+        figures = [pressed(wanted, model, reach, patch, request.tilt_deg, request.steps) for wanted in each]
+        simulated = f"{by.model}, marks laid over each other along the way"
+    else:
+        label = "fitted footprint"
+        figures = [led(wanted, fitted.footprint(), reach, patch, request.tilt_deg) for wanted in each]
+        simulated = f"the footprint fitted to {fitted.session_id}, {fitted.source}"
+    request.out.mkdir(parents=True, exist_ok=True)
+    draw(figures, patch.side_mm, request.out / PICTURE)
+    records = tuple(figure.record() for figure in figures)
+    record = PlanRecord(model=label, planned_by=by, cell_mm=patch.side_mm, software=made_by(), figures=records)
+    protocol = write_plan(record, request.repeats, request.out)
+    return Written(protocol, (*_said(figures, simulated), str(protocol), str(request.out / PICTURE)))
 
 
-def read_requests(what: str, data: Path | None, settings: Settings) -> list[FigureRequest]:
+def _said(figures: list[PlannedFigure], simulated: str) -> Iterator[str]:
+    yield f"simulated by {simulated}: not ink"
+    for figure in figures:
+        points = sum(len(stroke) for stroke in figure.strokes)
+        yield f"{figure.wanted.name}: {len(figure.strokes)} strokes, {points} points, ink = 1: {figure.scores()}"
+
+
+def pressed(
+    wanted: Wanted, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int
+) -> PlannedFigure:
+    """Plan a figure as presses that are laid over each other along the way."""
+    side_mm = patch.side_mm
+    first = [trajectory(path, model, reach, patch, tilt_deg) for path in wanted.paths]
+    refined = refine(model, first, wanted.image, side_mm, reach, steps)
+    strokes = [reach.spaced(np.round(reach.within(stroke, side_mm), 3)) for stroke in refined]
+    return PlannedFigure(wanted, strokes, *(written(model, each, side_mm) for each in (first, strokes)))
+
+
+def led(wanted: Wanted, footprint: Footprint, reach: Reach, patch: Patch, tilt_deg: float) -> PlannedFigure:
+    """Plan a figure so that the ink of a dragged footprint follows it."""
+    side_mm, size_px = patch.side_mm, len(wanted.image)
+    first = first_lead(wanted.paths, footprint, reach, side_mm, tilt_deg)
+    footprints = [footprint] * len(first)
+    strokes = lead(footprints, first, wanted.image, side_mm, reach)
+    images = (covered(drawn(footprints, each, side_mm, size_px), side_mm) for each in (first, strokes))
+    return PlannedFigure(wanted, strokes, *images)
+
+
+def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Wanted]:
     """Read the figures to write. Raises `CalibrationError` that names file and field."""
     if what.lower().endswith((".csv", ".json")) and len(what) > len(".csv"):
-        return [_hand(Path(what), settings)]
-    if not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
+        each = [_drawn_by_hand(Path(what), patch)]
+    elif not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
         raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters, or a .csv or .json trajectory")
-    if len(set(what)) != len(what):
+    elif len(set(what)) != len(what):
         raise CalibrationError("character", "the same character twice: the protocol's `repeats` writes it again")
-    out: list[FigureRequest] = []
-    for name in what:
-        glyph = _shipped(name) if data is None else _from(data, name)
-        ways = paths_of(glyph, settings.cell, settings.step_mm)
-        out.append(
-            FigureRequest(name, SHIPPED_SOURCE if data is None else data.name, ways, reference(glyph, settings.cell))
-        )
-    return out
+    else:
+        glyphs = [_shipped(name) if data is None else _from(data, name) for name in what]
+        source = SHIPPED_SOURCE if data is None else data.name
+        each = [Wanted(g.name, source, paths_of(g, patch, STEP_MM), reference(g, patch)) for g in glyphs]
+    for wanted in each:
+        if not wanted.image.any():
+            raise CalibrationError(wanted.name, "has no width anywhere: nothing would be written")
+    return each
 
 
-def _planned(request: FigureRequest, model: StrokeModel, settings: Settings) -> PlannedFigure:
-    reach, cell = settings.reach, settings.cell
-    low, high = reach.tilt_deg
-    if not low <= settings.tilt_deg <= high:
-        raise CalibrationError("--tilt", f"{settings.tilt_deg:g} deg is outside {low:g} to {high:g}")
-    if not request.image.any():
-        raise CalibrationError(request.name, "has no width anywhere: nothing would be written")
-    if settings.footprint is not None:
-        return _led(request, settings.footprint, settings)
-    first = [trajectory(way, model, reach, cell, settings.tilt_deg, settings.drag) for way in request.ways]
-    better = refine(model, first, request.image, cell.side_mm, reach, settings.steps, drag=settings.drag)
-    strokes = [reach.spaced(np.round(reach.within(stroke, cell.side_mm), 3)) for stroke in better.strokes]
-    before, after = (written(model, one, cell.side_mm, drag=settings.drag) for one in (first, strokes))
-    return PlannedFigure(request, strokes, before, after)
-
-
-def _led(request: FigureRequest, footprint: Footprint, settings: Settings) -> PlannedFigure:
-    reach, side_mm, size_px = settings.reach, settings.cell.side_mm, len(request.image)
-    first = first_lead(request.ways, footprint, reach, side_mm, settings.tilt_deg)
-    each = [footprint] * len(first)
-    strokes = lead(each, first, request.image, side_mm, reach)
-    before, after = (covered(drawn(each, one, side_mm, size_px), side_mm) for one in (first, strokes))
-    return PlannedFigure(request, strokes, before, after)
-
-
-def _hand(path: Path, settings: Settings) -> FigureRequest:
+def _drawn_by_hand(path: Path, patch: Patch) -> Wanted:
     text = _text(path, MAX_FILE_BYTES)
-    parse: Callable[[str, Cell, float], list[Way]] = parse_csv if path.suffix.lower() == ".csv" else parse_json
     try:
-        ways = parse(text, settings.cell, settings.step_mm)
+        paths = (parse_csv if path.suffix.lower() == ".csv" else parse_json)(text, patch, STEP_MM)
     except GlyphError as error:
         raise CalibrationError(str(path), str(error)) from None
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in path.stem)[:50].strip("-") or "figure"
-    return FigureRequest(name, path.name, ways, swept(ways, settings.cell.side_mm))
+    return Wanted(name, path.name, paths, swept(paths, patch.side_mm))
 
 
 def _shipped(name: str) -> Glyph:
@@ -154,9 +226,9 @@ def _from(data: Path, name: str) -> Glyph:
     """Read from a folder of `字.json` files, one such file, or makemeahanzi's graphics.txt (a JSON object a line)."""
     if data.is_dir():
         path = data / f"{name}.json"
-        return _parsed(str(path), _text(path, MAX_CHARS), name)
+        return _parsed(str(path), _text(path, MAX_GLYPH_CHARS), name)
     if data.suffix == ".json":
-        return _parsed(str(data), _text(data, MAX_CHARS), name)
+        return _parsed(str(data), _text(data, MAX_GLYPH_CHARS), name)
     for line in _text(data, MAX_GRAPHICS_BYTES).splitlines():
         if name in line or f"\\u{ord(name):04x}" in line.lower():
             try:
@@ -180,3 +252,37 @@ def _text(path: Path, most_bytes: int) -> str:
         return read_bounded(path, most_bytes).decode("utf-8")
     except UnicodeDecodeError:
         raise CalibrationError(str(path), "is no UTF-8 text") from None
+
+
+def draw(figures: list[PlannedFigure], side_mm: float, path: Path) -> None:
+    """Draw a row per figure: wanted, first plan, refined plan, and the tip's trajectory over the strokes' phases."""
+    picture, rows = picture_grid(len(figures), 4, (12.0, 3.4 * len(figures)))
+    extent = (0.0, side_mm, 0.0, side_mm)
+    for figure, axes in zip(figures, rows, strict=True):
+        image = figure.wanted.image
+        titles = (
+            f"wanted: {code_points(figure.wanted.name)}",
+            f"first plan, simulated: CSIM {csim(image, figure.first):.4f}, SSIM {ssim(image, figure.first):.4f}",
+            f"refined, simulated: CSIM {csim(image, figure.simulated):.4f}, SSIM {ssim(image, figure.simulated):.4f}",
+            "phases of the strokes; blue: trajectory",
+        )
+        images = (image, figure.first, figure.simulated, 0.25 * image)
+        for axis, shown, title in zip(axes, images, titles, strict=True):
+            axis.imshow(1 - shown, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest")
+            axis.set_title(title, fontsize=8)
+            axis.tick_params(labelsize=7)
+        for stroke, median in zip(figure.strokes, figure.wanted.paths, strict=True):
+            axes[3].plot(stroke[:, 0], stroke[:, 1], "-", color=BLUE, lw=0.8)
+            colours = [COLOURS[phase] for phase in phases_of(median)]
+            axes[3].scatter(median.points[:, 0], median.points[:, 1], s=22, color=colours, marker="s", zorder=2)
+            axes[3].scatter(stroke[:, 0], stroke[:, 1], s=0.4 * stroke[:, 2], color=BLUE, zorder=3)
+        axes[0].set_ylabel("mm", fontsize=7)
+    for phase, colour in COLOURS.items():
+        rows[0][3].scatter([], [], s=14, color=colour, marker="s", label=str(phase))
+    rows[0][3].legend(fontsize=5, loc="lower right")
+    save_picture(picture, path)
+
+
+def code_points(name: str) -> str:
+    """A name with code points for Chinese characters, since most machines have no font that shows them."""
+    return " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in name)

@@ -1,16 +1,21 @@
-"""Writes the results of written characters: Figure 13, one self-contained HTML file, CSV and JSON."""
+"""`brushloop write compare`: Figure 13, one self-contained HTML file, CSV and JSON of written characters."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.compare.place import Alignment, Image, Tone
 from brushloop.calibrate.compare.score import SSIM_SETTINGS, Polarity
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import (
+    Written,
     about,
     ink_uri,
     overlay,
@@ -22,9 +27,9 @@ from brushloop.calibrate.report import (
     show_picture,
     write_files,
 )
-from brushloop.calibrate.writing.compare import WritingComparison
 from brushloop.calibrate.writing.learn import phase_table, round_of
-from brushloop.calibrate.writing.plan_files import code_points
+from brushloop.calibrate.writing.plan import code_points
+from brushloop.calibrate.writing.record import load_plan
 from brushloop.calibrate.writing.scores import FILE as NUMBERS
 from brushloop.calibrate.writing.scores import (
     HEADLINE,
@@ -33,12 +38,44 @@ from brushloop.calibrate.writing.scores import (
     REFERENCE,
     Character,
     Table3Row,
+    WritingComparison,
     WrittenRecord,
     WrittenScore,
+    compare_written,
+    read_reference,
 )
 from brushloop.sessions.disk import csv_text
+from brushloop.sessions.terminal import Progress, unseen
 
 PAGE, TABLE = "written.html", "written.csv"
+
+
+@dataclass(frozen=True, slots=True)
+class CompareRequest:
+    """Which written characters are compared, and where the report goes."""
+
+    session: Path
+    plan: Path
+    """The plan's folder, or its plan.json."""
+    out: Path
+    command: str
+    """Named by the report as what made it."""
+    references: tuple[str, ...] = ()
+    """Pictures to compare with instead of the plan's font, as `CHARACTER=FILE`."""
+
+
+def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
+    """Compare written characters with their simulation and reference; write the report. Raises `CalibrationError`."""
+    check_folder(request.out)
+    references: dict[str, tuple[str, Image]] = {}
+    for words in request.references:
+        name, equals, path = words.partition("=")
+        if not name or not equals or not path:
+            raise CalibrationError("--reference", f"{words!r}: expected CHARACTER=FILE, as 字=zi.png")
+        references[name] = (Path(path).name, read_reference(Path(path)))
+    written = compare_written(request.session, load_plan(request.plan), references, progress)
+    report = write_written(written, request.out, request.command)
+    return Written(report, (*summary(written), f"Picture: {request.out / PICTURE}", f"Report:  {report}"))
 
 
 def write_written(written: WritingComparison, folder: Path, command: str) -> Path:
@@ -99,7 +136,7 @@ def record_of(written: WritingComparison, command: str, picture: bytes) -> Writt
         table_3=tuple(written.table),
         refused=tuple(written.refused),
         figure_13_sha256=hashlib.sha256(picture).hexdigest(),
-        software=written.software,
+        software=made_by(),
         command=command,
     ).sealed()
 
@@ -178,5 +215,5 @@ def _provenance(written: WritingComparison, command: str) -> Iterator[tuple[str,
     yield "robot", f"{header.robot} {header.robot_firmware}".strip()
     yield "camera", f"{header.camera} {header.lens}".strip()
     yield "brush, ink, paper", ", ".join(part for part in (header.brush, header.ink, header.paper) if part)
-    yield "compared with", f"{written.software}, Python {platform.python_version()}"
+    yield "compared with", f"{made_by()}, Python {platform.python_version()}"
     yield "command", command

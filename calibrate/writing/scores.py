@@ -1,23 +1,33 @@
-"""Similarity of a written character to its simulated image, its reference, and its other writings: Table 3."""
+"""Written characters compared: with the plan's simulated image, the reference, and their other writings (Table 3)."""
 
 from __future__ import annotations
 
 import itertools
+import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
-from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, to_tone
+from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, prepare_cell, to_tone
 from brushloop.calibrate.compare.score import Polarity, similarity
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.report import Sealed, load_sealed
-from brushloop.calibrate.stats import Summary, others_of, summarise
-from brushloop.sessions.records import Source
+from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.stats import others_of, summarise
+from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, points_digest
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Header, Source
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 FILE, PICTURE = "written.json", "figure-13.png"
 FORMAT = "brushloop-written-1"
@@ -180,7 +190,9 @@ def table_3(
         found = grouped.get((character, *key, pair))
         if not found:
             continue
-        csim, ssim = (_summary([getattr(s, measure) for s in found]) for measure in ("csim", "ssim"))
+        csim, ssim = (summarise(100.0 * np.array([getattr(s, what) for s in found])) for what in ("csim", "ssim"))
+        assert csim is not None, "scores are finite"
+        assert ssim is not None, "scores are finite"
         paper = PAPER_ROWS.get(pair)
         rows.append(
             Table3Row(
@@ -206,10 +218,132 @@ def table_3(
     return rows
 
 
-def _summary(values: list[float]) -> Summary:
-    """Summary in percent."""
-    percent = [100.0 * value for value in values]
-    found = summarise(np.array(percent))
-    assert found is not None, "only called with scores, which are finite"
-    # Summed in order: numpy's sum would differ in the last bit from every existing written.json.
-    return replace(found, avg=sum(percent) / len(percent))
+@dataclass(frozen=True, slots=True)
+class WritingComparison:
+    """Written characters, compared with their plan."""
+
+    header: Header
+    recording: Path
+    recording_sha256: str
+    calibration: Calibration
+    plan: PlanRecord
+    characters: list[Character]
+    scores: list[WrittenScore]
+    table: list[Table3Row]
+    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """(stroke, why), never dropped in silence."""
+
+
+def compare_written(
+    session: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]], progress: Progress = unseen
+) -> WritingComparison:
+    """Compare a session with its plan. `references` (character -> name, image) replace those of the plan.
+
+    Raises `CalibrationError` if the two do not belong together or nothing can be compared.
+    """
+    recording = Recording(session)
+    digest = recording.sha256
+    first = next(recording.stroke_records(), None)
+    calibration = None if first is None else calibration_of(recording, first, digest, None)
+    if first is None or calibration is None:
+        raise CalibrationError(str(recording.path), "holds no characters that the arm wrote")
+    _check_points(recording, plan)
+    if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
+        raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
+    found, cut, refused = _writings(recording, plan, calibration, progress)
+    characters = [_character(figure, found, cut, references) for figure in plan.figures if figure.name in found]
+    if not characters:
+        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
+        raise CalibrationError(str(recording.path), f"no character can be compared{why}")
+    counting = counted(characters, "characters compared", len(characters), progress)
+    scores = [score for one in counting for score in score_character(one)]
+    header = recording.header
+    table = table_3(
+        scores,
+        source=header.source,
+        session_id=header.session_id,
+        model=plan.model,
+        references={one.name: one.reference_name for one in characters},
+    )
+    return WritingComparison(header, recording.path, digest, calibration, plan, characters, scores, table, refused)
+
+
+def _writings(
+    recording: Recording, plan: PlanRecord, calibration: Calibration, progress: Progress
+) -> tuple[dict[str, dict[str, Ink]], set[str], list[tuple[str, str]]]:
+    """(character -> stroke -> ink, strokes that are cut, refused)."""
+    found: dict[str, dict[str, Ink]] = {}
+    cut: set[str] = set()
+    refused: list[tuple[str, str]] = []
+    what = f"{recording.header.session_id}: found"
+    for capture in counted(recording.captures(), what, recording.strokes(), progress):
+        stroke_id = capture.stroke.stroke_id
+        name = stroke_id.rsplit("-r", 1)[0]
+        if capture.stroke.kind != "drag" or plan.figure(name) is None:
+            refused.append((stroke_id, "is not a character of this plan"))
+            continue
+        try:
+            ink, is_cut = captured(capture, calibration)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((stroke_id, error.what))
+            continue
+        found.setdefault(name, {})[stroke_id] = ink
+        cut |= {stroke_id} if is_cut else set()
+    return found, cut, refused
+
+
+def _character(
+    figure: FigureRecord, found: dict[str, dict[str, Ink]], cut: set[str], references: dict[str, tuple[str, Image]]
+) -> Character:
+    name, image = references.get(figure.name) or (figure.source, figure.wanted())
+    writings = found[figure.name]
+    edge = tuple(stroke_id for stroke_id in writings if stroke_id in cut)
+    return Character(figure.name, name, as_ink(image), as_ink(figure.simulated()), writings, edge)
+
+
+def _check_points(recording: Recording, plan: PlanRecord) -> None:
+    """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
+    try:
+        protocol: Any = json.loads(recording.header.protocol)
+        points = {f["name"]: points_digest([s["points"] for s in f["strokes"]]) for f in protocol["figures"]}
+        cell_mm = [float(side) for side in protocol["cell_mm"]]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise CalibrationError(str(recording.path), "was not collected by a `write` protocol") from None
+    if cell_mm != [plan.cell_mm, plan.cell_mm]:
+        raise CalibrationError(str(recording.path), f"has cells of {cell_mm} mm, the plan {plan.cell_mm:g} mm")
+    for name, digest in points.items():
+        figure = plan.figure(name)
+        if figure is None or figure.points_sha256 != digest:
+            raise CalibrationError(str(recording.path), f"{name!r} was not drawn from this plan")
+
+
+def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
+    """Return the ink on the character's paper cell, and whether it reaches the edge. Raises `CaptureRefused`."""
+    _, _, size_x_mm, size_y_mm = capture.stroke.cell_mm or (0.0,) * 4
+    if not math.isclose(size_x_mm, size_y_mm):
+        what = f"its cell is {size_x_mm:g} x {size_y_mm:g} mm, but must be square"
+        raise CaptureRefused(capture.stroke.stroke_id, what)
+    prepared = prepare_cell(capture, calibration)
+    return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
+
+
+def _small(image: Image) -> Image:
+    return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
+
+
+def read_reference(path: Path) -> Image:
+    """Read (128, 128) ink from a picture of a dark character on light, padded to square. Raises `CalibrationError`."""
+    gray = read_gray(path)
+    ink = 1.0 - gray.astype(np.float32) / 255.0
+    if float(ink.mean()) > 0.5:
+        raise CalibrationError(str(path), "is mostly dark: a reference is dark ink on light paper")
+    height, width = ink.shape
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    square = np.pad(ink, ((top, side - height - top), (left, side - width - left)))
+    return _small(square)
+
+
+def as_ink(image: Image) -> Ink:
+    """Make ink from an image that was not photographed: its darkness is its coverage."""
+    return dict.fromkeys(Tone, image)

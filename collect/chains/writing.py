@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.calibrate.artefact import current
-from brushloop.calibrate.writing.plan_record import PROTOCOL, load_plan
+from brushloop.calibrate.writing.record import PROTOCOL, PlannedBy, load_plan
 from brushloop.collect.chains.commands import Say, collected_session, finished_session
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
@@ -85,37 +85,36 @@ class Writing:
                 check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
             brush = load_rig(request.config).brush
 
-            from brushloop.calibrate.writing import command  # slow to import
+            from brushloop.calibrate.writing import plan as planning  # slow to import
 
-            wanted = command.PlanRequest(
+            wanted = planning.PlanRequest(
                 request.what,
                 plan,
-                brush.radius_mm,
-                brush.length_mm,
+                PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm, speed_mm_s=request.speed_mm_s),
                 data=request.data,
                 footprint=self._footprint() if request.practice else None,
                 cell_mm=request.cell_mm,
-                speed_mm_s=request.speed_mm_s,
                 repeats=self._repeats(1),
             )
             self._say(f"write plan {request.what} --out {plan}")
-            show_work(command.plan, wanted)
+            show_work(planning.plan, wanted)
         return plan
 
     def _footprint(self) -> Path:
         """Write the practice sheet and fit the footprint of the brush to it, if that is not done; return its file."""
-        from brushloop.calibrate.writing import command  # slow to import
+        from brushloop.calibrate.writing import learn  # slow to import
 
         request, folder = self._request, self._request.out / "practice"
         if not (folder / PROTOCOL).exists():
             brush = load_rig(request.config).brush
             self._say(f"write practice --out {folder}")
-            show_work(command.practice, command.PracticeRequest(folder, brush.radius_mm, brush.length_mm))
+            by = PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm)
+            show_work(learn.practice, learn.PracticeRequest(folder, by))
         session = self._written(folder / PROTOCOL)
         found = current(session, FOOTPRINT)
         if found is None:
             self._say(f"write fit {session}")
-            found = show_work(command.fit, session).path
+            found = show_work(learn.fit, session).path
         return found
 
     def _learn(self, plan: Path, number: int) -> Path:
@@ -125,14 +124,12 @@ class Writing:
             _check_plan(plan / PROTOCOL, self._request, self._repeats(number))
             session = self._written(plan / PROTOCOL)
             self._compare(session, plan, self._request.out / f"round-{number}")
-            from brushloop.calibrate.writing import command  # slow to import
+            from brushloop.calibrate.writing import learn  # slow to import
 
             self._say(f"write learn {session} --plan {plan} --out {after}")
             repeats, settled = self._repeats(number + 1), self._request.count
-            show_work(
-                command.learn,
-                command.LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled),
-            )
+            wanted = learn.LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled)
+            show_work(learn.learn, wanted)
         return after
 
     def _repeats(self, number: int) -> int:
@@ -155,12 +152,12 @@ class Writing:
         return collected_session(self._say, wanted)
 
     def _compare(self, session: Path, plan: Path, out: Path, references: tuple[str, ...] = ()) -> Path:
-        from brushloop.calibrate.writing import command  # slow to import
+        from brushloop.calibrate.writing import report  # slow to import
 
         given = "".join(f" --reference {reference}" for reference in references)
         line = f"brushloop write compare {session} --plan {plan} --out {out}{given}"
         self._say(f"$ {line}")
-        return show_work(command.compare, command.CompareRequest(session, plan, out, line, references)).path
+        return show_work(report.compare, report.CompareRequest(session, plan, out, line, references)).path
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:

@@ -1,12 +1,18 @@
-"""Parse a character of hanzi-writer or makemeahanzi: an outline and a median for each stroke. Reads no files.
+"""What is written: a character of hanzi-writer or makemeahanzi, or a trajectory supplied by the user. Reads no files.
 
-Font units: 1024 per side, x to the right, y upward from -124 at the bottom to 900 at the top. The data is not trusted:
-sizes are bounded, and an error is one line.
+A character has an outline and a median for each stroke, in font units: 1024 per side, x to the right, y upward from
+-124 at the bottom to 900 at the top. A trajectory has the width that the stroke should have at each point. It is CSV
+with the columns `x_mm`, `y_mm`, `width_mm` and, for several strokes, `stroke` (a number that changes from one stroke
+to the next); or JSON, `{"strokes": [[[x_mm, y_mm, width_mm], ...], ...]}`. Positions are relative to the patch's lower
+left corner. The data is not trusted: sizes are bounded, and an error is one line.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
+import math
 import re
 from dataclasses import dataclass
 from typing import Any, cast
@@ -14,13 +20,18 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.model.characters.plan import Patch, StrokePath, lengths_along, resampled
+
 Floats = NDArray[np.float64]
-SIDE_UNITS, FOOT_UNITS = 1024.0, -124.0
-MAX_CHARS = 256 * 1024
+MAX_GLYPH_CHARS, MAX_TRAJECTORY_CHARS = 256 * 1024, 4 * 1024 * 1024
 MAX_STROKES, MAX_MEDIAN, MAX_SEGMENTS = 64, 256, 1024
 MAX_UNITS = 4096.0
+MAX_DRAWN_STROKES, MAX_POINTS = 100, 10_000
+MAX_WIDTH_MM = 100.0
+COLUMNS = ("x_mm", "y_mm", "width_mm")
 _CUBIC_PIECES = 8
-_TOKEN = re.compile(r"\s*,?\s*(?:([A-Za-z])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?))")
+_COMMAND = re.compile(r"([A-DF-Za-df-z])([^A-DF-Za-df-z]*)")  # an E belongs to a number
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,3})?", re.IGNORECASE)
 _TAKES = {"M": 2, "L": 2, "Q": 4, "C": 6, "Z": 0}
 
 
@@ -58,11 +69,11 @@ class Glyph:
 
 def parse_glyph(text: str, name: str) -> Glyph:
     """Parse a character from `{"strokes": [path, ...], "medians": [[[x, y], ...], ...]}`; raises GlyphError."""
-    data = json_of(text, MAX_CHARS)
+    data = _json_of(text, MAX_GLYPH_CHARS)
     if not isinstance(data, dict):
         raise GlyphError("", "is not a JSON object")
     table = cast("dict[str, Any]", data)
-    paths, medians = (_list(table, key, 1, MAX_STROKES) for key in ("strokes", "medians"))
+    paths, medians = (_list(table.get(key), key, 1, MAX_STROKES) for key in ("strokes", "medians"))
     if len(paths) != len(medians):
         raise GlyphError("medians", f"{len(medians)} for {len(paths)} strokes")
     strokes: list[GlyphStroke] = []
@@ -73,38 +84,26 @@ def parse_glyph(text: str, name: str) -> Glyph:
     return Glyph(name, tuple(strokes))
 
 
-def json_of(text: str, most_chars: int) -> Any:
-    """Decode a JSON text of at most `most_chars` characters; raises GlyphError."""
-    if len(text) > most_chars:
-        raise GlyphError("", f"is longer than {most_chars} characters")
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise GlyphError("", f"is not JSON: {str(error).splitlines()[0][:100]}") from None
-
-
 def parse_path(path: str, field: str) -> Floats:
     """Parse a closed SVG path of absolute M, L, Q, C and Z into arcs (K, 3, 2); raises GlyphError."""
+    if not path.lstrip().startswith("M"):
+        raise GlyphError(field, "expected M first, then L, Q, C or Z")
     arcs: list[Floats] = []
     at = begin = np.zeros(2)
-    for letter, numbers in _commands(path, field):
-        points = np.array(numbers, np.float64).reshape(-1, 2)
-        if letter == "M":
-            if arcs:
-                raise GlyphError(field, "has more than one loop")
-            at = begin = points[0]
-            continue
-        if letter == "Z":
-            points, letter = begin[None], "L"
-        if letter == "L":
-            if np.allclose(at, points[0]):
-                continue
-            arcs.append(np.stack((at, 0.5 * (at + points[0]), points[0])))
-        elif letter == "Q":
-            arcs.append(np.stack((at, *points)))
-        else:
-            arcs.extend(_cubic(np.stack((at, *points))))
-        at = points[-1]
+    for number, command in enumerate(_COMMAND.finditer(path)):
+        letter, pieces = _pieces(command, field)
+        if letter == "M" and number > 0:
+            raise GlyphError(field, "has more than one loop")
+        for k, points in enumerate(pieces if letter != "Z" else [begin[None]]):
+            if letter == "M" and k == 0:
+                at = begin = points[0]
+            elif letter == "C":
+                arcs.extend(_cubic(np.stack((at, *points))))
+            elif letter == "Q":
+                arcs.append(np.stack((at, *points)))
+            elif not np.allclose(at, points[0]):  # further pairs after M are lines, as in SVG
+                arcs.append(np.stack((at, 0.5 * (at + points[0]), points[0])))
+            at = points[-1]
         if len(arcs) > MAX_SEGMENTS:
             raise GlyphError(field, f"has more than {MAX_SEGMENTS} pieces")
     if len(arcs) < 2:
@@ -112,45 +111,27 @@ def parse_path(path: str, field: str) -> Floats:
     if not np.allclose(at, begin):
         arcs.append(np.stack((at, 0.5 * (at + begin), begin)))
     loop = np.stack(arcs)
-    corners = GlyphStroke(loop, loop[:, 0]).polyline(4)
-    following = np.roll(corners, -1, axis=0)
-    area = 0.5 * float(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]))
+    x, y = GlyphStroke(loop, loop[:, 0]).polyline(4).T
+    area = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
     if abs(area) < 1.0:
         raise GlyphError(field, "encloses nothing")
     return loop if area > 0 else np.ascontiguousarray(loop[::-1, ::-1])
 
 
-def _commands(path: str, field: str) -> list[tuple[str, list[float]]]:
-    out: list[tuple[str, list[float]]] = []
-    at, letter, numbers = 0, "", list[float]()
-    path = path.strip()
-    while at < len(path):
-        token = _TOKEN.match(path, at)
-        if token is None:
-            raise GlyphError(field, f"is not a path at character {at + 1}: {path[at : at + 12]!r}")
-        at = token.end()
-        if token[1] is not None:
-            if numbers:
-                raise GlyphError(field, f"{letter} takes {_TAKES[letter]} numbers at a time")
-            letter = token[1]
-            if letter not in _TAKES or (letter == "M") != (not out):
-                raise GlyphError(field, f"{letter} at character {at}: expected M first, then L, Q, C or Z")
-            if letter == "Z":
-                out.append((letter, []))
-            continue
-        value = float(token[2])
-        if not letter or letter == "Z" or not abs(value) <= MAX_UNITS:
-            raise GlyphError(field, f"number {token[2][:20]} at character {at}: expected {MAX_UNITS:g} at most")
-        numbers.append(value)
-        if len(numbers) == _TAKES[letter]:
-            out.append((letter, numbers))
-            numbers = []
-            letter = "L" if letter == "M" else letter  # further pairs after M are lines, as in SVG
-        if len(out) > MAX_SEGMENTS:
-            raise GlyphError(field, f"has more than {MAX_SEGMENTS} pieces")
-    if numbers:
-        raise GlyphError(field, f"{letter} takes {_TAKES[letter]} numbers at a time")
-    return out
+def _pieces(command: re.Match[str], field: str) -> tuple[str, Floats]:
+    """The letter of a command, and its points (pieces, points of a piece, 2)."""
+    letter, text = command.groups()
+    takes = _TAKES.get(letter)
+    if takes is None:
+        raise GlyphError(field, f"{letter} at character {command.start() + 1}: expected M first, then L, Q, C or Z")
+    if rest := _NUMBER.sub("", text).replace(",", " ").split():
+        raise GlyphError(field, f"is not a path at character {command.start() + 1}: {rest[0][:12]!r}")
+    numbers = np.array(_NUMBER.findall(text), np.float64)
+    if (numbers.size % takes if takes else numbers.size) or bool(takes) != bool(numbers.size):
+        raise GlyphError(field, f"{letter} takes {takes} numbers at a time")
+    if np.any(np.abs(numbers) > MAX_UNITS):
+        raise GlyphError(field, f"number at character {command.start() + 1}: expected {MAX_UNITS:g} at most")
+    return letter, numbers.reshape(-1, max(takes // 2, 1), 2)
 
 
 def _cubic(nodes: Floats) -> list[Floats]:
@@ -162,11 +143,9 @@ def _cubic(nodes: Floats) -> list[Floats]:
     return list(np.stack((start, 2 * middle - 0.5 * (start + end), end), axis=1))
 
 
-def _median(given: object, field: str) -> Floats:
-    if not isinstance(given, list) or not 2 <= len(cast("list[Any]", given)) <= MAX_MEDIAN:
-        raise GlyphError(field, f"expected 2 to {MAX_MEDIAN} points")
+def _median(value: object, field: str) -> Floats:
     points: list[list[float]] = []
-    for n, point in enumerate(cast("list[Any]", given)):
+    for n, point in enumerate(_list(value, field, 2, MAX_MEDIAN, "points")):
         pair = cast("list[Any]", point) if isinstance(point, list) else []
         good = len(pair) == 2 and all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair)
         if not good or not all(abs(v) <= MAX_UNITS for v in pair):
@@ -179,8 +158,116 @@ def _median(given: object, field: str) -> Floats:
     return median[kept]
 
 
-def _list(table: dict[str, Any], key: str, least: int, most: int) -> list[Any]:
-    value = table.get(key)
+def paths_of(glyph: Glyph, patch: Patch, step_mm: float) -> list[StrokePath]:
+    """The medians of a character, resampled, each with its distance to the stroke's outline."""
+    out: list[StrokePath] = []
+    for stroke in glyph.strokes:
+        points = resampled(patch.to_mm(stroke.median), step_mm)
+        out.append(StrokePath(points, distance_to(patch.to_mm(stroke.polyline()), points)))
+    return out
+
+
+def distance_to(loop: Floats, points: Floats) -> Floats:
+    """The distance of (N, 2) points to a closed polyline (M, 2), (N,); 0 outside it."""
+    start, end = loop, np.roll(loop, -1, axis=0)
+    side = end - start
+    off = points[:, None] - start
+    share = np.clip(np.sum(off * side, axis=2) / np.maximum(np.sum(side**2, axis=1), 1e-18), 0, 1)
+    nearest = np.linalg.norm(off - share[..., None] * side, axis=2).min(axis=1)
+    y = points[:, 1:]
+    crosses = (start[:, 1] > y) != (end[:, 1] > y)
+    rise = np.where(side[:, 1] == 0, 1.0, side[:, 1])
+    left = points[:, :1] < start[:, 0] + (y - start[:, 1]) / rise * side[:, 0]
+    inside = np.count_nonzero(crosses & left, axis=1) % 2 == 1
+    return np.where(inside, nearest, 0.0)
+
+
+def parse_csv(text: str, patch: Patch, step_mm: float) -> list[StrokePath]:
+    """The paths of a CSV; raises GlyphError, which names line and column."""
+    if len(text) > MAX_TRAJECTORY_CHARS:
+        raise GlyphError("", f"is longer than {MAX_TRAJECTORY_CHARS} characters")
+    rows = csv.DictReader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
+    strokes: dict[int, list[_Point]] = {}
+    number, last = 0, None
+    try:
+        header = [name.strip() for name in rows.fieldnames or []]
+        rows.fieldnames = header
+        for name in COLUMNS:
+            if name not in header:
+                raise GlyphError("line 1", f"has no column {name}")
+        if extra := [name for name in header if name not in (*COLUMNS, "stroke")]:
+            raise GlyphError("line 1", f"unknown column {extra[0][:40]!r}; known: stroke, {', '.join(COLUMNS)}")
+        for row in rows:
+            where = f"line {rows.line_num}"
+            if None in row or None in row.values():
+                raise GlyphError(where, f"expected {len(header)} values, one for each column")
+            if row.get("stroke") != last or not strokes:
+                number, last = number + 1, row.get("stroke")
+            strokes.setdefault(number, []).append(_point([row[name] for name in COLUMNS], where, patch))
+    except csv.Error as error:
+        raise GlyphError(f"line {rows.line_num}", f"is not CSV: {error}") from None
+    return _paths(list(strokes.values()), step_mm)
+
+
+def parse_json(text: str, patch: Patch, step_mm: float) -> list[StrokePath]:
+    """The paths of a JSON trajectory; raises GlyphError, which names stroke and point."""
+    data = _json_of(text, MAX_TRAJECTORY_CHARS)
+    table = cast("dict[str, Any]", data) if isinstance(data, dict) else {}
+    strokes: list[list[_Point]] = []
+    for k, stroke in enumerate(_list(table.get("strokes"), "strokes", 1, MAX_DRAWN_STROKES, "strokes")):
+        strokes.append([])
+        for n, point in enumerate(_list(stroke, f"strokes.{k}", 1, MAX_POINTS, "points")):
+            where = f"strokes.{k}.{n}"
+            if not isinstance(point, list) or len(cast("list[Any]", point)) != len(COLUMNS):
+                raise GlyphError(where, f"expected [{', '.join(COLUMNS)}]")
+            strokes[-1].append(_point(cast("list[Any]", point), where, patch))
+    return _paths(strokes, step_mm)
+
+
+_Point = tuple[float, float, float]
+
+
+def _point(values: list[Any], where: str, patch: Patch) -> _Point:
+    out: list[float] = []
+    for name, value in zip(COLUMNS, values, strict=True):
+        low, high = (0.0, MAX_WIDTH_MM) if name == "width_mm" else (0.0, patch.side_mm)
+        try:
+            number = math.nan if isinstance(value, bool) or "_" in str(value) else float(value)
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if not low <= number <= high:
+            raise GlyphError(f"{where}: {name}", f"must be a number, {low:g} to {high:g} (given: {value!r:.40})")
+        out.append(number)
+    return out[0], out[1], out[2]
+
+
+def _paths(strokes: list[list[_Point]], step_mm: float) -> list[StrokePath]:
+    if not strokes:
+        raise GlyphError("", "holds no stroke")
+    if len(strokes) > MAX_DRAWN_STROKES or sum(map(len, strokes)) > MAX_POINTS:
+        raise GlyphError("", f"more than {MAX_DRAWN_STROKES} strokes or {MAX_POINTS} points")
+    out: list[StrokePath] = []
+    for k, stroke in enumerate(strokes):
+        points = np.array(stroke)
+        along = lengths_along(points[:, :2])
+        if along[-1] < 2 * step_mm:
+            raise GlyphError(f"stroke {k + 1}", f"is {along[-1]:.3g} mm long, expected at least {2 * step_mm:g} mm")
+        even = resampled(points[:, :2], step_mm)
+        at = np.linspace(0, along[-1], len(even))
+        out.append(StrokePath(even, 0.5 * np.interp(at, along, points[:, 2])))
+    return out
+
+
+def _json_of(text: str, most_chars: int) -> Any:
+    if len(text) > most_chars:
+        raise GlyphError("", f"is longer than {most_chars} characters")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise GlyphError("", f"is not JSON: {str(error).splitlines()[0][:100]}") from None
+
+
+def _list(value: object, field: str, least: int, most: int, what: str = "entries") -> list[Any]:
     if not isinstance(value, list) or not least <= len(cast("list[Any]", value)) <= most:
-        raise GlyphError(key, f"expected a list of {least} to {most}")
+        raise GlyphError(field, f"expected a list of {least} to {most} {what}")
     return cast("list[Any]", value)

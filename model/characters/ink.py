@@ -1,8 +1,8 @@
-"""Images of trajectories: overlaid marks of presses along the path, and outlines of characters.
+"""Images of trajectories made of presses, images that are wanted, and refinement from the one to the other.
 
-The image of the cell is square, row 0 at its far (upper) edge. A pixel is as dark as the darkest mark on it: ink on
-ink stays ink. With a stroke model, bristles do not lag; with a drag model (`model.drag`, fitted to dragged strokes)
-they do. Neither models a brush that runs dry.
+The image of the patch is square, row 0 at its far (upper) edge. A pixel is as dark as the darkest mark on it: ink on
+ink stays ink. Marks of presses are laid over each other along the path: bristles do not lag, and no brush runs dry.
+`model.characters.lead` draws with a brush that is dragged.
 """
 
 from __future__ import annotations
@@ -15,10 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brushloop.model.characters.drag import dragged, is_dragged
 from brushloop.model.characters.glyph import Glyph
-from brushloop.model.characters.plan import Cell, Path, grid
-from brushloop.model.drag import DragModel
+from brushloop.model.characters.plan import Patch, Reach, StrokePath, grid, lengths_along
 from brushloop.model.outline import Outline
 from brushloop.model.raster import SIZE_PX, coverage
 from brushloop.model.raster.exact import coverage_at
@@ -26,6 +24,11 @@ from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
+_RATE = (0.12, 0.12, 0.12, 0.1, 1.5)
+"""Longest step of x, y, H (mm), alpha and heading (deg)."""
+_STIFF = (0.02, 0.02, 0.02, 0.002, 2e-5)
+"""Weight of the squared second difference along a stroke."""
+_WIDE_PX, _NARROW_PX = 2.0, 0.6
 
 
 def dense(points: Tensor, per_step: int) -> Tensor:
@@ -57,52 +60,90 @@ def stamped(model: StrokeModel, points: Tensor, side_mm: float, size_px: int = S
     return canvas.unflatten(0, (wide, wide))[tile : tile + size_px, tile : tile + size_px]
 
 
-def written(
-    model: StrokeModel,
-    strokes: Sequence[Floats],
-    side_mm: float,
-    size_px: int = SIZE_PX,
-    *,
-    drag: DragModel | None = None,
-) -> Image:
-    """The image of whole trajectories, each (N, 5), with marks dense enough that edges join to a tenth of a pixel.
-
-    With `drag`, dragged strokes are drawn with that model.
-    """
+def written(model: StrokeModel, strokes: Sequence[Floats], side_mm: float, size_px: int = SIZE_PX) -> Image:
+    """The image of whole trajectories, each (N, 5), with marks dense enough that edges join to a tenth of a pixel."""
     image = np.zeros((size_px, size_px), np.float32)
     for points in strokes:
-        if drag is not None and is_dragged(torch.from_numpy(points)):
-            with torch.no_grad():
-                image = np.maximum(image, dragged(drag, torch.from_numpy(points), side_mm, size_px).float().numpy())
-            continue
         longest = float(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).max())
         per_step = max(1, math.ceil(longest / (0.5 * side_mm / size_px)))
         with torch.no_grad():
-            made = stamped(model, dense(torch.from_numpy(points), per_step), side_mm, size_px)
-        image = np.maximum(image, made.float().numpy())
+            stroke = stamped(model, dense(torch.from_numpy(points), per_step), side_mm, size_px)
+        image = np.maximum(image, stroke.float().numpy())
     return image
 
 
-def reference(glyph: Glyph, cell: Cell, size_px: int = SIZE_PX) -> Image:
+def reference(glyph: Glyph, patch: Patch, size_px: int = SIZE_PX) -> Image:
     """The image of a character's outlines, with the exact coverage of each stroke."""
     image = np.zeros((size_px, size_px), np.float32)
     for stroke in glyph.strokes:
-        points = cell.to_mm(stroke.arcs)[None]
+        points = patch.to_mm(stroke.arcs)[None]
         loop = Outline(points, np.ones(points.shape[:2]))
-        drawn = coverage(loop, (0.0, cell.side_mm), size_px=size_px, px_mm=cell.side_mm / size_px)
+        drawn = coverage(loop, (0.0, patch.side_mm), size_px=size_px, px_mm=patch.side_mm / size_px)
         image = np.maximum(image, drawn[0])
     return image
 
 
-def swept(paths: Sequence[Path], side_mm: float, size_px: int = SIZE_PX) -> Image:
+def swept(paths: Sequence[StrokePath], side_mm: float, size_px: int = SIZE_PX) -> Image:
     """The image of discs along paths: the intended look of a user's trajectory with widths."""
     x, y = np.meshgrid(*grid(side_mm, size_px))
     image = np.zeros((size_px, size_px))
     for path in paths:
-        steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
-        along = np.concatenate(([0.0], np.cumsum(steps)))
+        along = lengths_along(path.points)
         at = np.linspace(0, along[-1], max(2, math.ceil(along[-1] / (0.25 * side_mm / size_px))))
         for cx, cy, r in zip(*(np.interp(at, along, v) for v in (*path.points.T, path.half_width_mm)), strict=True):
             edge = (r - np.hypot(x - cx, y - cy)) * size_px / side_mm
             image = np.maximum(image, np.clip(0.5 + edge, 0, 1))
     return image.astype(np.float32)
+
+
+def refine(
+    model: StrokeModel, strokes: Sequence[Floats], wanted: Image, side_mm: float, reach: Reach, steps: int = 60
+) -> list[Floats]:
+    """Adjust trajectories, each (N, 5), until their image is `wanted`, (N, N) of the patch, within reach.
+
+    Adam minimises the squared difference of the images, blurred by a Gaussian that narrows, so that an edge that is
+    pixels off still has a gradient. After every step `Reach.within` makes the trajectory feasible again. The best
+    trajectories are returned; `steps` = 0 leaves them unchanged.
+    """
+    size = len(wanted)
+    target = torch.from_numpy(wanted).double()
+    ends = np.cumsum([len(stroke) for stroke in strokes])[:-1].tolist()
+    rate, stiff = torch.tensor(_RATE).double(), torch.tensor(_STIFF).double()
+    scaled = (torch.from_numpy(np.concatenate(strokes)).double() / rate).requires_grad_()
+    adam = torch.optim.Adam([scaled], lr=1.0, betas=(0.8, 0.95), eps=1e-9)
+    best, least = [stroke.copy() for stroke in strokes], float("inf")
+    for step in range(steps + 1):
+        parts = torch.tensor_split(scaled * rate, ends)
+        pressed = [dense(part, _per_step(part, side_mm / size)) for part in parts]
+        off = stamped(model, torch.cat(pressed), side_mm, size) - target
+        plain = float(off.detach().square().mean())
+        if plain < least:
+            least, best = plain, [part.detach().numpy().copy() for part in parts]
+        if step == steps:
+            break
+        width = _WIDE_PX + (_NARROW_PX - _WIDE_PX) * min(1.0, step / (0.7 * steps))
+        bent = sum(((p[2:] - 2 * p[1:-1] + p[:-2]).square() * stiff).sum() for p in parts)
+        adam.param_groups[0]["lr"] = 1.0 - 0.8 * step / steps
+        adam.zero_grad()
+        loss = _blurred(off, width).square().sum() * (side_mm / size) ** 2 + bent
+        loss.backward()
+        adam.step()
+        with torch.no_grad():
+            feasible = [reach.within(part.numpy(), side_mm) for part in torch.tensor_split(scaled * rate, ends)]
+            scaled.copy_(torch.from_numpy(np.concatenate(feasible)) / rate)
+    return best
+
+
+def _per_step(part: Tensor, px_mm: float) -> int:
+    longest = float(torch.linalg.vector_norm(part.detach()[:, :2].diff(dim=0), dim=1).max())
+    return max(1, round(longest / (2.0 * px_mm)))
+
+
+def _blurred(image: Tensor, width_px: float) -> Tensor:
+    """An image blurred by a Gaussian of that standard deviation, zero outside."""
+    reach = max(1, round(3 * width_px))
+    at = torch.arange(-reach, reach + 1, dtype=image.dtype)
+    kernel = torch.exp(-0.5 * (at / width_px) ** 2)
+    kernel = kernel / kernel.sum()
+    out = torch.nn.functional.conv2d(image[None, None], kernel[None, None, :, None], padding=(reach, 0))
+    return torch.nn.functional.conv2d(out, kernel[None, None, None, :], padding=(0, reach))[0, 0]

@@ -14,12 +14,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.characters.brush import Reach
 from brushloop.model.characters.ink import Image
-from brushloop.model.characters.plan import Path, directions, grid, tangents, without_tilt
+from brushloop.model.characters.plan import Reach, StrokePath, directions, grid, tangents, without_tilt
 from brushloop.model.damped import Equations, descend
-from brushloop.model.drag import distances, ink
-from brushloop.model.footprint import Footprint, Marks, ink_equations, inked, marks, sampled, sampling
+from brushloop.model.drag import Drawings, distances, ink, ink_equations
+from brushloop.model.footprint import Footprint, inked, marks, sampled, sampling
 
 Floats = NDArray[np.float64]
 UNITS = np.array([0.3, 0.3, 0.5, 10.0])
@@ -36,7 +35,7 @@ GAIN = 5e-4
 
 
 def first_lead(
-    paths: Sequence[Path], footprint: Footprint, reach: Reach, side_mm: float, tilt_deg: float
+    paths: Sequence[StrokePath], footprint: Footprint, reach: Reach, side_mm: float, tilt_deg: float
 ) -> list[Floats]:
     """Trajectories (N, 5) with the depth of each width, whose tip is one lag ahead along the stroke."""
     reach = replace(reach, plunge=PLUNGE)
@@ -63,7 +62,7 @@ def lead(
     spreads_mm: Sequence[float] = FIRST_SPREADS_MM,
     rounds: int = ROUNDS,
 ) -> list[Floats]:
-    """Adjust trajectories (N, 5) until their predicted ink is `wanted` (S, S), row 0 at the cell's far edge.
+    """Adjust trajectories (N, 5) until their predicted ink is `wanted` (S, S), row 0 at the patch's far edge.
 
     Each stroke has a footprint of its own. x, y and depth of every point change, and the heading in which a stroke
     lands. `added_mm` (S, S) is added to the predicted signed distances: what the footprints are known to miss. `held`
@@ -114,9 +113,10 @@ class _Problem:
         self._values = np.array([footprint.values for footprint in footprints])
         self._like = [stroke.copy() for stroke in strokes]
         self._ends = np.cumsum([0, *(len(stroke) for stroke in strokes)])
-        self._wanted, self._side_mm, self._reach = wanted[None], side_mm, reach
-        self._added_mm = np.zeros(wanted.shape) if added_mm is None else added_mm
-        self._grid = grid(side_mm, len(wanted))
+        self._side_mm, self._reach = side_mm, reach
+        self._added_mm = np.zeros((1, *wanted.shape)) if added_mm is None else added_mm[None]
+        one_image = np.array([0, len(strokes)])
+        self._wanted = Drawings(strokes, one_image, wanted[None], *grid(side_mm, len(wanted)), np.ones(1))
         self._bent = _bending(self._ends)
         self._from, self._held = self.vector(strokes), held
 
@@ -133,30 +133,27 @@ class _Problem:
         return out
 
     def cost(self, vector: Floats, spread_mm: float) -> float:
-        made = self._marks([without_tilt(stroke) for stroke in self.strokes(vector)])
-        each = np.array([0, len(made.starts) - 1])
-        distance = distances(made.discs, made.starts, *self._grid, each)[0] + self._added_mm
-        off = ink(distance, spread_mm) - self._wanted[0]
+        at = marks([sampled(without_tilt(stroke)) for stroke in self.strokes(vector)], self._values)
+        each = np.array([0, len(at.starts) - 1])
+        distance_mm = distances(at.discs, at.starts, self._wanted.x_mm, self._wanted.y_mm, each) + self._added_mm
+        off = ink(distance_mm, spread_mm) - self._wanted.ink
         return 0.5 * float(np.sum(off**2)) + self._penalty(vector)
 
     def equations(self, vector: Floats, spread_mm: float) -> Equations:
         paths = [without_tilt(stroke) for stroke in self.strokes(vector)]
-        made = self._marks(paths)
-        slopes = np.zeros((len(made.discs), 3, len(vector)))
-        row = 0
+        at = marks([sampled(path) for path in paths], self._values)
+        slopes = np.zeros((len(at.discs), 3, len(vector)))
         for number, path in enumerate(paths):
             nodes, (shares, down) = sampled(path), sampling(path)
-            base = marks([nodes], self._values[number]).discs
+            rows = slice(*at.starts[at.strokes[number : number + 2]])
             for point in range(len(path)):
                 for column in range(4 if point == 0 else 3):
                     moved = nodes.copy()
                     moved[:, column] += 1e-3 * UNITS[column] * shares[:, point] * (down if column == 2 else 1.0)
                     changed = marks([moved], self._values[number]).discs
-                    at = 4 * (self._ends[number] + point) + column
-                    slopes[row : row + len(base), :, at] = (changed - base) / 1e-3
-            row += len(base)
-        each = np.array([0, len(made.starts) - 1])
-        found = ink_equations(made, each, slopes, self._wanted, *self._grid, spread_mm, self._added_mm)
+                    slopes[rows, :, 4 * (self._ends[number] + point) + column] = (changed - at.discs[rows]) / 1e-3
+        each = np.array([0, len(at.starts) - 1])
+        found = ink_equations(at.discs, at.starts, each, slopes, self._wanted, spread_mm, self._added_mm)
         gradient = found.gradient + self._bent @ vector + self._held * (vector - self._from)
         square = found.square + self._bent + self._held * np.eye(len(vector))
         return Equations(found.cost + self._penalty(vector), square, gradient)
@@ -165,19 +162,15 @@ class _Problem:
         moved = vector - self._from
         return 0.5 * float(vector @ self._bent @ vector) + 0.5 * self._held * float(moved @ moved)
 
-    def _marks(self, paths: Sequence[Floats]) -> Marks:
-        return marks([sampled(path) for path in paths], self._values)
-
 
 def _bending(ends: NDArray[np.int64]) -> Floats:
     """The quadratic form of the squared second differences of x, y and depth along each stroke."""
     size = 4 * int(ends[-1])
     out = np.zeros((size, size))
+    second = np.array([1.0, -2.0, 1.0])
     for first, last in itertools.pairwise(ends):
         for point in range(first + 1, last - 1):
             for column in range(3):
-                row = np.zeros(size)
-                at = 4 * point + column
-                row[[at - 4, at, at + 4]] = 1.0, -2.0, 1.0
-                out += BENT * UNITS[column] ** 2 * np.outer(row, row)
+                at = 4 * np.array([point - 1, point, point + 1]) + column
+                out[np.ix_(at, at)] += BENT * UNITS[column] ** 2 * np.outer(second, second)
     return out

@@ -8,7 +8,6 @@ from brushloop.calibrate.board.intrinsics import LensFile
 from brushloop.calibrate.board.lens import Lens, unknown_lens
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.writing.plan_record import PlannedBy
 
 CALIBRATION = Calibration(
     session_id="test",
@@ -28,16 +27,6 @@ CALIBRATION = Calibration(
     middle_px=(0.0, 0.0),
     board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
     still_sha256="",
-)
-BY = PlannedBy(
-    model="ccd-bsm",
-    radius_mm=6.0,
-    length_mm=48.0,
-    lam=None,
-    depth_range_mm=(0.5, 20.0),
-    tilt_range_deg=(0.0, 10.0),
-    turn_deg_mm=12.0,
-    speed_mm_s=15.0,
 )
 
 

@@ -43,7 +43,7 @@ def test_where_it_is_to_be_written_is_looked_at_before_any_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").write_text("a file")
     with monkeypatch.context() as patch:
-        patch.setattr("brushloop.calibrate.writing.command.planned", None)  # not called: it takes minutes
+        patch.setattr("brushloop.calibrate.writing.plan.pressed", None)  # not called: it takes minutes
         ran = CliRunner().invoke(app, [*words])
     assert isinstance(ran.exception, CalibrationError)
     assert str(ran.exception) == f"{tmp_path / 'taken'}: is a file; a folder is needed"

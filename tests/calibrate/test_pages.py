@@ -25,15 +25,13 @@ from brushloop.calibrate.pages.lens import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.validate.page import pages_beside
-from brushloop.calibrate.writing.compare import WritingComparison
-from brushloop.calibrate.writing.plan_files import figure_record
-from brushloop.calibrate.writing.plan_record import PlanRecord
+from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.calibrate.writing.report import write_written
-from brushloop.calibrate.writing.scores import Character, score_character, table_3
+from brushloop.calibrate.writing.scores import Character, WritingComparison, score_character, table_3
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
-from tests.calibrate.given import BY, CALIBRATION
+from tests.calibrate.given import CALIBRATION
 from tests.photographed import imported, photograph
 
 if TYPE_CHECKING:
@@ -129,7 +127,13 @@ def _written(folder: Path) -> str:
     cross[60:68, 30:100] = cross[30:100, 60:68] = 1.0
     ink = dict.fromkeys(Tone, cross)
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, 0.0], [5.0, 6.0, 7.0, 8.0, 9.0]])]
-    figure = figure_record("字", "a font", strokes, strokes, wanted=cross, simulated=cross)
+    figure = FigureRecord(
+        name="字",
+        source="a font",
+        commanded=as_points(strokes),
+        wanted_png=encoded(cross),
+        simulated_png=encoded(cross),
+    )
     one = Character("字", "a font", ink, ink, {"zi-r01": ink, "zi-r02": ink})
     scores = list(score_character(one))
     made = WritingComparison(
@@ -137,7 +141,7 @@ def _written(folder: Path) -> str:
         recording=folder,
         recording_sha256="ab",
         calibration=CALIBRATION,
-        plan=PlanRecord(model="CCD-BSM", planned_by=BY, cell_mm=60.0, software="test", figures=(figure,)),
+        plan=PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,)),
         characters=[one],
         scores=scores,
         table=table_3(

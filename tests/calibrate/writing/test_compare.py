@@ -14,9 +14,15 @@ from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.stroke.rectify import rectify_by
-from brushloop.calibrate.writing.compare import as_ink, captured, read_reference
-from brushloop.calibrate.writing.plan_files import figure_record
-from brushloop.calibrate.writing.plan_record import PlanRecord, load_plan, points_digest
+from brushloop.calibrate.writing.record import (
+    FigureRecord,
+    PlannedBy,
+    PlanRecord,
+    as_points,
+    encoded,
+    load_plan,
+    points_digest,
+)
 from brushloop.calibrate.writing.scores import (
     ANOTHER,
     KEYS,
@@ -25,7 +31,10 @@ from brushloop.calibrate.writing.scores import (
     SIMULATED,
     Character,
     aligned,
+    as_ink,
+    captured,
     compare_ink,
+    read_reference,
     read_written,
     score_character,
     table_3,
@@ -33,7 +42,7 @@ from brushloop.calibrate.writing.scores import (
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Source, Stroke
-from tests.calibrate.given import BY, CALIBRATION
+from tests.calibrate.given import CALIBRATION
 from tests.calibrate.records import written_record
 
 CELL = (20.0, 10.0, 60.0, 60.0)
@@ -157,8 +166,9 @@ def test_a_writing_alone_has_no_other() -> None:
 
 def test_a_plan_keeps_its_images_and_knows_its_points(tmp_path: Path) -> None:
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, -0.0001], [5.5, 6.25, 7.125, 8.0, 9.0]])]
-    figure = figure_record("x", "font", strokes, strokes, wanted=cross(), simulated=cross(width=10))
-    plan = PlanRecord(model="CCD-BSM", planned_by=BY, cell_mm=60.0, software="test", figures=(figure,))
+    images = {"wanted_png": encoded(cross()), "simulated_png": encoded(cross(width=10))}
+    figure = FigureRecord(name="x", source="font", commanded=as_points(strokes), **images)
+    plan = PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
     (tmp_path / "plan.json").write_text(plan.model_dump_json())
     loaded = load_plan(tmp_path)
     assert loaded == plan

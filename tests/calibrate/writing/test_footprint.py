@@ -7,33 +7,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.drags.captures import Drawn
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing import footprint
-from brushloop.calibrate.writing.footprint import (
+from brushloop.calibrate.writing import learn
+from brushloop.calibrate.writing.learn import (
     FIGURES,
     FOLDER,
     MARGIN,
     FootprintArtefact,
-    fit_session,
-    load_footprint,
+    PracticeRequest,
+    fit,
+    practice,
     practice_strokes,
-    write_practice,
 )
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
-from brushloop.model.characters.brush import Reach
-from brushloop.model.characters.plan import without_tilt
+from brushloop.model.characters.plan import Reach, without_tilt
+from brushloop.model.drag import Drawings
 from brushloop.model.footprint import NAMES, Footprint
 from brushloop.sessions.records import Header, Source
-from tests.calibrate.given import BY, CALIBRATION
+from tests.calibrate.given import CALIBRATION
 from tests.command import brushloop
 
 SIDE_MM = 70.0
 
 
 def test_a_practice_sheet_is_a_protocol_that_stays_inside_its_cells(tmp_path: Path) -> None:
-    protocol = load_protocol(write_practice(tmp_path, SIDE_MM, BY, seed=1))
+    protocol = load_protocol(practice(PracticeRequest(tmp_path)).path)
     assert isinstance(protocol, WriteConfig)
     assert len(protocol.figures) == FIGURES
     points = np.concatenate([np.array(stroke.points) for one in protocol.figures for stroke in one.strokes])
@@ -55,24 +56,24 @@ def test_a_session_of_practice_becomes_a_footprint(tmp_path: Path, monkeypatch: 
 
     def drawn(count: int) -> Drawn:
         header = Header(session_id="practice-01", source=Source.LOOPBACK, software="test")
-        groups = np.array([0, 2, 4])[: count + 1]
         names = ["practice-01-r01", "practice-02-r01"][:count]
-        flat, images = paths[: 2 * count], ink[:count]
-        return Drawn(header, "ab", CALIBRATION, x_mm, y_mm, flat, groups, images, names, [], None, [()] * count, "")
+        groups = np.array([0, 2, 4])[: count + 1]
+        drawings = Drawings(paths[: 2 * count], groups, ink[:count], x_mm, y_mm, np.ones(count))
+        return Drawn(header, "ab", CALIBRATION, drawings, names, [], None, [()] * count, "")
 
-    monkeypatch.setattr(footprint, "read_drags", lambda *_, **__: drawn(2))
-    made, path = fit_session(tmp_path)
+    monkeypatch.setattr(learn, "read_drags", lambda *_, **__: drawn(2))
+    path = fit(tmp_path).path
     assert path.parent == tmp_path / FOLDER
-    assert load_footprint(path) == made
-    assert made.source == "loopback rig"
-    assert made.strokes == 4
-    assert made.csim_percent > 95.0
-    older = made.model_dump() | {"values": {"drift_along_mm": 0.0}}
+    artefact = load_artefact(path, FootprintArtefact)
+    assert artefact.source == "loopback rig"
+    assert artefact.strokes == 4
+    assert artefact.csim_percent > 95.0
+    older = artefact.model_dump() | {"values": {"drift_along_mm": 0.0}}
     with pytest.raises(ValueError, match="fit the session again with `brushloop write fit`"):
         FootprintArtefact.model_validate(older)
-    monkeypatch.setattr(footprint, "read_drags", lambda *_, **__: drawn(1))
+    monkeypatch.setattr(learn, "read_drags", lambda *_, **__: drawn(1))
     with pytest.raises(CalibrationError, match="holds 2 strokes, at least 3 are needed"):
-        fit_session(tmp_path)
+        fit(tmp_path)
 
 
 def test_a_file_that_is_no_footprint_is_one_line(tmp_path: Path) -> None:

@@ -7,25 +7,23 @@ from pathlib import Path
 import pytest
 
 from brushloop.calibrate.report import Written
-from brushloop.calibrate.writing import command
-from brushloop.calibrate.writing.command import CompareRequest, LearnRequest, PlanRequest, PracticeRequest
-from brushloop.calibrate.writing.plan_record import FILE as PLAN
-from brushloop.calibrate.writing.plan_record import PROTOCOL, FigureRecord, PlanRecord
+from brushloop.calibrate.writing.learn import LearnRequest, PracticeRequest
+from brushloop.calibrate.writing.plan import PlanRequest
+from brushloop.calibrate.writing.record import FILE as PLAN
+from brushloop.calibrate.writing.record import PROTOCOL, FigureRecord, PlannedBy, PlanRecord
+from brushloop.calibrate.writing.report import CompareRequest
 from brushloop.collect.chains import writing
 from brushloop.collect.chains.writing import FOOTPRINT, Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
 from brushloop.sessions.journal import JOURNAL_NAME
-from tests.calibrate.given import BY
 
 CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]\nname = "子"\n[[figures.strokes]]\n'
 POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
 
 
 def plan(settled: bool) -> PlanRecord:
-    figure = FigureRecord(
-        name="子", source="", commanded=(), intended=(), wanted_png="", simulated_png="", settled=settled
-    )
-    return PlanRecord(model="", planned_by=BY, cell_mm=48.0, software="", figures=(figure,))
+    figure = FigureRecord(name="子", source="", commanded=(), wanted_png="", simulated_png="", settled=settled)
+    return PlanRecord(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
 
 
 class Commands:
@@ -34,8 +32,9 @@ class Commands:
     def __init__(self, settled_after: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ran: list[str] = []
         self._rounds, self._settled_after = 0, settled_after
-        for name in ("plan", "compare", "learn", "practice", "fit"):
-            monkeypatch.setattr(command, name, getattr(self, name))
+        for name in ("plan.plan", "report.compare", "learn.learn", "learn.practice", "learn.fit"):
+            command = getattr(self, name.split(".")[1])
+            monkeypatch.setattr(f"brushloop.calibrate.writing.{name}", command)
 
     def plan(self, request: PlanRequest, _: object) -> Written:
         return self._planned("plan", request.out, request.repeats)

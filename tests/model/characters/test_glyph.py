@@ -10,10 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.model.characters.glyph import GlyphError, parse_glyph, parse_path
-from brushloop.model.characters.hand import parse_csv, parse_json
+from brushloop.model.characters.glyph import (
+    GlyphError,
+    distance_to,
+    parse_csv,
+    parse_glyph,
+    parse_json,
+    parse_path,
+    paths_of,
+)
 from brushloop.model.characters.ink import reference
-from brushloop.model.characters.plan import Cell, distance_to, paths_of, resampled, tangents
+from brushloop.model.characters.plan import Patch, resampled, tangents
 
 SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"
 
@@ -30,7 +37,7 @@ def glyph_text(**changes: object) -> str:
 def test_the_shipped_characters_can_be_read(name: str, strokes: int) -> None:
     glyph = parse_glyph(shipped(name), name)
     assert len(glyph.strokes) == strokes
-    ink = reference(glyph, Cell(60.0, 0.0))
+    ink = reference(glyph, Patch(60.0, 0.0))
     assert 0.05 < ink.mean() < 0.3
     assert ink.max() == 1.0
 
@@ -68,7 +75,7 @@ def test_the_half_width_of_a_bar_is_half_its_width() -> None:
 
 
 def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
-    cell = Cell(70.0, 6.0)
+    cell = Patch(70.0, 6.0)
     assert cell.to_mm(np.array([[0.0, -124.0], [1024.0, 900.0]])).tolist() == [[6.0, 6.0], [64.0, 64.0]]
     for path in paths_of(parse_glyph(shipped("永"), "永"), cell, 2.0):
         assert np.all(path.half_width_mm > 0)
@@ -100,7 +107,7 @@ def test_headings_are_unwrapped_along_a_spiral() -> None:
         (glyph_text(strokes=["M 0 0 L 9 0 Z"]), "strokes.0: encloses nothing"),
         (glyph_text(strokes=["M 0 0 L 9 0 #"]), "is not a path at character"),
         (glyph_text(strokes=["M 0 0 " + "L 1 2 L 3 4 " * 2000]), "more than 1024 pieces"),
-        (glyph_text(medians=[[[0, 0]]]), "medians.0: expected 2 to 256 points"),
+        (glyph_text(medians=[[[0, 0]]]), "medians.0: expected a list of 2 to 256 points"),
         (glyph_text(medians=[[[0, 0], [0, "x"]]]), "medians.0.1: expected [x, y]"),
         (glyph_text(medians=[[[0, 0], [0, float("nan")]]]), "medians.0.1: expected [x, y]"),
         (glyph_text(medians=[[[0, 0], [True, 1]]]), "medians.0.1: expected [x, y]"),
@@ -127,8 +134,8 @@ def test_any_path_is_arcs_or_a_glyph_error(path: str) -> None:
 
 def test_a_hand_gives_ways_and_widths() -> None:
     text = "stroke,x_mm,y_mm,width_mm\n1,10,10,2\n1,30,10,4\n2,10,30,3\n2,10,50,3\n"
-    ways = parse_csv(text, Cell(), 2.0)
-    same = parse_json('{"strokes": [[[10,10,2],[30,10,4]],[[10,30,3],[10,50,3]]]}', Cell(), 2.0)
+    ways = parse_csv(text, Patch(), 2.0)
+    same = parse_json('{"strokes": [[[10,10,2],[30,10,4]],[[10,30,3],[10,50,3]]]}', Patch(), 2.0)
     assert len(ways) == len(same) == 2
     for one, other in zip(ways, same, strict=True):
         assert np.allclose(one.points, other.points)
@@ -141,7 +148,7 @@ def test_a_hand_gives_ways_and_widths() -> None:
     [
         ("x_mm,y_mm\n1,2\n", "line 1: has no column width_mm"),
         ("x_mm,y_mm,width_mm,z\n1,2,3,4\n", "line 1: unknown column 'z'"),
-        ("x_mm,y_mm,width_mm\n1,2\n", "line 2: 2 cells under 3 columns"),
+        ("x_mm,y_mm,width_mm\n1,2\n", "line 2: expected 3 values"),
         ("x_mm,y_mm,width_mm\n1,900,3\n", "line 2: y_mm: must be a number, 0 to 70"),
         ("x_mm,y_mm,width_mm\n1,nan,3\n", "line 2: y_mm: must be a number"),
         ("x_mm,y_mm,width_mm\n1,1_0,3\n", "line 2: y_mm: must be a number"),
@@ -152,7 +159,7 @@ def test_a_hand_gives_ways_and_widths() -> None:
 )
 def test_a_bad_hand_is_one_line(text: str, words: str) -> None:
     with pytest.raises(GlyphError) as caught:
-        parse_csv(text, Cell(), 2.0)
+        parse_csv(text, Patch(), 2.0)
     assert words in str(caught.value)
 
 
@@ -161,4 +168,4 @@ def test_a_bad_hand_is_one_line(text: str, words: str) -> None:
 )
 def test_bad_json_of_a_hand_is_refused(text: str) -> None:
     with pytest.raises(GlyphError):
-        parse_json(text, Cell(), 2.0)
+        parse_json(text, Patch(), 2.0)

@@ -12,16 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.brush import Reach, depth_of
-from brushloop.model.characters.glyph import parse_glyph
-from brushloop.model.characters.ink import dense, reference, stamped, swept, written
-from brushloop.model.characters.plan import Cell, Path, paths_of, trajectory
-from brushloop.model.characters.refine import refine
+from brushloop.model.characters.glyph import parse_glyph, paths_of
+from brushloop.model.characters.ink import dense, reference, refine, stamped, swept, written
+from brushloop.model.characters.plan import Patch, Reach, StrokePath, depth_of, trajectory
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
 
 MODEL = stroke_model("ccd-bsm", Brush())
-CELL = Cell(60.0, 3.0)
+CELL = Patch(60.0, 3.0)
 REACH = Reach()
 
 
@@ -108,26 +106,24 @@ def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
     wanted = reference(glyph, CELL, 64)
     first = [trajectory(path, MODEL, REACH, CELL, 5.0) for path in paths_of(glyph, CELL, 2.5)]
     better = refine(MODEL, first, wanted, CELL.side_mm, REACH, 25)
-    before, after = (
-        np.square(written(MODEL, one, CELL.side_mm, 64) - wanted).mean() for one in (first, better.strokes)
-    )
+    before, after = (np.square(written(MODEL, one, CELL.side_mm, 64) - wanted).mean() for one in (first, better))
     assert after < 0.15 * before
-    for points in (*first, *better.strokes):
+    for points in (*first, *better):
         assert_feasible(points, REACH)
 
 
 def test_a_shallow_brush_stays_shallow() -> None:
     reach = Reach(depth_mm=(0.5, 3.0))
-    way = Path(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 4.0))
+    way = StrokePath(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 4.0))
     first = trajectory(way, MODEL, reach, CELL, 0.0)
     better = refine(MODEL, [first], swept([way], CELL.side_mm, 64), CELL.side_mm, reach, 5)
-    assert better.strokes[0][:, 2].max() <= 3.0
+    assert better[0][:, 2].max() <= 3.0
 
 
 def test_no_steps_change_nothing() -> None:
-    way = Path(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 2.0))
+    way = StrokePath(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 2.0))
     first = trajectory(way, MODEL, REACH, CELL, 0.0)
-    assert np.array_equal(refine(MODEL, [first], swept([way], 60.0, 64), 60.0, REACH, 0).strokes[0], first)
+    assert np.array_equal(refine(MODEL, [first], swept([way], 60.0, 64), 60.0, REACH, 0)[0], first)
 
 
 @pytest.mark.parametrize("options", [{"depth_mm": (3.0, 3.0)}, {"tilt_deg": (-1.0, 5.0)}, {"plunge": 0.0}])

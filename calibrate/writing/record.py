@@ -1,6 +1,6 @@
-"""What `plan.json` holds: where each figure leads the brush, the wanted and the simulated image, and what was learned.
+"""The files of a plan: plan.json with everything that later commands need, and the protocol that draws it.
 
-Nothing here needs torch, so that a rig's computer can read a plan.
+Reading one needs no torch, so that a rig's computer can read a plan.
 """
 
 from __future__ import annotations
@@ -15,80 +15,78 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
+from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
+from brushloop.calibrate.report import write_files
+from brushloop.model.footprint import NAMES
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.messages import decode_gray
+from brushloop.sessions.messages import decode_gray, encode_png
 
 FILE, PROTOCOL = "plan.json", "protocol-write.toml"
-"""Names of the files of a plan; the protocol is written last."""
+"""Names of the files of a plan; the protocol is written last: if it exists, so does the other."""
 MAX_PLAN_BYTES = 4 * 1024 * 1024
 Text = Annotated[str, Field(max_length=64 * 1024)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Points = tuple[tuple[tuple[Number, Number, Number, Number, Number], ...], ...]
-"""[stroke][point] of x, y, height, tilt, heading, as in the protocol."""
+"""[stroke][point] of x, y, depth, tilt, heading, as in the protocol."""
 Floats = NDArray[np.float64]
 
 
-class PlannedBy(BaseModel):
-    """The model and the brush's reach that a plan was made with."""
+class PlannedBy(Frozen):
+    """The model, and the limits of brush and arm, that a plan is made with."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    model: str
+    model: str = "ccd-bsm"
     """Name of the stroke model."""
-    radius_mm: Number
-    length_mm: Number
-    lam: Number | None
-    """None means pi."""
-    depth_range_mm: tuple[Number, Number]
-    tilt_range_deg: tuple[Number, Number]
-    turn_deg_mm: Number
-    speed_mm_s: Number
-    drag_fit: Annotated[str, Field(max_length=64)] = ""
-    """Digest of the drag fit that images were drawn with; empty for superimposed presses."""
-    footprint: Annotated[tuple[Number, ...], Field(max_length=64)] | None = None
+    radius_mm: Number = 6.0
+    length_mm: Number = 48.0
+    lam: Number | None = None
+    """lambda of CCD-BSM; None means pi."""
+    depth_range_mm: tuple[Number, Number] = (0.5, 20.0)
+    tilt_range_deg: tuple[Number, Number] = (0.0, 10.0)
+    speed_mm_s: Number = 15.0
+    """Speed of the tip."""
+    wrist_deg_s: Number = 180.0
+    """Greatest speed of the wrist."""
+    footprint: Annotated[tuple[Number, ...], Field(min_length=len(NAMES), max_length=len(NAMES))] | None = None
     """Values of the fitted footprint (`model.footprint`) that the plan leads the brush by; None without one."""
 
 
-class Round(BaseModel):
+class Round(Frozen):
     """What one round of learning found: the mean of its writings against the wanted image, mm, binary, ink = 1."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     csim_percent: Number
     lost_percent: dict[str, Number]
     """Phase -> wrong pixels (missing or too much) there, in percent of the wanted ink."""
 
 
-class FigureRecord(BaseModel):
+class FigureRecord(Frozen):
     """One planned figure."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
     source: Text
     """Font or file that the wanted image comes from."""
     commanded: Points
     """Where the arm goes."""
-    intended: Points
-    """What `commanded` was before learning moved its points; the same as `commanded` in plans of today."""
     wanted_png: Text
-    """128 x 128 gray in base64, ink black, row 0 at the cell's far edge."""
+    """128 x 128 gray in base64, ink black, row 0 at the patch's far edge."""
     simulated_png: Text
     medians: tuple[tuple[tuple[Number, Number, Number], ...], ...] = ()
-    """[stroke][point] of x, y and half width in mm: what the phases follow from; empty in older plans."""
+    """[stroke][point] of x, y and half width in mm: what the phases follow from; empty for practice strokes."""
     rounds: Annotated[tuple[Round, ...], Field(max_length=1000)] = ()
     """The rounds of learning so far, in order."""
     best: Points = ()
     """What was commanded in the best of them."""
-    best_png: Text = ""
-    """Written by an earlier version, and not used."""
     settled: bool = False
     """Whether a further round is not expected to help: `commanded` is then the best that was written."""
+
+    @property
+    def strokes(self) -> list[Floats]:
+        """The commanded trajectories, (N, 5) each."""
+        return [np.array(stroke, np.float64) for stroke in self.commanded]
 
     @property
     def points_sha256(self) -> str:
@@ -104,10 +102,8 @@ class FigureRecord(BaseModel):
         return _decoded(self.simulated_png, f"{self.name}: simulated_png")
 
 
-class PlanRecord(BaseModel):
+class PlanRecord(Frozen):
     """A plan."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     model: str
     """Label of the stroke model that planned and drew."""
@@ -121,11 +117,6 @@ class PlanRecord(BaseModel):
         return next((figure for figure in self.figures if figure.name == name), None)
 
 
-def arrays(points: Points) -> list[Floats]:
-    """Convert points to trajectories (N, 5)."""
-    return [np.array(stroke, np.float64) for stroke in points]
-
-
 def load_plan(path: Path) -> PlanRecord:
     """Read plan.json, or the one in a plan's folder. Raises `CalibrationError`."""
     path = path / FILE if path.is_dir() else path
@@ -135,10 +126,43 @@ def load_plan(path: Path) -> PlanRecord:
         raise invalid(str(path), error) from None
 
 
+def write_plan(record: PlanRecord, repeats: int, out: Path) -> Path:
+    """Write plan.json, then the protocol that draws it `repeats` times; returns the protocol's path. Raises OSError."""
+    side = record.cell_mm
+    lines = [
+        'kind = "write"',
+        f"cell_mm = [{side!r}, {side!r}]",
+        f"speed_mm_s = {record.planned_by.speed_mm_s!r}",
+        "blend_mm = 1.0",
+        f"repeats = {repeats}",
+    ]
+    for figure in record.figures:
+        source = " ".join(figure.source.split())
+        lines += ["", f"# From {json.dumps(source)}", "[[figures]]"]
+        lines.append(f"name = {json.dumps(figure.name, ensure_ascii=False)}")
+        for stroke in figure.commanded:
+            lines += ["", "[[figures.strokes]]", "points = ["]
+            lines += ["    [" + ", ".join(f"{value:.3f}" for value in point) + "]," for point in stroke]
+            lines.append("]")
+    write_files(out, {FILE: record.model_dump_json(indent=2) + "\n", PROTOCOL: "\n".join(lines) + "\n"})
+    return out / PROTOCOL
+
+
+def as_points(strokes: Sequence[Floats]) -> Points:
+    """Convert trajectories (N, 5) to points, rounded like the protocol to 0.001."""
+    rounded = (np.round(stroke, 3).tolist() for stroke in strokes)
+    return tuple(tuple((x, y, depth, tilt, heading) for x, y, depth, tilt, heading in stroke) for stroke in rounded)
+
+
 def points_digest(strokes: Sequence[Any]) -> str:
-    """SHA-256 of trajectories [stroke][point][x, y, height, tilt, heading], rounded like the protocol to 0.001."""
+    """SHA-256 of trajectories [stroke][point][x, y, depth, tilt, heading], rounded like the protocol to 0.001."""
     rounded = [[[round(float(value), 3) + 0.0 for value in point] for point in stroke] for stroke in strokes]
     return hashlib.sha256(json.dumps(rounded, separators=(",", ":")).encode()).hexdigest()
+
+
+def encoded(ink: Image) -> str:
+    """(128, 128) ink as a PNG in base64."""
+    return base64.b64encode(encode_png(np.rint(255.0 * (1.0 - ink)).astype(np.uint8))).decode()
 
 
 def _decoded(text: str, where: str) -> Image:

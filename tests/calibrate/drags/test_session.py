@@ -1,0 +1,233 @@
+"""From photographs of dragged strokes to a drag model on disk and a report; loopback brush and drawn strokes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console  # noqa: TID251
+from typer.testing import CliRunner
+
+from brushloop.__main__ import app
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.drags.brush import FOLDER, LAGGING, STAMPS, DragArtefact
+from brushloop.calibrate.drags.captures import (
+    FLAGGED_WEIGHT,
+    along_axis,
+    commanded_path,
+    defects,
+    figures_of,
+    read_drags,
+    validate_drags,
+)
+from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke.measure import measure
+from brushloop.calibrate.stroke.params import Params
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Header, Source
+from tests.photographed import imported, photograph
+
+STROKES = [
+    (30.0, 0.0, 4.0),
+    (30.0, 12.0, 7.0),
+    (25.0, -12.0, 5.0),
+    (35.0, 8.0, 8.0),
+    (28.0, -8.0, 3.0),
+    (32.0, 15.0, 6.0),
+]
+LEFT, TOP = 200, 250
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    lines = ["file,length_mm,bend_mm,depth_mm,px_per_mm,start_x_px,start_y_px"]
+    brush = Brush(BrushSpec())
+    for k, (length, bend, depth) in enumerate(STROKES):
+        path = commanded_path(length, bend, depth, depth)
+        mark = brush.drag([Waypoint(*row[:3]) for row in path.tolist()], 0.0, 0.0, ink_load=1.0, press_seed=k)
+        photograph(folder / f"{k}.png", mark, (700, 900), (300, 350))
+        lines.append(f"{k}.png,{length},{bend},{depth},10.0,300,350")
+    return imported(folder, lines, tmp_path_factory.mktemp("sessions") / "drags", "drag")
+
+
+def fit_command(session: Path, *more: str) -> tuple[Path, str]:
+    """The artefact that `brushloop fit --drags` writes, and what it prints."""
+    ran = CliRunner().invoke(app, ["fit", str(session), "--drags", "--mm-per-px", "1.0", *more])
+    assert ran.exit_code == 0, ran.output
+    path = current(session, FOLDER)
+    assert path is not None
+    return path, " ".join(ran.output.split())
+
+
+@pytest.fixture(scope="module")
+def fitted(session: Path) -> tuple[Path, str]:
+    """Fitted once, for whoever only reads it."""
+    return fit_command(session)
+
+
+def test_dragged_strokes_are_fitted_and_written(session: Path, fitted: tuple[Path, str]) -> None:
+    path, output = fitted
+    for words in ("bristle lag", "circle stamps", "leash_mm", "not determined", "no depth at the ends"):
+        assert words in output
+    fit = load_artefact(path, DragArtefact)
+    assert (fit.images, fit.strokes) == (6, 6)
+    assert fit.held_out[LAGGING].csim_percent > fit.held_out[STAMPS].csim_percent + 2.0
+    assert fit.model().leash_mm + 6.0 * fit.model().leash_per_mm > 1.0
+    assert fit.parameters["half_mm"].low is not None
+    assert fit.parameters["settle_mm"].low is None  # each depth is constant along its path
+    assert fit_command(session)[0] == path, "equal inputs give an equal file"
+
+
+def test_another_session_is_predicted_stroke_by_stroke(session: Path, fitted: tuple[Path, str], tmp_path: Path) -> None:
+    """Here the session itself, so that the report has to say "in sample"."""
+    out = tmp_path / "report"
+    ran = CliRunner().invoke(app, ["validate", str(session), "--fit", str(fitted[0]), "--out", str(out)])
+    assert ran.exit_code == 0, ran.output
+    words = " ".join(ran.output.split())
+    for part in ("circle stamps", "bristle lag alone", "predicted worst", "In sample", "No command was repeated"):
+        assert part in words
+    said = json.loads((out / "report.json").read_text())
+    assert said["source"] == "imported photographs"
+    assert said["over_all"]["predicted"]["csim"] > said["over_all"]["circle stamps"]["csim"]
+    assert len(said["strokes"]) == 6
+    assert "captured and predicted ink" in (out / "report.html").read_text()
+
+
+def test_a_known_brush_is_adapted_to_few_strokes(session: Path, fitted: tuple[Path, str]) -> None:
+    before = load_artefact(fitted[0], DragArtefact)
+    options = ("--prior", str(fitted[0]), "--strokes")
+    adapted = load_artefact(fit_command(session, *options, "2")[0], DragArtefact)
+    assert (adapted.prior, adapted.images) == (before.digest, 2)
+    assert adapted.parameters["settle_mm"] == before.parameters["settle_mm"]
+    assert adapted.refitted[:2] == ("half_mm", "half_per_mm")
+    assert adapted.kept == before.kept
+    path, output = fit_command(session, *options, "1")
+    assert "drift_x_mm" in output
+    one = load_artefact(path, DragArtefact)
+    assert one.parameters["drift_x_mm"].low is None  # a single stroke has no interval, not one of width zero
+    many = CliRunner().invoke(app, ["fit", str(session), "--drags", *options, "7"])
+    assert "allowed 1 to 6" in str(many.exception)
+
+
+@pytest.mark.parametrize("ink", ["not base64!", "", "aGVsbG8="])
+def test_hostile_ink_in_an_artefact_is_refused(fitted: tuple[Path, str], ink: str) -> None:
+    fit = load_artefact(fitted[0], DragArtefact)
+    assert fit.kept is not None
+    bad = fit.model_copy(update={"kept": fit.kept.model_copy(update={"ink": ink})})
+    with pytest.raises(CalibrationError, match=r"fit\.json: kept: ink"):
+        bad.predictor("fit.json", fit.recording_sha256)
+
+
+def test_an_edited_file_and_presses_are_refused_with_one_line(
+    session: Path, fitted: tuple[Path, str], tmp_path: Path
+) -> None:
+    edited = tmp_path / fitted[0].name
+    edited.write_text(fitted[0].read_text().replace('"leash_mm"', '"leash_m"'))
+    with pytest.raises(CalibrationError, match="leash_mm"):
+        load_artefact(edited, DragArtefact)
+    ran = CliRunner().invoke(app, ["fit", str(session)])
+    assert ran.exit_code != 0
+    assert "drags" in str(ran.exception)
+    assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--correction"]).exit_code == 2
+
+
+def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:
+    drawn = read_drags(session, 1.0)
+    drawings = drawn.drawings
+    straight = drawings.ink[drawn.stroke_ids.index("0")] > 0.5
+    x, y = drawings.x_mm[straight.any(axis=0)], drawings.y_mm[straight.any(axis=1)]
+    assert -12.0 < x.min() < 2.0
+    assert 20.0 < x.max() < 36.0
+    assert abs(float(y.mean())) < 2.0
+
+
+def test_a_drawn_figure_has_the_strokes_of_its_protocol() -> None:
+    def header(protocol: str) -> Header:
+        return Header(session_id="s", source=Source.LOOPBACK, software="test", protocol=protocol)
+
+    points = [[1.0, 2.0, 3.0, 4.0, 90.0], [5.0, 6.0, 7.0, 8.0, 90.0]]
+    protocol = {"kind": "write", "figures": [{"name": "yong", "strokes": [{"points": points}, {"points": points}]}]}
+    found = figures_of(header(json.dumps(protocol)))
+    assert [path.tolist() for path in found["yong"]] == [[[1.0, 2.0, 3.0, 90.0], [5.0, 6.0, 7.0, 90.0]]] * 2
+    with pytest.raises(CalibrationError, match="holds no trajectories"):
+        figures_of(header('{"kind": "grid"}'))
+
+
+def page(defect: str) -> np.ndarray:
+    """A stroke of 40 x 5 mm on gray paper, 10 px/mm."""
+    image = np.full((500, 800), 185, np.uint8)
+    cv2.rectangle(image, (LEFT, TOP - 25), (LEFT + 400, TOP + 25), 30, -1)
+    match defect:
+        case "torn":
+            image[:, LEFT + 150 : LEFT + 190] = 185
+        case "hollow":
+            image[TOP - 17 : TOP + 17, LEFT + 8 : LEFT + 392] = 185
+        case "glare":
+            cv2.circle(image, (LEFT + 100, 80), 30, 253, -1)
+        case "cut":
+            image[:, LEFT + 370 : LEFT + 390] = 185
+            image[TOP - 25 : TOP + 25, LEFT + 390 :] = 30
+        case _:
+            pass
+    return image
+
+
+@pytest.fixture(scope="module")
+def flawed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One whole stroke, three with a defect, and one that the photograph cuts."""
+    folder = tmp_path_factory.mktemp("flawed")
+    lines = ["file,length_mm,depth_mm,px_per_mm,start_x_px,start_y_px"]
+    for k, name in enumerate(("whole", "torn", "hollow", "glare", "cut")):
+        cv2.imwrite(str(folder / f"{name}.png"), page(name))
+        lines.append(f"{name}.png,40,{3 + k},10,{LEFT},{TOP}")
+    return imported(folder, lines, tmp_path_factory.mktemp("flawed-session") / "drags", "drag")
+
+
+def test_flagged_strokes_count_less_and_a_cut_one_not_at_all(flawed: Path) -> None:
+    drawn = read_drags(flawed, 1.0)
+    weights = dict(zip(drawn.stroke_ids, drawn.drawings.weights.tolist(), strict=True))
+    assert weights == {"whole": 1.0, "torn": FLAGGED_WEIGHT, "hollow": FLAGGED_WEIGHT, "glare": FLAGGED_WEIGHT}
+    assert [name for name, _ in drawn.refused] == ["cut"]
+    for name, flags in zip(drawn.stroke_ids[1:], drawn.flags[1:], strict=True):
+        assert flags[0].startswith(name)
+
+
+def test_the_report_lists_defects_and_says_everywhere_what_is_simulated(flawed: Path, tmp_path: Path) -> None:
+    recording = Recording(flawed)
+    results = validate_drags(recording.captures(), Params())
+    header = recording.header.model_copy(update={"source": Source.IMPORT_SIMULATED})
+    validation = DragValidation(header, recording.path, "", results)
+    html = write_drags(validation, tmp_path, "test").read_text()
+    said = "\n".join(line for line in summary(validation) if isinstance(line, str))
+    for words in ("torn: torn: 2 parts", "hollow: hollow: ink covers", "glare: glare:"):
+        assert words in html
+        assert f"counts less: {words}" in said
+    assert html.count("imported simulation") >= 3
+    assert "imported photographs" not in html
+    with (tmp_path / "measured.csv").open() as file:
+        rows = {row["stroke_id"]: row for row in csv.DictReader(file)}
+    assert [name for name, row in rows.items() if row["cut"] == "1"] == ["cut"]
+    assert rows["whole"]["source"] == "imported simulation"
+    assert {drag.stroke_id: drag.weight for drag in results.strokes}["torn"] == FLAGGED_WEIGHT
+    with io.StringIO() as narrow:
+        Console(file=narrow, width=80).print(*summary(validation))
+        heads = narrow.getvalue().split("┡")[0]
+    for word in ("stroke", "cmd.", "length", "depth", "width", "middle", "area", "whole"):
+        assert word in heads, f"the head {word} is broken"
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 45.0, 90.0, -60.0])
+def test_the_length_of_a_stroke_is_along_its_own_axis(angle_deg: float) -> None:
+    box = np.rint(cv2.boxPoints(((300.0, 300.0), (400.0, 60.0), angle_deg))).astype(np.int32)
+    bar = cv2.fillPoly(np.zeros((600, 600), np.uint8), [box], 1).astype(bool)
+    size = measure(along_axis(bar))
+    assert (size.length_mm, size.width_mm) == pytest.approx((20.0, 3.0), abs=0.25)
+    assert defects(bar) == ()
