@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from brushloop.calibrate.fit.captures import Captures
     from brushloop.twin.run import Twin
-    from brushloop.twin.shape import Found
 
 
 def twin(
@@ -29,17 +28,16 @@ def twin(
     `brushloop sim --brush twin.toml` is then a rig that presses like that brush. A run that was interrupted
     continues when the same command is given again.
     """
-    from importlib.metadata import version
     from shlex import quote
 
+    from brushloop.calibrate.artefact import made_by
     from brushloop.calibrate.compare.place import Field
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target, write_whole
     from brushloop.calibrate.fit.captures import read_presses
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
-    from brushloop.twin.camera import noise_gray
-    from brushloop.twin.file import Notes, notes_path, resumed, save_notes, twin_toml
+    from brushloop.twin.file import Notes, noise_gray, twin_toml
     from brushloop.twin.run import fit_twin, workers
 
     recording = Recording(session)
@@ -47,31 +45,19 @@ def twin(
     check_target(target, ".toml")
     if target.exists() and not replace:
         raise CalibrationError(str(target), "exists: give --out FILE or --replace")
-    notes_file = notes_path(target)
     with shown() as progress:
         captures = read_presses(session, Field(), calibration, progress)
         used = captures.calibration.digest if captures.calibration else ""
-        fresh = Notes(
-            recording_sha256=captures.recording_sha256,
-            calibration=used,
-            mm_per_px=MM_PER_PX,
-            software=f"brushloop {version('brushloop')}",
-        )
-        kept = [resumed(notes_file, fresh)]
-
-        def keep(name: str, found: Found) -> None:
-            kept[0] = kept[0].with_step(name, found)
-            save_notes(notes_file, kept[0])
-
+        notes = Notes(target, captures.recording_sha256, used, f"{MM_PER_PX:g} mm/px", made_by())
+        brush = captures.radius_mm, captures.length_mm
         with workers() as pool:
             try:
-                brush = captures.radius_mm, captures.length_mm
-                fitted = fit_twin(captures.strokes, captures.grid, *brush, pool, progress, kept[0].found(), keep)
+                fitted = fit_twin(captures.strokes, captures.grid, *brush, pool, progress, notes.known)
             except ValueError as error:
                 raise CalibrationError(str(recording.path), str(error)) from None
     noise = noise_gray(recording)
     write_whole(target, twin_toml(fitted, captures.header.session_id, noise))
-    notes_file.unlink(missing_ok=True)
+    notes.path.unlink(missing_ok=True)
     say(*_tables(captures, fitted, noise), f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
 
 
@@ -85,8 +71,8 @@ def _tables(captures: Captures, fitted: Twin, noise: float | None) -> Iterator[o
         yield f"left out: {name}: {why}"
     out = Table("constant", "unit", "default", "twin", "95 %", title="simulated brush")
     for one in fitted.estimates:
-        interval = f"{one.low:.3g} to {one.high:.3g}" if one.determined else "not determined"
-        out.add_row(one.constant.name, one.constant.unit, f"{one.constant.default:.4g}", f"{one.value:.4g}", interval)
+        found = (f"{one.value:.4g}", f"{one.low:.3g} to {one.high:.3g}") if one.determined else ("", "not determined")
+        out.add_row(one.constant.name, one.constant.unit, f"{one.constant.default:.4g}", *found)
     yield out
     if noise is None:
         yield "The camera's noise was not measured: no two stills show the same view."

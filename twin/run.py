@@ -14,33 +14,39 @@ from typing import ClassVar
 
 import numpy as np
 
-from brushloop.calibrate.fit.captures import Grid, Pressed, by_cell
-from brushloop.calibrate.fit.heldout import (
-    BEZIER,
-    HeldOut,
-    Scores,
-    image_of,
-    refit_bezier,
-)
+from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
+from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Scores, image_of, refit_bezier
 from brushloop.calibrate.stats import CEILING
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.config import SoundHead
 from brushloop.sessions.terminal import Progress, unseen
-from brushloop.twin.constants import SHAPE, SPREAD, Constant, Offset, Vector, brush_at, offset_at, with_values
-from brushloop.twin.drawing import Cell, Images, draw
-from brushloop.twin.shape import (
+from brushloop.twin.brush import (
+    SHAPE,
+    SPREAD,
+    Constant,
+    Images,
+    Offset,
+    Vector,
+    brush_at,
+    draw,
+    offset_at,
+    with_values,
+)
+from brushloop.twin.search import (
     COARSE,
+    FEWEST_REPEATS,
     FINE,
     Found,
-    Round,
+    Repeats,
+    Spread,
     Target,
     choose_individual,
     covariance,
+    fit_spread,
     of_parts,
     search,
     start,
 )
-from brushloop.twin.spread import FEWEST_REPEATS, Repeats, Spread, fit_spread
 
 MOST_WORKERS = 8
 MOST_SD = 0.7
@@ -48,9 +54,7 @@ MOST_SD = 0.7
 NORMAL_95 = 1.96
 WIDER = 3.5
 """Factor on the standard errors of mechanics and ink: constants that have nearly the same effect are known less well
-than the derivatives at one point say. It was chosen on two brushes of `DEVELOPMENT` in `bench/brushes.py`."""
-Keep = Callable[[str, Found], None]
-"""Called after each step with its name and the point that the search has reached."""
+than the derivatives at one point say. It was chosen on two brushes whose twins are not measured by the benches."""
 PARTS = 3
 TWIN = "twin"
 VOTES = 7
@@ -64,6 +68,8 @@ MARGIN_MM = 0.8
 and other presses differ."""
 LEAST_MISPLACED_MM = 1.6
 """The limit of the quality checks by default: a smaller one is not needed."""
+Known = Callable[[str, Callable[[], Found]], Found]
+"""The result of a step by its name: that of an interrupted run, or else that of the work, which is then kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +82,14 @@ class Estimate:
     high: float
     determined: bool
     """False where the presses do not determine it; the prior then does."""
+
+    @staticmethod
+    def of(constant: Constant, scales: float, error: float) -> Estimate:
+        """The estimate at a point of the search; the standard error in scales."""
+        ends = (constant.value(scales + way * NORMAL_95 * error) for way in (-1.0, 1.0))
+        low, high = constant.bounds
+        determined = error < MOST_SD and low + 0.01 < scales < high - 0.01
+        return Estimate(constant, constant.value(scales), *ends, determined=bool(determined))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,164 +156,99 @@ def fit_twin(
     length_mm: float,
     pool: Executor,
     progress: Progress = unseen,
-    before: dict[str, Found] | None = None,
-    keep: Keep = lambda _name, _found: None,
+    known: Known = lambda _name, work: work(),
 ) -> Twin:
     """Fit the twin of a brush of this size to its presses.
 
-    `before` holds the finished steps of an interrupted run; `keep` is called with each new one.
     Raises ValueError for a press that is deeper than a brush of this size allows.
     """
     cells = by_cell(strokes)
-    target = target_of(cells, radius_mm, length_mm, grid)
+    means = np.asarray([np.mean([press.ink for press in group], axis=0) for group in cells.values()], np.float32)
+    target = Target(BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0), tuple(cells), grid, means)
     parts = parts_of(target.cells)
-    ticks = _Ticks(progress, (1 + len(parts)) * sum(one.steps for one in (*COARSE, FINE)))
-    run = _Run(pool, ticks, before or {}, keep)
-    found = run.coarse("all cells", target)
-    repeats, spread = repeats_of(cells), None
-    if repeats.cells:
+    searches = _Searches(pool, known, progress, 1 + len(parts))
+    found = searches.coarse("all cells", target)
+    several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST_REPEATS}
+    repeats = Repeats(tuple(several), tuple(np.array([press.ink for press in group]) for group in several.values()))
+    spread: Spread | None = None
+    if several:
         spread = fit_spread(_brush(found, target), offset_at(found.point), repeats, grid, pool.map)
         # hairs that stray make every mark wider and its ends fainter: the shape is fitted to the captures with them
         target = replace(target, base=with_values(target.base, SPREAD, spread.point))
-    found = run.fine("all cells", target, found)
+    found = searches.fine("all cells", target, found)
     variance = np.diagonal(covariance(target, found, pool))
     spec, offset = _brush(found, target), offset_at(found.point)
     if spread is not None:
         spread = fit_spread(spec, offset, repeats, grid, pool.map, spread.point)
     scores, points = Scores(), list[Vector]()
     for number, part in enumerate(parts, 1):
-        kept = [k for k in range(len(cells)) if k not in part]
-        name, others = f"part {number} left out", target.only(kept)
-        there = run.fine(name, others, run.coarse(name, others))
+        name, others = f"part {number} left out", target.only([k for k in range(len(cells)) if k not in part])
+        there = searches.fine(name, others, searches.coarse(name, others))
         points.append(there.point)
         _score_part(scores, cells, [target.cells[k] for k in part], there, target)
-    ticks.end()
     errors = WIDER * np.sqrt(variance + of_parts(points))
-    estimates = [_estimate(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
+    estimates = [Estimate.of(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
         spec = with_values(spec, SPREAD, spread.point)
-        estimates += [_estimate(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
+        estimates += [Estimate.of(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
     held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
     return Twin(spec, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
 
 
-def _score_part(
-    scores: Scores,
-    cells: dict[Cell, list[Pressed]],
-    held: list[Cell],
-    there: Found,
-    target: Target,
-) -> None:
-    """Score the cells `held` by the twin found without them, and by a Bezier refitted to the others."""
-    drawn = predicted(_brush(there, target), offset_at(there.point), held, target.grid)
-    others = [one for cell, group in cells.items() if cell not in held for one in group]
-    bezier = None
-    with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-        bezier = refit_bezier(others, target.grid)
-    for cell in held:
-        images: dict[str, Images] = {TWIN: drawn[cell]}
-        if bezier is not None:
-            images[BEZIER] = image_of(bezier.outline(*cell), target.grid)
-        scores.add(cells[cell], images)
+class _Searches:
+    """The searches of one twin; those that an interrupted run finished are not repeated."""
+
+    def __init__(self, pool: Executor, known: Known, progress: Progress, twins: int) -> None:
+        self._pool, self._known, self._progress = pool, known, progress
+        self._done, self._count = 0, twins * (2 + len(COARSE) + 1)
+        progress("twin: passes of the search", 0, self._count)
+
+    def coarse(self, what: str, target: Target) -> Found:
+        found = self._step(f"{what}, first individual", lambda: choose_individual(target, start(), self._pool))
+        for one in COARSE:
+            before = found
+            name = f"{what}, blur {one.blur_mm:g} mm"
+            found = self._step(name, lambda one=one, before=before: search(target, before, one, self._pool))
+        return found
+
+    def fine(self, what: str, target: Target, found: Found) -> Found:
+        chosen = self._step(f"{what}, individual", lambda: choose_individual(target, found, self._pool))
+        name = f"{what}, blur {FINE.blur_mm:g} mm"
+        return self._step(name, lambda: search(target, chosen, FINE, self._pool))
+
+    def _step(self, name: str, work: Callable[[], Found]) -> Found:
+        found = self._known(name, work)
+        self._done += 1
+        self._progress("twin: passes of the search", self._done, self._count)
+        return found
 
 
 def _brush(found: Found, target: Target) -> BrushSpec:
     return brush_at(found.point, replace(target.base, seed=found.seed))
 
 
-def target_of(cells: dict[Cell, list[Pressed]], radius_mm: float, length_mm: float, grid: Grid) -> Target:
-    """The mean capture of each cell."""
-    means = [np.mean([one.ink for one in group], axis=0) for group in cells.values()]
-    base = BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0)
-    return Target(base, tuple(cells), grid, np.asarray(means, np.float32))
-
-
-def repeats_of(cells: dict[Cell, list[Pressed]]) -> Repeats:
-    """The captures of the cells that have at least `FEWEST_REPEATS`."""
-    several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST_REPEATS}
-    return Repeats(tuple(several), tuple(np.array([one.ink for one in group]) for group in several.values()))
-
-
-class _Ticks:
-    """Progress over all passes; a pass that ends early counts as if it had taken all its steps."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress = progress
-        self._total = total
-        self._done = 0
-        self._due = 0
-        progress("twin: steps of the search", 0, total)
-
-    def tick(self) -> None:
-        self._show(min(self._done + 1, self._total))
-
-    def passed(self, steps: int) -> None:
-        """A pass of this many steps has ended."""
-        self._due += steps
-        self._show(max(self._done, self._due))
-
-    def _show(self, done: int) -> None:
-        self._done = done
-        self._progress("twin: steps of the search", done, self._total)
-
-    def end(self) -> None:
-        self.passed(self._total - self._due)
-
-
-class _Run:
-    """The searches of one twin; those that an interrupted run finished are not repeated."""
-
-    def __init__(self, pool: Executor, ticks: _Ticks, before: dict[str, Found], keep: Keep) -> None:
-        self._pool = pool
-        self._ticks = ticks
-        self._before = before
-        self._keep = keep
-
-    def coarse(self, what: str, target: Target) -> Found:
-        found = self._individual(f"{what}, first individual", target, start())
-        for one in COARSE:
-            found = self._step(f"{what}, blur {one.blur_mm:g} mm", one, target, found)
-        return found
-
-    def fine(self, what: str, target: Target, found: Found) -> Found:
-        found = self._individual(f"{what}, individual", target, found)
-        return self._step(f"{what}, blur {FINE.blur_mm:g} mm", FINE, target, found)
-
-    def _individual(self, name: str, target: Target, found: Found) -> Found:
-        return self._known(name, lambda: choose_individual(target, found, self._pool))
-
-    def _step(self, name: str, one: Round, target: Target, found: Found) -> Found:
-        ended = self._known(name, lambda: search(target, found, one, self._pool, self._ticks.tick))
-        self._ticks.passed(one.steps)
-        return ended
-
-    def _known(self, name: str, work: Callable[[], Found]) -> Found:
-        if name in self._before:
-            return self._before[name]
-        found = work()
-        self._keep(name, found)
-        return found
-
-
-def _estimate(constant: Constant, scales: float, error: float) -> Estimate:
-    ends = (constant.value(scales + way * NORMAL_95 * error) for way in (-1.0, 1.0))
-    low, high = constant.bounds
-    inside = low + 0.01 < scales < high - 0.01
-    return Estimate(constant, constant.value(scales), *ends, determined=bool(error < MOST_SD and inside))
+def _score_part(
+    scores: Scores, cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target
+) -> None:
+    """Score the cells `held` by the twin found without them, and by a Bezier refitted to the others."""
+    drawn = draw(_brush(there, target), offset_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
+    others = [press for cell, group in cells.items() if cell not in held for press in group]
+    bezier = None
+    with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
+        bezier = refit_bezier(others, target.grid)
+    for cell, image in zip(held, drawn, strict=True):
+        images: dict[str, Images] = {TWIN: image}
+        if bezier is not None:
+            images[BEZIER] = image_of(bezier.outline(*cell), target.grid)
+        scores.add(cells[cell], images)
 
 
 def parts_of(cells: Sequence[Cell]) -> list[list[int]]:
     """Numbers of the cells in each part, along the diagonals of the grid of depths and tilts."""
-    heights, tilts = sorted({h for h, _ in cells}), sorted({a for _, a in cells})
-    diagonal = [(heights.index(h) + tilts.index(a)) % PARTS for h, a in cells]
+    depths, tilts = sorted({depth for depth, _ in cells}), sorted({tilt for _, tilt in cells})
+    diagonal = [(depths.index(depth) + tilts.index(tilt)) % PARTS for depth, tilt in cells]
     parts = [[k for k, at in enumerate(diagonal) if at == part] for part in range(PARTS)]
     return [part for part in parts if part and len(part) < len(cells)]
-
-
-def predicted(spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid) -> dict[Cell, Images]:
-    """Mean ink of several presses of the twin in each cell."""
-    drawn = draw(spec, offset, cells, grid, VOTES, FIRST_SEED)
-    return dict(zip(cells, drawn.mean(axis=1), strict=True))
 
 
 def sound_head(spec: BrushSpec, cells: Sequence[Cell], grid: Grid) -> SoundHead | None:

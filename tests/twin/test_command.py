@@ -1,23 +1,34 @@
-"""`brushloop twin`, on an imported session of shallow presses, with a short search."""
+"""`brushloop twin`, on an imported session of shallow presses, with a short search; its files and its processes."""
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Generator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.heldout import HeldOut
+from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.brush_file import load_brush
-from brushloop.twin.file import notes_path
-from brushloop.twin.run import PARTS
-from brushloop.twin.shape import Found, Round
+from brushloop.drivers.sim.config import SoundHead
+from brushloop.twin.brush import SHAPE
+from brushloop.twin.file import Notes, noise_of, twin_toml
+from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, workers
+from brushloop.twin.search import Found, Round
 from tests.photographed import imported_presses
-from tests.twin.serial import Serial
+from tests.twin.test_search import Serial
+from tests.waiting import PATIENCE_S, wait_until
 
 CELLS = [(height, tilt) for height in (3.0, 4.0, 5.0) for tilt in (0.0, 5.0)]
 
@@ -36,16 +47,19 @@ def _in_this_process() -> Generator[Executor]:
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     first, last = Round(1.0, 1), Round(0.5, 1)
-    for name, value in {"COARSE": (first,), "FINE": last, "workers": _in_this_process}.items():
+    for name, value in {"COARSE": (first,), "FINE": last, "workers": _in_this_process, "VOTES": 1}.items():
         monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
-    monkeypatch.setattr("brushloop.twin.shape.INDIVIDUALS", range(2))
-    monkeypatch.setattr("brushloop.twin.run.VOTES", 1)
+    monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(2))
 
 
-def made(session: Path, out: Path) -> str:
+def twin(session: Path, out: Path) -> str:
     ran = CliRunner().invoke(brushloop.__main__.app, ["twin", str(session), "--out", str(out)], catch_exceptions=False)
     assert ran.exit_code == 0, ran.output
     return " ".join(ran.output.split())
+
+
+class PowerCut(BaseException):
+    pass
 
 
 @pytest.mark.usefixtures("short")
@@ -55,32 +69,100 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     out, searched = tmp_path / "twin.toml", list[float]()
 
     def counted(_target: object, found: Found, one: Round, *_: object) -> Found:
+        if len(searched) == 2 and not cut:
+            cut.append(True)
+            raise PowerCut
         searched.append(one.blur_mm)
-        return found  # how a search finds its way is tested beside it
+        return found  # how a search finds its way is tested with it
 
+    cut: list[bool] = []
     monkeypatch.setattr("brushloop.twin.run.search", counted)
-    with monkeypatch.context() as broken:
-        broken.setattr("brushloop.twin.run.covariance", _power_cut)
-        with pytest.raises(PowerCut):
-            made(session, out)
-    assert notes_path(out).exists()
+    with pytest.raises(PowerCut):
+        twin(session, out)
+    assert Notes(out).path.exists()
     assert not out.exists()
     assert searched == [1.0, 0.5]
 
-    said = made(session, out)
+    said = twin(session, out)
     assert searched == [1.0, 0.5] * (1 + PARTS)  # those of all cells were not repeated
     unknown = "No cell has three captures", "The camera's noise was not measured"
     for words in ("friction", "a third of the cells left out in turn", "next: brushloop sim --brush", *unknown):
         assert words in said
-    assert not notes_path(out).exists()
+    assert not Notes(out).path.exists()
     assert load_brush(out).name == "simulated bristle bundle (twin of presses, simulated)"
     with pytest.raises(CalibrationError, match="exists: give --out FILE or --replace"):
-        made(session, out)
+        twin(session, out)
 
 
-class PowerCut(BaseException):
-    pass
+def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path: Path) -> None:
+    spec = BrushSpec(radius_mm=5.0, length_mm=42.0, friction=0.3, set_deg=9.0, seed=7)
+    estimates = tuple(Estimate(one, float(getattr(spec, one.name)), 0.1, 0.4, one.name != "set_deg") for one in SHAPE)
+    fitted = Twin(spec, estimates, None, (HeldOut("twin", 95.1, 90.2, 45),), SoundHead(2.2, 4.0))
+    path = tmp_path / "twin.toml"
+    path.write_text(twin_toml(fitted, 'session "1"\n', 1.234))
+    found = load_brush(path)
+    assert (found.spec, found.noise_gray, found.head) == (spec, 1.23, SoundHead(2.2, 4.0))
+    assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"
+    lines = {line.split(" = ")[0]: line for line in path.read_text().splitlines()}
+    assert lines["friction"].endswith("# 0.1 to 0.4")
+    assert lines["set_deg"].endswith("# deg; not determined by these presses")
 
 
-def _power_cut(*_: object) -> None:
-    raise PowerCut
+def test_steps_of_other_captures_are_not_used_and_a_foreign_file_is_refused(tmp_path: Path) -> None:
+    found, other = (Found(np.full(len(SHAPE) + 3, at), seed) for at, seed in ((0.5, 4), (1.0, 5)))
+    out = tmp_path / "twin.toml"
+    Notes(out, "session a").known("all cells", lambda: found)
+    assert Notes(out, "session a").known("all cells", lambda: other).seed == 4
+    assert Notes(out, "session b").known("all cells", lambda: other).seed == 5
+    Notes(out).path.write_text('{"steps": 3}')
+    with pytest.raises(CalibrationError, match=r"twin\.toml\.unfinished\.json: is not the file of an interrupted"):
+        Notes(out, "session a")
+
+
+def still(sd: float, seed: int) -> np.ndarray:
+    """A page under uneven light with one more mark than the still before, as the simulated camera compresses it."""
+    page = np.full((240, 320), 200.0) + np.linspace(0.0, 30.0, 320)
+    page[20 : 60 + 10 * seed, 40 * seed : 40 * seed + 20] = 30.0
+    noisy = np.clip(page + np.random.default_rng(seed).normal(0.0, sd, page.shape), 0, 255).astype(np.uint8)
+    coded = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+@pytest.mark.parametrize("sd", [1.0, 5.0])
+def test_the_camera_s_noise_is_found_in_stills_of_one_view(sd: float) -> None:
+    assert noise_of([still(sd, seed) for seed in range(4)]) == pytest.approx(sd, rel=0.15)
+    assert noise_of([still(sd, 1), still(sd, 2)[:100]]) is None
+
+
+PROGRAM = """
+import os, time
+from brushloop.twin.run import workers
+
+if __name__ == "__main__":
+    with workers(1) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        list(pool.map(time.sleep, [0.1] * 10_000))
+"""
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
+def test_a_command_that_is_killed_leaves_no_process_behind(tmp_path: Path, kill: signal.Signals) -> None:
+    script = tmp_path / "drawing.py"
+    script.write_text(PROGRAM)
+    paths = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, str(script)], **pipes, text=True, env=environment) as command:
+        assert command.stdout is not None
+        worker = Path(f"/proc/{int(command.stdout.readline())}/status")
+        command.send_signal(kill)
+        _, said = command.communicate(timeout=PATIENCE_S)
+    wait_until(lambda: not worker.exists() or "(zombie)" in worker.read_text(), "the worker's end")
+    if kill is signal.SIGTERM:
+        assert said.splitlines()[-1] == "brushloop.twin.run.TwinStopped: SIGTERM: the same command continues"
+        assert "leaked" not in said
+
+
+def test_a_worker_that_ends_first_stops_the_command_in_one_line() -> None:
+    with pytest.raises(TwinStopped, match="the same command continues"), workers(1) as pool:
+        pool.submit(os._exit, 1).result()

@@ -1,26 +1,44 @@
-"""Fit of mechanics, ink and place to the mean press of each cell, by least squares on blurred images.
+"""The searches of a twin, all by least squares with brushes that press with the same seeds.
 
-The images are blurred less from round to round: a wide blur gives the search a slope from far away, a narrow one the
-detail. The minimiser is SciPy's trust-region least squares with bounds; its derivatives are differences between brushes
-that press with the same seeds. A wide prior on each constant keeps what the presses do not determine near its default.
+Mechanics, ink and place are fitted to the mean press of each cell, on blurred images: a wide blur gives the search a
+slope from far away, a narrow one the detail. The minimiser is SciPy's trust region with bounds; its derivatives are
+differences between brushes. A wide prior on each constant keeps what the presses do not determine near its default.
+
+How presses of one cell differ is fitted to five statistics of repeats: spread, reach and bow of the tip, place of the
+mark, and stray of the hairs.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.fit.captures import Grid
 from brushloop.drivers.sim.brush.spec import BrushSpec
-from brushloop.twin.constants import SHAPE, Vector, brush_at, offset_at, search_bounds
-from brushloop.twin.drawing import Cell, Images, draw, still
+from brushloop.twin.brush import (
+    SHAPE,
+    SPREAD,
+    Cell,
+    Images,
+    Offset,
+    Vector,
+    brush_at,
+    draw,
+    offset_at,
+    search_bounds,
+    still,
+    with_values,
+)
 
 IMAGE_SD = 0.12
 """Standard deviation that the fit assumes for a blurred pixel. It is large because neighbouring pixels deviate
@@ -42,6 +60,20 @@ MOST_TRIALS = 4
 """Brushes tried for each step: one that is not nearer to the captures costs little beside the derivatives."""
 FTOL = 3e-4
 """A step that brings the sum of squares down by less than this share is the last of its pass."""
+FEWEST_REPEATS = 3
+"""Captures of a cell from which their spread is told."""
+REPEATS = 6
+"""Simulated presses of a cell."""
+FIRST_SEED = 500
+END_SHARE = 1.0 / 3.0
+"""Share of the mark whose middle measures the bow, from its tip, or the place, from its other end."""
+SPREAD_START = tuple(0.5 if one.name == "place_wander_mm" else 0.0 for one in SPREAD)
+"""Where the search starts, in scales: a place that wanders by 0 is a bad start, where deviations do not yet rise."""
+SPREAD_PRIOR_SD = 2.0
+SPREAD_STEPS = 6
+AGREEMENT_SD = 0.05
+"""Relative standard error of the disagreement of repeats, 1 - CSIM. It averages over the whole edge of each mark, so it
+is better known than the four deviations, each of one number a mark: without one repeat of four it changes by 3 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +141,8 @@ def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
     return np.asarray(soft, np.float64)
 
 
-def search(target: Target, found: Found, one: Round, workers: Executor, tick: Callable[[], None]) -> Found:
-    """One pass, starting from `found`; `tick` is called before the derivatives of each step."""
+def search(target: Target, found: Found, one: Round, workers: Executor) -> Found:
+    """One pass, starting from `found`."""
     from scipy.optimize import least_squares  # slow to import
 
     low, high = search_bounds()
@@ -124,7 +156,6 @@ def search(target: Target, found: Found, one: Round, workers: Executor, tick: Ca
         reached.append(began + moved)
         if len(reached) > one.steps + 1:
             raise _EnoughSteps
-        tick()
         at_point = partial(off, target, found.seed, one.blur_mm)
         return derivatives(at_point, reached[-1], high, STEP, workers.map)
 
@@ -194,3 +225,106 @@ def of_parts(points: Sequence[Vector]) -> Vector | float:
         return 0.0
     apart = np.asarray(points) - np.mean(points, axis=0)
     return (len(points) - 1) / len(points) * (apart**2).sum(axis=0)
+
+
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """The cells with several captures, and their ink, (n, len(y_mm), len(x_mm)) each."""
+
+    cells: tuple[Cell, ...]
+    ink: tuple[Images, ...]
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of a deviation pooled over the cells."""
+        return sum(len(one) - 1 for one in self.ink)
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """The constants in scales from their defaults, their standard errors, and the agreement of repeats."""
+
+    point: tuple[float, ...]
+    error: tuple[float, ...]
+    captured_percent: float
+    """Mean CSIM of two captures of a cell."""
+    twin_percent: float
+    """The same of the twin."""
+
+
+def fit_spread(
+    spec: BrushSpec,
+    offset: Offset,
+    repeats: Repeats,
+    grid: Grid,
+    each: Map = map,
+    start: Sequence[float] = SPREAD_START,
+) -> Spread:
+    """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST_REPEATS` captures."""
+    from scipy.optimize import least_squares  # slow to import
+
+    if not repeats.cells:
+        raise ValueError(f"no cell has {FEWEST_REPEATS} captures")
+    # twice the relative standard error of a deviation with this many degrees of freedom: the simulated one has its own
+    deviation = 2.0 / math.sqrt(2.0 * repeats.freedom)
+    sd = np.array([deviation] * 4 + [AGREEMENT_SD])
+    seen = statistics(repeats.ink, grid)
+    off = partial(_off_statistics, spec, offset, repeats.cells, grid, seen, sd)
+    low, high = np.array([one.bounds for one in SPREAD]).T
+    best = least_squares(
+        off,
+        start,
+        jac=lambda point: derivatives(off, point, high, STEP, each),
+        bounds=(low, high),
+        max_nfev=SPREAD_STEPS,
+    )
+    twin = _drawn(spec, offset, repeats.cells, grid, best.x)
+    jacobian = np.asarray(best.jac, np.float64)
+    error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
+    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(repeats.ink), agreement(twin))
+
+
+def _off_statistics(
+    spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, seen: Vector, sd: Vector, point: Vector
+) -> Vector:
+    drawn = statistics(_drawn(spec, offset, cells, grid, point), grid)
+    return np.concatenate([(drawn - seen) / sd, point / SPREAD_PRIOR_SD])
+
+
+def _drawn(spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, point: Vector) -> list[Images]:
+    return list(draw(with_values(spec, SPREAD, point), offset, cells, grid, REPEATS, FIRST_SEED))
+
+
+def statistics(ink: Sequence[Images], grid: Grid) -> Vector:
+    """Logarithms of deviations between repeats and of 1 - CSIM of two of them.
+
+    The deviations are those of log area, and in mm of the tip's x and of the y of the tip and of the heel.
+    """
+    measured = [np.array([_measure(image, grid) for image in cell]) for cell in ink]
+    freedom = sum(len(one) - 1 for one in measured)
+    squares = sum(((one - one.mean(axis=0)) ** 2).sum(axis=0) for one in measured)
+    deviations = np.sqrt(np.asarray(squares) / max(freedom, 1))
+    return np.log(np.append(deviations, 1.0 - agreement(ink) / 100.0) + 1e-6)
+
+
+def agreement(ink: Sequence[Images]) -> float:
+    """Mean CSIM in percent of two repeats of a cell, as binary images."""
+    binary = [(cell > 0.5).astype(np.float32) for cell in ink]
+    pairs = [csim(a, b) for cell in binary for a, b in combinations(cell, 2)]
+    return 100.0 * float(np.mean(pairs))
+
+
+def _measure(image: Images, grid: Grid) -> tuple[float, float, float, float]:
+    ink = image > 0.5
+    columns = np.flatnonzero(ink.any(axis=0))
+    if not columns.size:
+        return 0.0, 0.0, 0.0, 0.0
+    first, last = int(columns[0]), int(columns[-1])
+    share = max(1, round(END_SHARE * (last - first + 1)))
+    tip, heel = (_middle_mm(end, grid) for end in (ink[:, first : first + share], ink[:, last + 1 - share : last + 1]))
+    return math.log(float(ink.sum())), float(grid.x_mm[first]), tip, heel
+
+
+def _middle_mm(ink: NDArray[np.bool_], grid: Grid) -> float:
+    """The mean y of the ink."""
+    return float((ink.sum(axis=1) * grid.y_mm).sum() / ink.sum())
