@@ -24,7 +24,7 @@ BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a trainin
 SCALE = 4
 POINTS = 64  # along each side of an outline
 SHIFT = 4  # fractional bits of fillPoly's fixed-point corners
-DRAWS, SENSOR = 200, 0.05
+DRAWS, SENSOR = 600, 0.05
 """Presses to recover, and the standard deviation of the sensor's noise, of full ink."""
 INVERTED_PX_MM = 0.25  # so that an anchored press fits into 128 pixels
 INVERTED_MS, WORST_MM, WORST_DEG, BINARY_MM = 20.0, 0.001, 0.05, 0.02
@@ -99,7 +99,7 @@ def fill(polygon: NDArray[np.int32]) -> NDArray[np.uint8]:
 
 
 def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
-    """Recover `n` drawn presses (200) whose zero-touch point is known: H 11-20 mm, alpha 0-10 deg, 0.25 mm/px.
+    """Recover `n` drawn presses (600) whose zero-touch point is known: H 11-20 mm, alpha 0-10 deg, 0.25 mm/px.
 
     Worst errors on images as they are drawn, mean error on binary ones, how often 95 % intervals hold the truth on
     images with noise, and thread CPU time from images to intervals. For a few draws a share of intervals says nothing.

@@ -7,8 +7,10 @@ the fit itself, and a prior has the right weight at any noise.
 
 Intervals allow for residuals that are arbitrarily correlated within squares of `BLOCK_PX`, and independent between
 them: the sandwich (J'J)^-1 M (J'J)^-1 with M the sum over squares of (J'r)(J'r)' (K.-Y. Liang and S. Zeger, 1986). That
-is for captures, where the model is wrong by more than noise. They do not include errors of the brush's R, of lambda, or
-of the scale: these shift every press of a session alike.
+is for captures, where the model is wrong by more than noise. A mark lies on about ten squares, and so few often show
+less variance than there is: a variance is at least that of the posterior with independent pixels, s^2 (J'J)^-1 without
+a prior, which holds for a sensor's noise. They do not include errors of the brush's R, of lambda, or of the scale:
+these shift every press of a session alike.
 """
 
 from __future__ import annotations
@@ -294,7 +296,7 @@ class _Fit:
         values, sigma = self._start.copy(), np.zeros(5)
         values[self._free] = lowest.vector
         residual, jacobian = self._linear(lowest.vector)
-        sigma[self._free] = np.sqrt(np.diag(self._covariance(residual, jacobian)))
+        sigma[self._free] = np.sqrt(self._variances(residual, jacobian))
         at_limit = (lowest.vector <= self._low) | (lowest.vector >= self._high)
         upright = at_limit[1] and values[1] == 0.0
         flags = {Flag.UPRIGHT} if upright else set[Flag]()
@@ -333,8 +335,11 @@ class _Fit:
         """Variance of a pixel."""
         return float(np.sum(np.square(residual), dtype=np.float64)) / self._degrees + _LEAST_NOISE**2
 
-    def _covariance(self, residual: Images, jacobian: Images) -> Floats:
-        """The sandwich with blocks, (P, P); NaN where the image does not determine the values."""
+    def _variances(self, residual: Images, jacobian: Images) -> Floats:
+        """Of the values, (P,): the sandwich's, or those of the posterior where these are greater.
+
+        NaN where the image does not determine the values.
+        """
         noise = self._noise(residual)
         flat = jacobian.reshape(len(jacobian), -1).astype(np.float64)
         bread = _inverse(flat @ flat.T + noise * np.diag(self._precision))
@@ -343,7 +348,8 @@ class _Fit:
         sums = blocks.reshape(len(jacobian), -1).astype(np.float64)
         # Only blocks on the boundary carry information: about as many as lie along two sides of the image.
         few = 2 * len(starts) / max(2 * len(starts) - 1, 1)
-        return bread @ (few * sums @ sums.T + noise**2 * np.diag(self._precision)) @ bread
+        sandwich = bread @ (few * sums @ sums.T + noise**2 * np.diag(self._precision)) @ bread
+        return np.maximum(np.diag(sandwich), noise * np.diag(bread))
 
     def _clipped(self, vector: Floats) -> Floats:
         return np.clip(vector, self._low, self._high)
