@@ -19,7 +19,7 @@ import brushloop.calibrate.validate.cli
 import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
 import brushloop.collect.cli_rig
-import brushloop.model.train.cli
+import brushloop.model.generator.cli
 import brushloop.sessions.cli
 import brushloop.twin.cli
 from brushloop.calibrate.path_or_command import PathOrCommand
@@ -132,7 +132,7 @@ write.command("learn")(brushloop.calibrate.writing.cli.learn)
 write.command("practice")(brushloop.calibrate.writing.cli.practice)
 write.command("fit")(brushloop.calibrate.writing.cli.fit)
 app.add_typer(write, name="write")
-app.add_typer(brushloop.model.train.cli.app, name="train", result_callback=brushloop.calibrate.cli.training_page)
+app.add_typer(brushloop.model.generator.cli.app, name="train", result_callback=brushloop.calibrate.cli.training_page)
 
 
 @app.command()

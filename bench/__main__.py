@@ -50,7 +50,6 @@ MOST_TIMES, MORE_S = 6, 180
 OUT = ROOT / "docs" / "results.md"
 GOALS = {
     "raster-press": 40.0,
-    "raster-press-bulk": 40.0,
     "recorder write rate": 0.8,
 }
 """The ratio that was asked for, by figure, where the peer is not itself a goal."""

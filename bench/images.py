@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import cv2
@@ -19,8 +17,8 @@ from brushloop.model.raster import PX_MM, SIZE_PX
 from brushloop.model.raster.press import press_images
 from brushloop.model.strokes import stroke_model
 
-BATCH = 64
-BULK = 1024  # 64 MiB of images: more than a cache holds, as in making a training set
+BATCH = 256
+CALLS = 4  # a single short call would mostly measure caches that the peer has emptied
 SCALE = 4
 POINTS = 64  # along each side of an outline
 SHIFT = 4  # fractional bits of fillPoly's fixed-point corners
@@ -38,44 +36,29 @@ def raster(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     same ones. Ours counts everything from (H, alpha) to float32 images in memory that is used again; fillPoly gets its
     outlines ready made and gives 8-bit images, is not exact (it paints its boundary pixels whole, so its marks come out
     about 1 % too large, and at 4x it knows 17 levels of gray), and each of its images is a zeroed canvas, a fill and an
-    area mean. 64 images a call on one thread, or, as `-bulk`, 1024 on as many threads as there are cores, as does its
-    peer.
+    area mean. 256 images a call, on one thread.
 
-    ratio = our images/s over the peer's, in CPU seconds of all threads and means of the quickest tenth of the rounds:
+    ratio = our images/s over the peer's, in CPU seconds and means of the quickest tenth of the rounds:
     other work on the machine only ever slows.
     """
-    rounds, rng, cores, brush = rounds_of(n, 60), np.random.default_rng(seed), os.cpu_count() or 1, Brush()
-    depth_mm, tilt_deg = rng.uniform(11, 20, BULK), rng.uniform(0, 10, BULK)
-    images = np.empty((BULK, SIZE_PX, SIZE_PX), np.float32)
-    polygons = outlines(depth_mm[:BATCH], tilt_deg[:BATCH])
+    rounds, rng, brush = rounds_of(n, 60), np.random.default_rng(seed), Brush()
+    depth_mm, tilt_deg = rng.uniform(11, 20, BATCH), rng.uniform(0, 10, BATCH)
+    images = np.empty((BATCH, SIZE_PX, SIZE_PX), np.float32)
+    polygons = outlines(depth_mm, tilt_deg)
 
-    def few() -> None:
-        # BULK images in calls of BATCH; a single short call would mostly measure caches that the peer has emptied.
-        for _ in range(BULK // BATCH):
-            press_images(brush, depth_mm[:BATCH], tilt_deg[:BATCH], threads=1, out=images[:BATCH])
+    def ours() -> None:
+        for _ in range(CALLS):
+            press_images(ccdbsm(brush, depth_mm, tilt_deg), out=images)
 
-    def many() -> None:
-        press_images(brush, depth_mm, tilt_deg, threads=cores, out=images)
-
-    def filled(which: NDArray[np.int32]) -> None:
-        for polygon in which:
+    def peer() -> None:
+        for polygon in polygons:
             fill(polygon)
 
-    with _one_thread(), ThreadPoolExecutor(cores) as pool:
-
-        def shared() -> None:
-            list(pool.map(filled, np.array_split(polygons, cores)))
-
-        results: list[Result] = []
-        for name, ours, peer, threads in (
-            ("raster-press", few, lambda: filled(polygons), 1),
-            ("raster-press-bulk", many, shared, cores),
-        ):
-            turns = interleave(ours, peer, rounds, time.process_time)
-            ours_s, peer_s = turns.quickest_s[0] / BULK, turns.quickest_s[1] / BATCH
-            ratios, of = turns.ratios(BULK / BATCH), f"cv2.fillPoly at 4x, threads: {threads}"
-            results.append(Result(name, 1 / ours_s, "images/s", of, peer_s / ours_s, rounds, seed, machine(), *ratios))
-        return results
+    with _one_thread():
+        turns = interleave(ours, peer, rounds, time.process_time)
+    ours_s, peer_s = turns.quickest_s[0] / (CALLS * BATCH), turns.quickest_s[1] / BATCH
+    ratio, of = peer_s / ours_s, "cv2.fillPoly at 4x"
+    return [Result("raster-press", 1 / ours_s, "images/s", of, ratio, rounds, seed, machine(), *turns.ratios(CALLS))]
 
 
 def outlines(depth_mm: Floats, tilt_deg: Floats) -> NDArray[np.int32]:
@@ -108,7 +91,7 @@ def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     truth = {"depth_mm": rng.uniform(11, 20, count), "tilt_deg": rng.uniform(0, 10, count)}
     anchor = np.array([0.8, 0.5]) * SIZE_PX * INVERTED_PX_MM + rng.uniform(-0.5, 0.5, (count, 2)) * INVERTED_PX_MM
     origin = anchor + np.column_stack((truth["depth_mm"] * np.tan(np.radians(truth["tilt_deg"])), np.zeros(count)))
-    clean = press_images(Brush(), truth["depth_mm"], truth["tilt_deg"], origin_mm=origin, px_mm=INVERTED_PX_MM)
+    clean = press_images(ccdbsm(Brush(), truth["depth_mm"], truth["tilt_deg"]), origin, px_mm=INVERTED_PX_MM)
     noisy = (clean + rng.normal(0, SENSOR, clean.shape)).astype(np.float32)
     inverter = Inverter(stroke_model("ccd-bsm", Brush()), px_mm=INVERTED_PX_MM)
     with _one_thread():

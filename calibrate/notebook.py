@@ -26,7 +26,6 @@ from brushloop.calibrate.compare.place import (
     brush_of,
     simulated,
 )
-from brushloop.calibrate.compare.score import csim, ssim
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
@@ -37,6 +36,7 @@ from brushloop.calibrate.validate.command import Request, ValidationOutput, chec
 from brushloop.calibrate.validate.command import validate as run_validation
 from brushloop.calibrate.validate.inputs import local_path
 from brushloop.model.ccdbsm import Brush
+from brushloop.model.similarity import csim, ssim
 from brushloop.sessions.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Condition, Header

@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.fit.captures import Grid
 from brushloop.drivers.sim.brush.spec import BrushSpec
+from brushloop.model.similarity import csim
 from brushloop.twin.brush import (
     SHAPE,
     SPREAD,

@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 from rich.table import Table
 
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
-from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.captures import COMMANDS, Drawn
 from brushloop.calibrate.drags.fit import (
     CIRCLES,
@@ -36,6 +35,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import source_label, source_note
 from brushloop.calibrate.spread import farthest_first
 from brushloop.model.drag import DragModel, Floats, Indices, ink
+from brushloop.model.similarity import binary_scores
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 BETWEEN_SESSIONS = 0.66

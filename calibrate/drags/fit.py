@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from brushloop.calibrate.artefact import FittedValue, Frozen
-from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.captures import COMMANDS, commanded_path
 from brushloop.model.drag import (
     DragModel,
@@ -35,6 +34,7 @@ from brushloop.model.drag import (
     ink_equations,
     trails,
 )
+from brushloop.model.similarity import binary_scores
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray
 

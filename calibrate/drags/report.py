@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from rich.table import Column, Table
 
 from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.brush import STAMPS, DragArtefact, correction_helps, ends_sentence
 from brushloop.calibrate.drags.captures import DEPTH_NAMES, LENGTH_NAME, DragResults, Drawn, read_drags
 from brushloop.calibrate.report import (
@@ -35,6 +34,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
 from brushloop.model.drag import Floats
+from brushloop.model.similarity import binary_scores
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen

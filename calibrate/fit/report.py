@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, predictor
 from brushloop.calibrate.fit.run import Fitted
@@ -29,6 +28,7 @@ from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.outline import Outline
+from brushloop.model.similarity import csim
 
 MAX_CELLS = 48
 MARGIN_MM = 1.5

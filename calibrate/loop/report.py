@@ -14,7 +14,6 @@ from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1
 from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone
-from brushloop.calibrate.compare.score import SSIM_SETTINGS
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, compare_sessions
 from brushloop.calibrate.loop.scores import (
@@ -48,6 +47,7 @@ from brushloop.calibrate.report import (
     write_files,
 )
 from brushloop.calibrate.session import OpenSession
+from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, unseen
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
@@ -23,11 +22,11 @@ from brushloop.calibrate.report import (
     shortened,
     write_page,
 )
+from brushloop.model.generator.card import NUMBERS, load_samples, read_curves
+from brushloop.model.generator.config import INPUTS, TrainConfig
+from brushloop.model.generator.data import sha256
 from brushloop.model.generator.stroke import read_generator
-from brushloop.model.generator.targets import INPUTS
-from brushloop.model.train.card import NUMBERS, load_samples, read_curves
-from brushloop.model.train.config import TrainConfig, config_of
-from brushloop.model.train.data import sha256
+from brushloop.model.similarity import csim
 
 PAGE = "training.html"
 SMOOTH_STEPS = 50
@@ -45,7 +44,7 @@ def write_training_page(folder: Path) -> Path:
     """
     path = folder / "generator.safetensors"
     file = read_generator(path)
-    config, report = config_of(path, file), file.report
+    config, report = file.config, file.report
     losses, checks = read_curves(folder)
     label = config.tuning.source if config.tuning else EXACT
     return write_page(
@@ -99,7 +98,7 @@ def _score(target: Image, drawn: Image) -> float:
 
 def _verdict(config: TrainConfig, report: dict[str, Any]) -> Iterator[str]:
     end = f"{report.get('steps')} steps: {report.get('end')}"
-    yield f"The network has {config.weight_count():,} weights and was trained for {end}."
+    yield f"The network has {config.weight_count:,} weights and was trained for {end}."
     score = report.get("csim")
     if isinstance(score, int | float):
         which = "captured strokes that were held out" if config.tuning else "strokes that it was not trained on"

@@ -16,7 +16,6 @@ import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Tone, brush_of
-from brushloop.calibrate.compare.score import SSIM_SETTINGS
 from brushloop.calibrate.loop.scores import LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.scores import Numbers, Row, Scores, Values
@@ -32,6 +31,7 @@ from brushloop.calibrate.validate.models import (
 from brushloop.calibrate.validate.run import Outcome, Refused, Step
 from brushloop.calibrate.writing.scores import WrittenRecord
 from brushloop.model.ccdbsm import DomainError
+from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Condition, Header, Source

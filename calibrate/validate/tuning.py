@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
@@ -28,14 +28,14 @@ from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.calibrate.validate.inputs import one_source
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
-from brushloop.model.generator.targets import ANCHOR_SHARE, INPUTS, Placement, Target
+from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
 
 if TYPE_CHECKING:
-    from brushloop.model.train.train import Validation
+    from brushloop.model.generator.train import Validation
 
 FOLDS = 5
 """Number of folds: cells are left out by fifths, since a tuning takes a minute."""
@@ -100,7 +100,7 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condi
 
     Raises `CalibrationError` if fewer than two conditions are left.
     """
-    from brushloop.model.train.data import save_captures
+    from brushloop.model.generator.data import save_captures
 
     chosen = [k for k, cell in enumerate(aligned.cells) if cell not in leave_out]
     conditions = len({tuple(aligned.inputs[k].values()) for k in chosen})
@@ -150,7 +150,7 @@ def tuned_by_cell(
 
 @dataclass(slots=True)
 class _TrainingProgress:
-    """Reports the steps of a training; see `model.train.train.Progress`."""
+    """Reports the steps of a training; see `model.generator.train.Progress`."""
 
     progress: Progress
     what: str
@@ -164,27 +164,21 @@ class _TrainingProgress:
 
 
 def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int, progress: _TrainingProgress) -> None:
-    from brushloop.model.generator.stroke import read_generator
-    from brushloop.model.train.config import checked
-    from brushloop.model.train.train import TuningFiles, run_training
+    from brushloop.model.generator.data import TuningFiles
+    from brushloop.model.generator.train import run_training
 
-    tuning: dict[str, Any] = {
-        "start_sha256": file_sha256(generator),
-        "captures_sha256": file_sha256(captures),
-        "source": source,
-        "held_out": HELD_OUT,
-    }
-    fields: dict[str, Any] = read_generator(generator).config | {
-        "steps": steps,
-        "learning_rate": LEARNING_RATE,
-        "seed": 0,
-        "validate_every": steps,
-        "picture_every": steps,
-        "checkpoint_every": max(1, steps // 4),
-        "tuning": tuning,
-    }
     files = TuningFiles(generator, captures)
-    run_training(checked("tune", fields), folder, progress, lambda: False, files)
+    config = files.config(
+        source,
+        HELD_OUT,
+        steps=steps,
+        learning_rate=LEARNING_RATE,
+        seed=0,
+        validate_every=steps,
+        picture_every=steps,
+        checkpoint_every=max(1, steps // 4),
+    )
+    run_training(config, folder, progress, lambda: False, files)
 
 
 def _with_images(

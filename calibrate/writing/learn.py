@@ -26,7 +26,6 @@ from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
 from brushloop.calibrate.compare.place import SIZE_PX, Image, Tone
-from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.drags.captures import read_drags
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
@@ -54,6 +53,7 @@ from brushloop.model.characters.lead import LATER_SPREADS_MM, covered, drawn, le
 from brushloop.model.characters.plan import Phase, Reach, StrokePath, directions, grid, phase_map, without_tilt
 from brushloop.model.drag import Drawings
 from brushloop.model.footprint import NAMES, Footprint, fit_each, fit_footprint
+from brushloop.model.similarity import binary_scores
 from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]

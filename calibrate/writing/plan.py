@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import load_artefact, made_by
-from brushloop.calibrate.compare.score import csim, ssim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder, read_bounded
 from brushloop.calibrate.report import Written, picture_grid, save_picture
@@ -33,6 +32,7 @@ from brushloop.model.characters.ink import Image, reference, refine, swept, writ
 from brushloop.model.characters.lead import covered, drawn, first_lead, lead
 from brushloop.model.characters.plan import Patch, Phase, Reach, StrokePath, phases_of, trajectory
 from brushloop.model.footprint import Footprint
+from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import StrokeModel, UnknownModelError, stroke_model
 from brushloop.sessions.terminal import Progress, unseen
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.compare.place import Alignment, Image, Tone
-from brushloop.calibrate.compare.score import SSIM_SETTINGS, Polarity
+from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import (
@@ -44,6 +44,7 @@ from brushloop.calibrate.writing.scores import (
     compare_written,
     read_reference,
 )
+from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.terminal import Progress, unseen
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brushloop.calibrate.compare.place import SIZE_PX, Field, Tone, captured_mm
-from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
@@ -16,6 +15,7 @@ from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.quality.verdict import Verdict
 from brushloop.collect.rig.paper import Patch
 from brushloop.model.fitted import FittedPress
+from brushloop.model.similarity import csim
 from brushloop.sessions.events import Press
 from brushloop.sessions.records import Condition
 

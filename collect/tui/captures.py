@@ -12,7 +12,6 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import board_of, see_board
-from brushloop.calibrate.compare.score import csim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
@@ -20,6 +19,7 @@ from brushloop.calibrate.session import lens_in_use
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
+from brushloop.model.similarity import csim
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import CaptureResult, Press, Remark

@@ -1,4 +1,7 @@
-"""The neural stroke generator (the paper's CCD-BSMG): what it learns to draw, the network, and its outlines."""
+"""The neural stroke generator (the paper's CCD-BSMG): its training, and its images and outlines in numpy.
+
+Only `network` and `train` load torch.
+"""
 
 from __future__ import annotations
 
@@ -18,3 +21,13 @@ class TrainError(Exception):
         self.path = str(path)
         self.what = what
         super().__init__(f"{path}: {what}")
+
+
+class TrainingStopped(Exception):
+    """Training cannot usefully continue, or was asked to stop, at `step`; the last checkpoint is complete."""
+
+    exit_code: ClassVar[int] = 4
+
+    def __init__(self, step: int, what: str) -> None:
+        self.step = step
+        super().__init__(f"step {step}: {what}")

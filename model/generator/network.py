@@ -14,8 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from brushloop.model.generator.stroke import Layers
-from brushloop.model.generator.targets import INPUTS, Target
+from brushloop.model.generator.config import INPUTS, Layers, Target
 
 
 class Generator(nn.Module):

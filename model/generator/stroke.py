@@ -8,93 +8,52 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 
 from brushloop.model.arrays import Array, as_batch, as_numpy
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import TrainError
-from brushloop.model.generator.targets import INPUTS, Target
+from brushloop.model.generator.config import INPUTS, MAX_WEIGHTS, Target, TrainConfig, checked
 from brushloop.model.outline import Outline
 from brushloop.model.strokes import StrokeModel
 
 Singles = NDArray[np.float32]
 FORMAT = "brushloop-generator-2"
-MAX_WEIGHTS = 50_000_000
 MAX_HEADER_BYTES = 4 * 1024 * 1024
 """Largest header of a safetensors file; it holds the names of the tensors, and the configuration."""
 MAX_CONFIG_CHARS = 64 * 1024
-
-
-class Layers(BaseModel):
-    """Sizes of a network: the layers of the paper's section III-B, which gives none."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    degree: Annotated[int, Field(ge=1, le=16)] = 4
-    """Of the Chebyshev polynomials of each input."""
-    width: Annotated[int, Field(ge=1, le=2048)] = 256
-    """Of the fully connected layers."""
-    depth: Annotated[int, Field(ge=1, le=8)] = 2
-    """Their number."""
-    channels: Annotated[int, Field(ge=1, le=128)] = 16
-    """Of the map of `side` x `side` that they put out."""
-    side: Literal[8, 16, 32, 64] = 16
-
-    def shapes(self, size_px: int) -> dict[str, tuple[int, ...]]:
-        """The weights by name, with their shapes. Raises ValueError if `side` does not divide the image."""
-        if size_px % self.side:
-            raise ValueError(f"layers.side = {self.side} does not divide size_px = {size_px}")
-        sizes = [self.degree * len(INPUTS), *[self.width] * self.depth, self.channels * self.side**2]
-        shapes: dict[str, tuple[int, ...]] = {}
-        for k in range(len(sizes) - 1):
-            name = f"fully_connected.{2 * k}"  # an activation stands between two layers
-            shapes |= {f"{name}.weight": (sizes[k + 1], sizes[k]), f"{name}.bias": (sizes[k + 1],)}
-        out = (size_px // self.side) ** 2
-        return shapes | {"convolution.0.weight": (out, self.channels, 3, 3), "convolution.0.bias": (out,)}
-
-    def weight_count(self, size_px: int) -> int:
-        """Number of weights."""
-        return sum(int(np.prod(shape)) for shape in self.shapes(size_px).values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeneratorFile:
     """The content of a `generator.safetensors`."""
 
-    target: Target
-    layers: Layers
+    config: TrainConfig
+    """What it was trained on, and how."""
     weights: dict[str, Singles]
-    config: dict[str, Any]
-    """The whole configuration of its training (`model.train.config.TrainConfig`)."""
     report: dict[str, Any]
     """How its images compare with exact ones: plain numbers and strings."""
 
-    @property
-    def tuned(self) -> bool:
-        """Whether it was tuned on captures."""
-        return self.config.get("tuning") is not None
-
     def images(self, inputs: Array) -> Singles:
         """The network's images of (N, 2) inputs in its placement and scale, (N, size_px, size_px) in [0, 1]."""
-        layers, weights = self.layers, self.weights
-        low, high = np.transpose([getattr(self.target, name) for name in INPUTS]).astype(np.float32)
+        target, layers, weights = self.config.target, self.config.layers, self.weights
+        low, high = np.transpose([getattr(target, name) for name in INPUTS]).astype(np.float32)
         unit = 2 * (np.asarray(inputs, np.float32) - low) / (high - low) - 1
         x = chebyshev(unit, layers.degree)[..., 1:].reshape(len(unit), -1)
         for k in range(layers.depth + 1):
             x = x @ weights[f"fully_connected.{2 * k}.weight"].T + weights[f"fully_connected.{2 * k}.bias"]
             if k < layers.depth:
                 x = x / (1 + np.exp(-x))  # SiLU
-        side, scale = layers.side, self.target.size_px // layers.side
+        side, scale = layers.side, target.size_px // layers.side
         padded = np.pad(x.reshape(-1, layers.channels, side, side), ((0, 0), (0, 0), (1, 1), (1, 1)))
         windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(2, 3))
         map_ = np.tensordot(windows, weights["convolution.0.weight"], axes=([1, 4, 5], [1, 2, 3]))
         map_ = (map_ + weights["convolution.0.bias"]).reshape(-1, side, side, scale, scale)
-        field = map_.transpose(0, 1, 3, 2, 4).reshape(-1, self.target.size_px, self.target.size_px)  # pixel shuffle
+        field = map_.transpose(0, 1, 3, 2, 4).reshape(-1, target.size_px, target.size_px)  # pixel shuffle
         return np.clip(field + np.float32(0.5), 0, 1)
 
 
@@ -118,7 +77,7 @@ class GeneratorModel(StrokeModel):
     @property
     def target(self) -> Target:
         """What the generator was trained to draw."""
-        return self.file.target
+        return self.file.config.target
 
 
 def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorModel:
@@ -129,7 +88,7 @@ def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorMod
     file = read_generator(Path(path))
     if brush is not None:
         for name in ("radius_mm", "length_mm"):
-            trained, wanted = getattr(file.target, name), float(as_numpy(getattr(brush, name)))
+            trained, wanted = getattr(file.config.target, name), float(as_numpy(getattr(brush, name)))
             if wanted != trained:
                 raise TrainError(path, f"was trained for a brush with {name} = {trained:g}, not {wanted:g}")
     return generator_model(file)
@@ -140,14 +99,15 @@ def generator_model(file: GeneratorFile) -> GeneratorModel:
 
     It is `fitted` if it was tuned on captures, or its brush was fitted to some.
     """
-    learned = file.target.stroke_model
+    target, is_tuned = file.config.target, file.config.tuning is not None
+    learned = target.stroke_model
     paper = learned.name == "ccd-bsm"
-    tuned = ", then tuned on captured strokes" if file.tuned else ""
+    tuned = ", then tuned on captured strokes" if is_tuned else ""
 
     def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
         inputs = np.stack([as_numpy(part) for part in as_batch(depth_mm, tilt_deg)], axis=-1)
-        file.target.check(inputs)
-        return traced(file.images(inputs), file.target.origin_mm(inputs), file.target.px_mm)
+        target.check(inputs)
+        return traced(file.images(inputs), target.origin_mm(inputs), target.px_mm)
 
     return GeneratorModel(
         name="ccd-bsmg" if paper else f"{learned.name}-generator",
@@ -155,7 +115,7 @@ def generator_model(file: GeneratorFile) -> GeneratorModel:
         definition=f"A network trained on exact images of {learned.label}{tuned}; its outline is traced at half "
         "coverage.",
         profile=profile,
-        fitted=file.tuned or file.target.fitted_brush,
+        fitted=is_tuned or target.fitted_brush,
         file=file,
     )
 
@@ -195,17 +155,8 @@ def read_generator(path: Path) -> GeneratorFile:
     metadata, tensors = read_tensors(path, 4 * MAX_WEIGHTS + 2**26)
     if metadata.get("format") != FORMAT:
         raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, expected {FORMAT!r}")
-    config, report = (_table(path, name, metadata.get(name, "")) for name in ("config", "report"))
-    try:
-        target, layers = Target.model_validate(config.get("target")), Layers.model_validate(config.get("layers"))
-        if layers.weight_count(target.size_px) > MAX_WEIGHTS:
-            raise TrainError(path, f"asks for {layers.weight_count(target.size_px):,} weights; at most {MAX_WEIGHTS:,}")
-        wanted = layers.shapes(target.size_px)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise TrainError(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
-    except ValueError as error:
-        raise TrainError(path, str(error)) from error
+    config = checked(path, _table(path, "config", metadata.get("config", "")))
+    wanted = config.layers.shapes(config.target.size_px)
     for name in sorted(wanted.keys() ^ tensors.keys()):
         raise TrainError(path, f"tensor {name[:100]!r} is {'missing' if name in wanted else 'not known'}")
     for name, shape in wanted.items():
@@ -214,7 +165,7 @@ def read_generator(path: Path) -> GeneratorFile:
             raise TrainError(path, f"{name} is {tensor.dtype} {tensor.shape}, expected float32 {shape}")
         if not np.isfinite(tensor).all():
             raise TrainError(path, f"{name} holds numbers that are not finite")
-    return GeneratorFile(target, layers, tensors, config, report)
+    return GeneratorFile(config, tensors, _table(path, "report", metadata.get("report", "")))
 
 
 def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:

@@ -12,11 +12,6 @@ points: 0 is to the right, 90 up, counter-clockwise. A point (x, y) of the strok
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +20,7 @@ from brushloop.model.outline import Outline
 
 SIZE_PX = 128
 PX_MM = 0.2
-_PER_THREAD = 64  # images; fewer are not worth a thread
-Images = NDArray[np.floating[Any]]
+Images = NDArray[np.float32]
 
 
 def coverage(
@@ -36,22 +30,18 @@ def coverage(
     *,
     size_px: int = SIZE_PX,
     px_mm: float = PX_MM,
-    threads: int | None = 1,
-    out: Images | None = None,
 ) -> Images:
     """The covered share of every pixel, (B, size_px, size_px) in [0, 1], of B outlines, by compiled loops.
 
-    `origin_mm` is (2,) or (B, 2), `heading_deg` a scalar or (B,). float32 unless `out` is given: a C-contiguous float32
-    or float64 array of that shape, which is filled and returned. `threads` None is the number of cores. The error stays
-    below 1e-6. Raises ValueError for an invalid size, shape or `out`, and for an outline that is not finite.
+    `origin_mm` is (2,) or (B, 2), `heading_deg` a scalar or (B,). The error stays below 1e-6. Raises ValueError for an
+    invalid size or shape, and for an outline that is not finite.
     """
     from brushloop.model.raster.kernel import rasterise  # numba takes a fifth of a second to import
 
     check_raster(size_px, px_mm)
     points, weights = as_numpy(outline.points), as_numpy(outline.weights)
-    maps = to_pixels(as_numpy(origin_mm), as_numpy(heading_deg), px_mm, weights)
-    out = checked_images(out, len(points), size_px)
-    in_parts(lambda at: rasterise(points[at], weights[at], maps[at], out[at]), len(out), threads)
+    out = np.empty((len(points), size_px, size_px), np.float32)
+    rasterise(points, weights, to_pixels(as_numpy(origin_mm), as_numpy(heading_deg), px_mm, weights), out)
     return out
 
 
@@ -59,16 +49,6 @@ def check_raster(size_px: int, px_mm: float) -> None:
     """Raise ValueError unless the raster has pixels of a positive size."""
     if size_px < 1 or not px_mm > 0:
         raise ValueError(f"size_px = {size_px}, px_mm = {px_mm:g}: both must be positive")
-
-
-def checked_images(out: Images | None, count: int, size_px: int) -> Images:
-    """New float32 images, or `out` if they can be drawn into it; else ValueError."""
-    wanted = (count, size_px, size_px)
-    if out is None:
-        return np.empty(wanted, np.float32)
-    if out.shape != wanted or out.dtype.char not in "fd" or not out.flags.c_contiguous:
-        raise ValueError(f"out is {out.dtype} {out.shape}, expected C-contiguous float32 or float64 {wanted}")
-    return out
 
 
 def to_pixels(origin_mm: Array, heading_deg: Array, px_mm: float, marks: Array) -> Array:
@@ -93,15 +73,3 @@ def centred_origin(outline: Outline, *, size_px: int = SIZE_PX, px_mm: float = P
     x = 0.5 * (outline.x_min_mm + outline.x_max_mm)
     middle = 0.5 * size_px * px_mm
     return library(x).stack((middle - x, middle + 0 * x), -1)
-
-
-def in_parts(work: Callable[[slice], None], count: int, threads: int | None) -> None:
-    """Do the work on all of `count` images, an equal share on each thread where there are enough."""
-    parts = min(threads or os.cpu_count() or 1, max(1, count // _PER_THREAD))
-    if parts == 1:
-        work(slice(0, count))
-        return
-    # The loops release the interpreter's lock, so plain threads run in parallel.
-    with ThreadPoolExecutor(parts) as pool:
-        for done in [pool.submit(work, slice(k * count // parts, (k + 1) * count // parts)) for k in range(parts)]:
-            done.result()

@@ -1,4 +1,4 @@
-"""The compiled rasteriser of CCD-BSM's marks at heading 0, from presses to exact coverage in one pass (numba).
+"""The compiled rasteriser of CCD-BSM's marks at heading 0: exact coverage without an outline (numba).
 
 Above the axis of a mark, ink reaches up to the half width w(x). Let P(a) be the ink of one column of pixels up to the
 level a, the integral of min(w, a); a pixel holds the difference of P between its row edges. In a column where w does
@@ -17,90 +17,54 @@ import numba
 import numpy as np
 
 from brushloop.model.arrays import Array
-from brushloop.model.ccdbsm import Brush, ccdbsm
-from brushloop.model.raster import PX_MM, SIZE_PX, Images, check_raster, checked_images, in_parts
+from brushloop.model.ccdbsm import CcdBsm
+from brushloop.model.raster import PX_MM, SIZE_PX, Images, check_raster
 from brushloop.model.raster.kernel import FURTHEST, OPTIONS, compiled, inline
 
 CENTRED = 1e-9  # px; an axis this close to a row edge or to the middle of a row has a mirror image on the grid
 
 
 def press_images(
-    brush: Brush,
-    depth_mm: Array,
-    tilt_deg: Array,
-    lam: Array = math.pi,
-    *,
+    mark: CcdBsm,
     origin_mm: Array | None = None,
+    *,
     size_px: int = SIZE_PX,
     px_mm: float = PX_MM,
-    threads: int | None = 1,
     out: Images | None = None,
 ) -> Images:
-    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for CCD-BSM's marks of B presses at heading 0.
+    """The covered share of every pixel, (B, size_px, size_px) in [0, 1], for B marks of CCD-BSM at heading 0.
 
-    The same as `coverage` of `ccdbsm(brush, depth_mm, tilt_deg, lam)`, but several times as fast. Depth, tilt, lambda
-    and the lengths of `brush` are numbers or (B,). `origin_mm`, (2,) or (B, 2), centres each mark's bounding box if it
-    is left out; `threads` and `out` as for `coverage`, float32 only. Raises DomainError for a press outside the model's
-    domain, and ValueError for an invalid size, origin or `out`.
+    The same as `coverage` of the mark's outline, but several times as fast. `origin_mm`, (2,) or (B, 2), centres each
+    mark's bounding box if it is left out. A C-contiguous float32 `out` is filled and returned. Raises ValueError for an
+    invalid size, origin or `out`, and for a mark that is not finite or reaches further than a billion pixels.
     """
     check_raster(size_px, px_mm)
-    columns = (depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)
-    presses = np.empty((np.broadcast(*columns).size, len(columns)))
-    for k, values in enumerate(columns):
-        presses[:, k] = values
-    marks = np.empty_like(presses)
-    inside = lengths(presses, marks)
-    if inside < len(presses):
-        depth, tilt, radius, length, dilation = presses[inside].tolist()
-        ccdbsm(Brush(radius, length), depth, tilt, dilation)  # raises a DomainError that names the value
-        raise ValueError(f"press {inside}: H = {depth:g} mm at {tilt:g} deg makes no mark")
+    marks = np.empty((len(mark.o3a_mm), 5))
+    marks[:, 0], marks[:, 1], marks[:, 2] = mark.o3a_mm, mark.o4o3_mm, mark.half_width_mm
     if origin_mm is None:
         half = 0.5 * size_px * px_mm
-        marks[:, 3], marks[:, 4] = half + 0.5 * (marks[:, 1] - marks[:, 0]), half
+        marks[:, 3], marks[:, 4] = half - mark.middle_mm, half
     else:
         marks[:, 3:] = origin_mm
     marks /= px_mm
-    out = checked_images(out, len(marks), size_px)
-    in_parts(lambda at: draw(marks[at], out[at]), len(out), threads)
-    return out
-
-
-def draw(marks, out):
-    """Fill `out` (B, N, N) with marks (B, 5): heel O3A, tip O4O3, half width, and column and row of O3.
-
-    Raises ValueError for a mark that is not finite or reaches further than a billion pixels.
-    """
-    size = out.shape[1]
-    means, areas = np.empty(size, np.int32), np.zeros(size + 2)
-    columns = np.empty((2, size + 2), np.int64)
-    places, missing = np.empty((2, 2, size + 2))
+    wanted = (len(marks), size_px, size_px)
+    out = np.empty(wanted, np.float32) if out is None else out
+    if out.shape != wanted or out.dtype != np.float32 or not out.flags.c_contiguous:
+        raise ValueError(f"out is {out.dtype} {out.shape}, expected C-contiguous float32 {wanted}")
+    means, areas = np.empty(size_px, np.int32), np.zeros(size_px + 2)
+    columns = np.empty((2, size_px + 2), np.int64)
+    places, missing = np.empty((2, 2, size_px + 2))
     if not _draw_all(marks, out, means, areas, places, columns, missing):
         raise ValueError(f"a shape is not finite, or lies more than {FURTHEST:g} pixels away")
-
-
-@numba.njit(**OPTIONS, cache=True)
-def lengths(presses, marks):
-    """Fill the first three columns of `marks` (B, 5) from `presses` (B, 5): H, alpha in degrees, R, L, lambda.
-
-    See Eq. 2-5 in `model.ccdbsm`. Returns how many presses come before the first one outside the model's domain.
-    """
-    for n in range(len(presses)):
-        height, tilt_deg, radius, length, dilation = presses[n]
-        alpha, theta = math.radians(tilt_deg), math.atan(radius / length)
-        cosine, inner = math.cos(alpha), math.cos(alpha - theta)
-        allowed = radius > 0.0 and length > 0.0 and dilation > 0.0 and alpha >= 0.0 and alpha + theta < 0.5 * math.pi
-        # Rounding must not refuse what `model.ccdbsm` accepts.
-        if not (allowed and 0.0 < height <= length * cosine * (1 + 1e-12)):
-            return n
-        heel = height * (math.sin(alpha) / cosine - math.sin(alpha - theta) / inner)
-        marks[n, 0], marks[n, 1] = heel, height / inner + heel
-        marks[n, 2] = dilation * height * radius / (length * cosine)
-    return len(presses)
+    return out
 
 
 @numba.njit(**OPTIONS, cache=True)
 def _draw_all(marks, out, means, areas, places, columns, missing):
-    """Draw one image after another; false for a shape that cannot be drawn."""
+    """Draw marks (B, 5), in pixels: heel O3A, tip O4O3, half width, and column and row of O3.
+
+    False for one that cannot be drawn.
+    """
     size = out.shape[1]
     unit = np.int32(1 << min(23, 30 - math.ceil(math.log2(size))))
     for n in range(out.shape[0]):

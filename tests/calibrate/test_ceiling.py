@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.score import binary_scores
 from brushloop.calibrate.stats import average, ceiling_values, is_near, others_of, pair_means
+from brushloop.model.similarity import binary_scores
 
 CELLS = 6
 Y, X = np.mgrid[:60, :120]

@@ -62,7 +62,7 @@ def run(*arguments: object) -> str:
 
 @pytest.fixture(scope="module")
 def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """A page of every command but `train` (tests/model/train/test_commands.py), by the command's name."""
+    """A page of every command but `train` (tests/model/test_train.py), by the command's name."""
     folder = tmp_path_factory.mktemp("pages")
     session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {

@@ -11,7 +11,6 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from brushloop.model.ccdbsm import Brush, DomainError, basic_lengths, ccdbsm
-from brushloop.model.raster.press import lengths
 
 # (H, alpha): O3A, O3C, O4O3, length, width, all mm, for R = 6, L = 48 and lambda = pi.
 TABLE = {
@@ -108,15 +107,6 @@ def test_the_half_width_is_greatest_at_the_brush_axis_and_ends_at_both_ends(pres
     assert mark.half_width(places)[0].tolist() == pytest.approx([0.0, 0.0, peak, 0.0], abs=1e-6 * peak)
 
 
-@given(presses(), st.floats(0.1, 1.0))
-def test_every_length_is_proportional_to_depth(press: tuple[Brush, float, float], factor: float) -> None:
-    brush, h, tilt_deg = press
-    mark, smaller = ccdbsm(brush, h, tilt_deg), ccdbsm(brush, factor * h, tilt_deg)
-    for name in ("o3a_mm", "o3c_mm", "o4o3_mm", "length_mm", "width_mm"):
-        assert getattr(smaller, name).item() == pytest.approx(factor * getattr(mark, name).item(), rel=1e-12)
-    assert smaller.area_mm2.item() == pytest.approx(factor**2 * mark.area_mm2.item(), rel=1e-12)
-
-
 def test_a_tensor_computes_in_torch_and_keeps_its_dtype_all_else_in_numpy() -> None:
     depths = np.array([11.0, 20.0])
     mark, in_torch = ccdbsm(BRUSH, depths, 5), ccdbsm(BRUSH, torch.tensor(depths, dtype=torch.float32), 5)
@@ -127,16 +117,12 @@ def test_a_tensor_computes_in_torch_and_keeps_its_dtype_all_else_in_numpy() -> N
         np.testing.assert_allclose(getattr(in_torch, size).numpy(), getattr(mark, size), rtol=1e-6)
 
 
-@given(presses(), st.floats(0.1, 10))
-def test_the_scalar_forms_of_the_equations_agree_with_the_arrays(press: tuple[Brush, float, float], lam: float) -> None:
+@given(presses())
+def test_the_scalar_form_of_the_equations_agrees_with_the_arrays(press: tuple[Brush, float, float]) -> None:
     brush, depth_mm, tilt_deg = press
-    mark = ccdbsm(brush, depth_mm, tilt_deg, lam)
+    mark = ccdbsm(*press)
     scalar = basic_lengths(depth_mm, math.radians(tilt_deg), brush.radius_mm, brush.length_mm, math)
     assert scalar == pytest.approx((mark.o3a_mm.item(), mark.o3c_mm.item(), mark.o4o3_mm.item()), rel=1e-12)
-    compiled = np.zeros((1, 5))
-    assert lengths(np.array([[depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam]]), compiled) == 1
-    sizes = [mark.o3a_mm.item(), mark.o4o3_mm.item(), mark.half_width_mm.item()]
-    assert compiled[0, :3].tolist() == pytest.approx(sizes, rel=1e-12)
 
 
 def test_gradients_are_exact_in_every_parameter() -> None:
@@ -167,10 +153,7 @@ def test_presses_outside_the_domain_are_refused(
     assert caught.value.name == name
     assert caught.value.value == pytest.approx(value, nan_ok=True)
     assert says in str(caught.value)
-
-
-def test_the_deepest_press_is_allowed() -> None:
-    assert ccdbsm(BRUSH, 48, 0).o3c_mm.item() == pytest.approx(6.0)
+    assert ccdbsm(BRUSH, 48, 0).o3c_mm.item() == pytest.approx(6.0)  # the deepest press is inside
 
 
 def test_impossible_brush_dilation_and_shape_are_refused() -> None:

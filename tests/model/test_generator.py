@@ -17,14 +17,13 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from brushloop.model.ccdbsm import Brush, DomainError, ccdbsm
-from brushloop.model.generator import SHIPPED_GENERATOR, TrainError, stroke
+from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
+from brushloop.model.generator.card import likeness, report_of
+from brushloop.model.generator.config import MAX_WEIGHTS, PRESETS, Layers, Target, preset
+from brushloop.model.generator.data import exact_sets, sha256
 from brushloop.model.generator.network import Generator, covered, squared_error
-from brushloop.model.generator.stroke import Layers, load_generator, read_generator, traced
-from brushloop.model.generator.targets import Target
+from brushloop.model.generator.stroke import load_generator, read_generator, traced
 from brushloop.model.raster import centred_origin, coverage
-from brushloop.model.train.card import likeness, report_of
-from brushloop.model.train.config import PRESETS, config_of, preset
-from brushloop.model.train.data import exact_sets, sha256
 
 MOST_BYTES = 10_000_000
 
@@ -67,13 +66,14 @@ def test_a_target_that_makes_no_sense_is_refused(fields: dict, words: str) -> No
 
 def test_numpy_draws_what_torch_draws() -> None:
     file = read_generator(SHIPPED_GENERATOR)
-    network = Generator(file.target, file.layers)
+    target, layers = file.config.target, file.config.layers
+    network = Generator(target, layers)
     network.load_state_dict({name: torch.from_numpy(value) for name, value in file.weights.items()})
-    inputs = file.target.draw(8, (0,))
+    inputs = target.draw(8, (0,))
     with torch.no_grad():
         np.testing.assert_allclose(file.images(inputs), network(torch.from_numpy(inputs)).numpy(), rtol=0, atol=1e-5)
     shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    assert shapes == file.layers.shapes(file.target.size_px)
+    assert shapes == layers.shapes(target.size_px)
     with pytest.raises(ValueError, match="side = 16 does not divide size_px = 40"):
         Layers().shapes(40)
 
@@ -109,7 +109,7 @@ def test_a_generator_is_a_stroke_model_that_calls_itself_what_it_is() -> None:
     np.testing.assert_allclose(outline.x_max_mm, exact.x_max_mm, atol=0.1)
     assert (outline.x_min_mm - exact.x_min_mm < 1.0).all()  # the tip ends where it is half a pixel wide
     origin = centred_origin(exact)
-    assert likeness(coverage(outline, origin), coverage(exact, origin))[1].min() > 0.98
+    assert likeness(coverage(outline, origin), coverage(exact, origin))[:, 1].min() > 0.98
     with pytest.raises(DomainError, match=r"depth_mm = 25 is outside \[11, 20\] mm"):
         model.profile(25.0, 5.0)
     with pytest.raises(TrainError, match="was trained for a brush with radius_mm = 6, not 5"):
@@ -125,9 +125,8 @@ def test_the_shipped_generator_is_small_and_the_one_that_its_card_describes() ->
     assert "trained on exact area coverage of the stroke model `ccd-bsm`" in card
     assert "It has seen no real ink" in card
     assert f"{file.report['mse']:.3g}" in card
-    config = config_of(SHIPPED_GENERATOR, file)
-    assert config == preset("anchored")  # the documented command trains it
-    held_out = exact_sets(config.model_copy(update={"seed": 1, "training_images": 1, "validation_images": 64}))[1]
+    assert file.config == preset("anchored")  # the documented command trains it
+    held_out = exact_sets(file.config.model_copy(update={"seed": 1, "training_images": 1, "validation_images": 64}))[1]
     inputs, target = held_out.pick(np.arange(64))
     mse = float(np.square(file.images(inputs) - target).mean())
     assert 0.5 * file.report["mse"] < mse < 2.0 * file.report["mse"]
@@ -167,7 +166,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "pickle": (lambda p: torch.save({"a": torch.zeros(1)}, p), "is not a safetensors file"),
     "cut": (lambda p: p.write_bytes(p.read_bytes()[:-100]), "is not a safetensors file"),
     "endless header": (lambda p: p.write_bytes(struct.pack("<Q", 2**60) + b"{}"), "is not a safetensors file"),
-    "huge": (lambda p: os.truncate(p, 4 * stroke.MAX_WEIGHTS + 2**26 + 1), "bytes; at most"),
+    "huge": (lambda p: os.truncate(p, 4 * MAX_WEIGHTS + 2**26 + 1), "bytes; at most"),
     "another kind": (lambda p: changed(p, format="other"), "format is 'other'"),
     "no config": (lambda p: changed(p, config=""), "config is not JSON"),
     "deep config": (lambda p: changed(p, config="[" * 60_000), "config is not JSON"),

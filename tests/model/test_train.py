@@ -21,16 +21,15 @@ from rich.progress import Progress
 from typer.testing import CliRunner
 
 import brushloop.__main__
-from brushloop.model.generator import TrainError
+from brushloop.model.generator import TrainError, TrainingStopped
+from brushloop.model.generator import train as training
+from brushloop.model.generator.card import read_curves
+from brushloop.model.generator.cli import Bar, app
+from brushloop.model.generator.config import TrainConfig, checked, load_config
+from brushloop.model.generator.data import batch_numbers, exact_sets, load_captures, save_captures, split, write_whole
 from brushloop.model.generator.network import Generator
 from brushloop.model.generator.stroke import load_generator
-from brushloop.model.train import TrainingStopped
-from brushloop.model.train import train as training
-from brushloop.model.train.card import read_curves
-from brushloop.model.train.cli import Bar, app
-from brushloop.model.train.config import TrainConfig, checked, load_config
-from brushloop.model.train.data import batch_numbers, exact_sets, load_captures, save_captures, split, write_whole
-from brushloop.model.train.train import Validation, converged, learning_rate, new_network, run_training
+from brushloop.model.generator.train import Validation, converged, learning_rate, new_network, run_training
 from tests.browser import BROWSER, content_widths_px
 
 TINY: dict[str, Any] = {
@@ -115,8 +114,8 @@ def test_the_folder_holds_all_that_the_algorithm_puts_out(finished: Path) -> Non
 
 KILLED = """
 from pathlib import Path
-from brushloop.model.train.config import load_config
-from brushloop.model.train.train import run_training
+from brushloop.model.generator.config import load_config
+from brushloop.model.generator.train import run_training
 
 class Reporter:
     def stepped(self, step, loss):
@@ -327,7 +326,7 @@ def test_without_a_terminal_each_tenth_is_a_line_with_the_time_that_is_left() ->
 
 def test_help_loads_nothing_heavy() -> None:
     heavy = {"torch", "numpy", "pydantic", "rich.progress"}
-    code = f"import sys, brushloop.model.train.cli; assert not {heavy} & sys.modules.keys()"
+    code = f"import sys, brushloop.model.generator.cli; assert not {heavy} & sys.modules.keys()"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -12,7 +12,8 @@ from hypothesis.extra import numpy as hnp
 from skimage.metrics import structural_similarity
 
 from brushloop.calibrate.compare.place import Alignment
-from brushloop.calibrate.compare.score import BEST_SHIFT_PX, Polarity, best_shift, binary_scores, csim, similarity, ssim
+from brushloop.calibrate.compare.score import BEST_SHIFT_PX, Polarity, best_shift, similarity
+from brushloop.model.similarity import binary_scores, csim, ssim
 
 images = hnp.arrays(np.float64, (16, 16), elements=st.floats(0, 1))
 NORMAL = Alignment.SIZE_NORMALISED

@@ -17,8 +17,8 @@ from brushloop.calibrate.validate.inputs import FittedSession
 from brushloop.calibrate.validate.report import load_report
 from brushloop.calibrate.validate.tuning import align_captures
 from brushloop.model.generator import SHIPPED_GENERATOR
+from brushloop.model.generator.data import load_captures
 from brushloop.model.generator.stroke import load_generator, read_generator
-from brushloop.model.train.data import load_captures
 from brushloop.sessions.records import Source
 
 # One word a line, as the file's owner would write it.
@@ -101,7 +101,9 @@ def test_a_tuned_generator_is_judged_on_cells_that_it_has_not_seen(
     folds = {path.parent.name for path in (tmp_path / "work" / "tuned").rglob("generator.safetensors")}
     assert len(folds) == 5
     tuned_generator = tmp_path / "work" / "tuned" / min(folds) / "generator.safetensors"
-    kept, _ = load_captures(tuned_generator.with_name("captures.safetensors"), read_generator(tuned_generator).target)
+    kept, _ = load_captures(
+        tuned_generator.with_name("captures.safetensors"), read_generator(tuned_generator).config.target
+    )
     assert len(kept.inputs) == 8  # two presses of one of five cells are left out
 
 
@@ -123,7 +125,7 @@ def test_captures_go_through_the_file_into_a_tuning(
     assert "left out, as requested: 2 presses of 1 cells" in said
     assert "8 presses (imported photographs)" in said
 
-    kept, source = load_captures(captures, read_generator(generator).target)
+    kept, source = load_captures(captures, read_generator(generator).config.target)
     inputs, truth = kept.pick(np.arange(len(kept)))
     assert source == "imported photographs"
     assert truth.shape == (8, 32, 32)

@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.score import csim, ssim
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.plan import PICTURE, PlanRequest, plan, pressed, read_wanted
 from brushloop.calibrate.writing.record import PROTOCOL, PlannedBy
@@ -19,6 +18,7 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.characters.plan import Patch, Reach
+from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import stroke_model
 from tests.command import brushloop
 

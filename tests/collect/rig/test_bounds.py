@@ -14,7 +14,7 @@ from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.brush_file import load_brush
 from brushloop.drivers.sim.described import SimFileError
 from brushloop.model.generator import TrainError
-from brushloop.model.train.config import load_config
+from brushloop.model.generator.config import load_config
 from tests.collect.rig.test_config import RIG
 
 DIGITS = "9" * 10_000

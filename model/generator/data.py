@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from brushloop.model.generator import TrainError
-from brushloop.model.generator.stroke import read_tensors
-from brushloop.model.generator.targets import INPUTS, Target
-from brushloop.model.train.config import TrainConfig
+from brushloop.model.generator.config import INPUTS, Target, TrainConfig, checked
+from brushloop.model.generator.stroke import read_generator, read_tensors
 
 Singles = NDArray[np.float32]
 _TRAINING, _VALIDATION, _ORDER, _SPLIT = range(4)
@@ -46,6 +45,20 @@ class Images:
         """Inputs (n, 2) and images (n, N, N) of these numbers (n,), or of a mask."""
         inputs = self.inputs[numbers]
         return inputs, self.target.images(inputs) if self.captured is None else self.captured[numbers]
+
+
+@dataclass(frozen=True, slots=True)
+class TuningFiles:
+    """The files of a fine-tuning: the generator to start from, and the captures."""
+
+    start: Path
+    captures: Path
+
+    def config(self, source: str, held_out: float, **changes: Any) -> TrainConfig:
+        """The configuration of the generator to start from, with fields changed. Raises TrainError."""
+        hashes = {"start_sha256": sha256(self.start), "captures_sha256": sha256(self.captures)}
+        tuning = {**hashes, "source": source, "held_out": held_out}
+        return checked("tune", read_generator(self.start).config.model_dump() | changes | {"tuning": tuning})
 
 
 def exact_sets(config: TrainConfig) -> tuple[Images, Images]:

@@ -9,15 +9,16 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from rich.progress import Progress as ProgressBar
 
-    from brushloop.model.train.config import TrainConfig
-    from brushloop.model.train.train import TuningFiles, Validation
+    from brushloop.model.generator.config import TrainConfig
+    from brushloop.model.generator.data import TuningFiles
+    from brushloop.model.generator.train import Validation
 
 app = typer.Typer(help="Train the neural stroke generator, or tune it on captures.")
 
@@ -38,7 +39,7 @@ def train(
     """Train on exact images of CCD-BSM (Algorithm 1), in one process on one device."""
     if context.invoked_subcommand is not None:
         return None
-    from brushloop.model.train import config as configs
+    from brushloop.model.generator import config as configs
 
     changes = {"steps": steps, "seed": seed, "threads": threads, "device": device}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -60,26 +61,13 @@ def tune(
     seed: Annotated[int, typer.Option(min=0, help="Which conditions are held out, and the order of the rest.")] = 0,
 ) -> Path:
     """Fine-tune a generator on captured strokes; some are held out to validate on."""
+    from brushloop.model.generator.data import TuningFiles, load_captures
     from brushloop.model.generator.stroke import read_generator
-    from brushloop.model.train.config import checked, config_of
-    from brushloop.model.train.data import load_captures, sha256
-    from brushloop.model.train.train import TuningFiles
 
-    before = config_of(generator, read_generator(generator))
-    _, source = load_captures(captures, before.target)
-    fields: dict[str, Any] = before.model_dump() | {
-        "steps": steps,
-        "learning_rate": learning_rate,
-        "seed": seed,
-        "validate_every": max(1, steps // 20),
-        "tuning": {
-            "start_sha256": sha256(generator),
-            "captures_sha256": sha256(captures),
-            "source": source,
-            "held_out": held_out,
-        },
-    }
-    return train_with_bar(checked("tune", fields), out, TuningFiles(generator, captures))
+    files = TuningFiles(generator, captures)
+    _, source = load_captures(captures, read_generator(generator).config.target)
+    changes = {"steps": steps, "learning_rate": learning_rate, "seed": seed, "validate_every": max(1, steps // 20)}
+    return train_with_bar(files.config(source, held_out, **changes), out, files)
 
 
 def train_with_bar(config: TrainConfig, folder: Path, tuning: TuningFiles | None = None) -> Path:
@@ -87,7 +75,7 @@ def train_with_bar(config: TrainConfig, folder: Path, tuning: TuningFiles | None
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as ProgressBar
 
-    from brushloop.model.train.train import run_training
+    from brushloop.model.generator.train import run_training
 
     words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
     columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True), words)

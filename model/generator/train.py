@@ -1,7 +1,7 @@
 """Algorithm 1 of the paper in one folder: sample H and alpha, draw the stroke, compare, update, until convergence.
 
 A folder holds `checkpoint.pt` during and after training, `generator.safetensors` with its card `generator.md` at the
-end, and what `model.train.card` writes. The same training started again resumes at the last checkpoint.
+end, and what `model.generator.card` writes. The same training started again resumes at the last checkpoint.
 """
 
 from __future__ import annotations
@@ -23,11 +23,8 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 from torch import Tensor
 
-from brushloop.model.generator import TrainError
-from brushloop.model.generator.network import Generator, squared_error
-from brushloop.model.generator.stroke import FORMAT, read_generator
-from brushloop.model.train import TrainingStopped
-from brushloop.model.train.card import (
+from brushloop.model.generator import TrainError, TrainingStopped
+from brushloop.model.generator.card import (
     Samples,
     likeness,
     report_of,
@@ -36,8 +33,19 @@ from brushloop.model.train.card import (
     write_curves,
     write_pictures,
 )
-from brushloop.model.train.config import TrainConfig, config_of, differences
-from brushloop.model.train.data import Images, batch_numbers, exact_sets, load_captures, sha256, split, write_whole
+from brushloop.model.generator.config import TrainConfig, differences
+from brushloop.model.generator.data import (
+    Images,
+    TuningFiles,
+    batch_numbers,
+    exact_sets,
+    load_captures,
+    sha256,
+    split,
+    write_whole,
+)
+from brushloop.model.generator.network import Generator, squared_error
+from brushloop.model.generator.stroke import FORMAT, read_generator
 
 BLANK_SHARE = 0.05
 """Output is blank if its ink, or its paper, is less than this share of the targets' ink or paper."""
@@ -75,14 +83,6 @@ class Progress(Protocol):
     def validated(self, validation: Validation) -> None:
         """Called after a validation."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class TuningFiles:
-    """The files of a fine-tuning: the generator to start from, and the captures."""
-
-    start: Path
-    captures: Path
 
 
 def run_training(
@@ -185,9 +185,8 @@ class _Training:
             self._resume()
         elif tuning is not None:
             file = read_generator(tuning.start)
-            before = config_of(tuning.start, file)
-            same = before.model_copy(update={"target": self.config.target, "layers": self.config.layers})
-            for difference in differences(before, same):
+            same = file.config.model_copy(update={"target": self.config.target, "layers": self.config.layers})
+            for difference in differences(file.config, same):
                 raise TrainError(tuning.start, f"is another generator: {difference}")
             self.network.load_state_dict({name: torch.from_numpy(value) for name, value in file.weights.items()})
 
@@ -230,11 +229,8 @@ class _Training:
         """Compute means over the validation set; raise TrainingStopped if the output was blank too often."""
         sums = np.zeros(5)
         for drawn, target in self._drawn(self.sets[1]):
-            sums += [
-                *(part.sum() for part in likeness(drawn, target)),
-                drawn.mean((1, 2)).sum(),
-                target.mean((1, 2)).sum(),
-            ]
+            shares = (images.mean((1, 2)).sum() for images in (drawn, target))
+            sums += [*likeness(drawn, target).sum(0), *shares]
         found = Validation(self.step, *(sums / len(self.sets[1])).tolist())
         self.validations.append((found.step, found.mse, found.iou, found.csim))
         self.progress.validated(found)
