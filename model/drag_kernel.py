@@ -1,4 +1,4 @@
-"""Compiled loops of `model.drag` and `model.footprint`: how a brush is pulled along its path, signed distances of its
+"""Compiled loops of `model.drag` and `model.drag`: how a brush is pulled along its path, signed distances of its
 mark, and the normal equations of a fit."""
 
 import math
@@ -61,7 +61,7 @@ def _quadratic(p, at, depth):
 def pull(path, ends, values, out):
     """Fill `out` with three discs (x, y, half width) for every node of paths of x, y, depth, heading in deg.
 
-    `values` (paths, 28) are those of the footprint that follows each path, in the order of `model.footprint.NAMES`.
+    `values` (paths, 28) are those of the footprint that follows each path, in the order of `model.drag.NAMES`.
     """
     for i in range(len(ends) - 1):
         first, last = ends[i], ends[i + 1]

@@ -51,8 +51,7 @@ from brushloop.calibrate.writing.scores import (
 )
 from brushloop.model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
 from brushloop.model.characters.plan import Phase, Reach, StrokePath, directions, grid, phase_map, without_tilt
-from brushloop.model.drag import Drawings
-from brushloop.model.footprint import NAMES, Footprint, fit_each, fit_footprint
+from brushloop.model.drag import NAMES, Drawings, Footprint, fit_each, fit_footprint
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.terminal import Progress, unseen
 

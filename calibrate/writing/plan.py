@@ -10,7 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.errors import CalibrationError
@@ -27,16 +26,16 @@ from brushloop.model.characters.glyph import (
     parse_glyph,
     parse_json,
     paths_of,
+    reference,
+    swept,
 )
-from brushloop.model.characters.ink import Image, reference, refine, swept, written
 from brushloop.model.characters.lead import covered, drawn, first_lead, lead
-from brushloop.model.characters.plan import Patch, Phase, Reach, StrokePath, phases_of, trajectory
-from brushloop.model.footprint import Footprint
+from brushloop.model.characters.plan import Floats, Image, Patch, Phase, Reach, StrokePath, phases_of, trajectory
+from brushloop.model.drag import Footprint
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import StrokeModel, UnknownModelError, stroke_model
 from brushloop.sessions.terminal import Progress, unseen
 
-Floats = NDArray[np.float64]
 PICTURE = "plan.png"
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
 STEP_MM = 2.0
@@ -167,6 +166,8 @@ def pressed(
     wanted: Wanted, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int
 ) -> PlannedFigure:
     """Plan a figure as presses that are laid over each other along the way."""
+    from brushloop.model.characters.presses import refine, written  # loads torch
+
     side_mm = patch.side_mm
     first = [trajectory(path, model, reach, patch, tilt_deg) for path in wanted.paths]
     refined = refine(model, first, wanted.image, side_mm, reach, steps)

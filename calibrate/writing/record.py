@@ -22,7 +22,7 @@ from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import write_files
-from brushloop.model.footprint import NAMES
+from brushloop.model.drag import NAMES
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray, encode_png
 
@@ -52,7 +52,7 @@ class PlannedBy(Frozen):
     wrist_deg_s: Number = 180.0
     """Greatest speed of the wrist."""
     footprint: Annotated[tuple[Number, ...], Field(min_length=len(NAMES), max_length=len(NAMES))] | None = None
-    """Values of the fitted footprint (`model.footprint`) that the plan leads the brush by; None without one."""
+    """Values of the fitted footprint (`model.drag`) that the plan leads the brush by; None without one."""
 
 
 class Round(Frozen):

@@ -1,4 +1,4 @@
-"""What is written: a character of hanzi-writer or makemeahanzi, or a trajectory supplied by the user. Reads no files.
+"""What is written, and its image: a character of hanzi-writer or makemeahanzi, or a trajectory of the user's.
 
 A character has an outline and a median for each stroke, in font units: 1024 per side, x to the right, y upward from
 -124 at the bottom to 900 at the top. A trajectory has the width that the stroke should have at each point. It is CSV
@@ -14,15 +14,16 @@ import io
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from brushloop.model.characters.plan import Patch, StrokePath, lengths_along, resampled
+from brushloop.model.characters.plan import Floats, Image, Patch, StrokePath, grid, lengths_along, resampled
+from brushloop.model.outline import Outline
+from brushloop.model.raster import SIZE_PX, coverage
 
-Floats = NDArray[np.float64]
 MAX_GLYPH_CHARS, MAX_TRAJECTORY_CHARS = 256 * 1024, 4 * 1024 * 1024
 MAX_STROKES, MAX_MEDIAN, MAX_SEGMENTS = 64, 256, 1024
 MAX_UNITS = 4096.0
@@ -167,6 +168,17 @@ def paths_of(glyph: Glyph, patch: Patch, step_mm: float) -> list[StrokePath]:
     return out
 
 
+def reference(glyph: Glyph, patch: Patch, size_px: int = SIZE_PX) -> Image:
+    """The image of a character's outlines, with the exact coverage of each stroke."""
+    image = np.zeros((size_px, size_px), np.float32)
+    for stroke in glyph.strokes:
+        points = patch.to_mm(stroke.arcs)[None]
+        loop = Outline(points, np.ones(points.shape[:2]))
+        drawn = coverage(loop, (0.0, patch.side_mm), size_px=size_px, px_mm=patch.side_mm / size_px)
+        image = np.maximum(image, drawn[0])
+    return image
+
+
 def distance_to(loop: Floats, points: Floats) -> Floats:
     """The distance of (N, 2) points to a closed polyline (M, 2), (N,); 0 outside it."""
     start, end = loop, np.roll(loop, -1, axis=0)
@@ -256,6 +268,19 @@ def _paths(strokes: list[list[_Point]], step_mm: float) -> list[StrokePath]:
         at = np.linspace(0, along[-1], len(even))
         out.append(StrokePath(even, 0.5 * np.interp(at, along, points[:, 2])))
     return out
+
+
+def swept(paths: Sequence[StrokePath], side_mm: float, size_px: int = SIZE_PX) -> Image:
+    """The image of discs along paths: the intended look of a user's trajectory with widths."""
+    x, y = np.meshgrid(*grid(side_mm, size_px))
+    image = np.zeros((size_px, size_px))
+    for path in paths:
+        along = lengths_along(path.points)
+        at = np.linspace(0, along[-1], max(2, math.ceil(along[-1] / (0.25 * side_mm / size_px))))
+        for cx, cy, r in zip(*(np.interp(at, along, v) for v in (*path.points.T, path.half_width_mm)), strict=True):
+            edge = (r - np.hypot(x - cx, y - cy)) * size_px / side_mm
+            image = np.maximum(image, np.clip(0.5 + edge, 0, 1))
+    return image.astype(np.float32)
 
 
 def _json_of(text: str, most_chars: int) -> Any:

@@ -1,6 +1,6 @@
 """Plans that lead a dragged brush, so that its ink rather than its tip follows the character.
 
-The points of all strokes are adjusted together until the ink that `model.footprint` predicts matches the wanted image:
+The points of all strokes are adjusted together until the ink that `model.drag` predicts matches the wanted image:
 least squares over the pixels, by Levenberg-Marquardt, through an edge that is first soft and then sharp. Every trial is
 made feasible by `Reach.within` before it is judged.
 """
@@ -14,13 +14,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.characters.ink import Image
-from brushloop.model.characters.plan import Reach, StrokePath, directions, grid, tangents, without_tilt
+from brushloop.model.characters.plan import Floats, Image, Reach, StrokePath, directions, grid, tangents, without_tilt
 from brushloop.model.damped import Equations, descend
-from brushloop.model.drag import Drawings, distances, ink, ink_equations
-from brushloop.model.footprint import Footprint, inked, marks, sampled, sampling
+from brushloop.model.drag import Drawings, Footprint, distances, ink, ink_equations, inked, marks, sampled, sampling
 
-Floats = NDArray[np.float64]
 UNITS = np.array([0.3, 0.3, 0.5, 10.0])
 """Steps of x, y, depth (mm) and heading (deg) that count as equally large."""
 BENT = 0.015

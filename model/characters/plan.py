@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+"""Ink of a patch from 0 to 1, (size, size), row 0 at its far (upper) edge."""
 SIDE_UNITS, FOOT_UNITS = 1024.0, -124.0
 """Side of a font's square, and its lower edge, in font units."""
 TURN_DEG, FOLD_DEG = 35.0, 90.0
@@ -157,7 +159,7 @@ def directions(heading_deg: Floats) -> Floats:
 
 
 def without_tilt(stroke: Floats) -> Floats:
-    """x, y, depth and heading (N, 4) of a trajectory (N, 5): a path as `model.footprint` and `model.drag` take it."""
+    """x, y, depth and heading (N, 4) of a trajectory (N, 5): a path as `model.drag` and `model.drag` take it."""
     return np.ascontiguousarray(stroke[:, [0, 1, 2, 4]])
 
 

@@ -24,8 +24,7 @@ from brushloop.calibrate.writing.learn import (
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.model.characters.plan import Reach, without_tilt
-from brushloop.model.drag import Drawings
-from brushloop.model.footprint import NAMES, Footprint
+from brushloop.model.drag import NAMES, Drawings, Footprint
 from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import CALIBRATION
 from tests.command import brushloop

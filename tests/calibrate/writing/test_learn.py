@@ -14,10 +14,10 @@ from brushloop.calibrate.writing.learn import MOST_MM, learned, lost_by_phase, m
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.calibrate.writing.report import write_written
 from brushloop.calibrate.writing.scores import Character, WritingComparison, as_ink, score_character
-from brushloop.model.characters.ink import swept
+from brushloop.model.characters.glyph import swept
 from brushloop.model.characters.lead import covered, drawn, first_lead, lead
 from brushloop.model.characters.plan import StrokePath
-from brushloop.model.footprint import NAMES, START, Footprint
+from brushloop.model.drag import NAMES, START, Footprint
 from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import CALIBRATION
 

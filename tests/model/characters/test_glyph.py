@@ -18,8 +18,8 @@ from brushloop.model.characters.glyph import (
     parse_json,
     parse_path,
     paths_of,
+    reference,
 )
-from brushloop.model.characters.ink import reference
 from brushloop.model.characters.plan import Patch, resampled, tangents
 
 SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.model.characters.ink import swept
+from brushloop.model.characters.glyph import swept
 from brushloop.model.characters.lead import PLUNGE, covered, drawn, first_lead, lead
 from brushloop.model.characters.plan import Phase, Reach, StrokePath, phase_map, phases_of, resampled
-from brushloop.model.drag import Drawings
-from brushloop.model.footprint import NAMES, START, Footprint, fit_each, fit_footprint, inked, marks, sampled
+from brushloop.model.drag import NAMES, START, Drawings, Footprint, fit_each, fit_footprint, inked, marks, sampled
 
 SIDE_MM, SIZE_PX = 48.0, 96
 HOOK = np.array([[12.0, 36.0], [20.0, 36.0], [28.0, 36.0], [34.0, 34.0], [34.0, 26.0], [33.0, 18.0], [30.0, 21.0]])

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.glyph import parse_glyph, paths_of
-from brushloop.model.characters.ink import dense, reference, refine, stamped, swept, written
+from brushloop.model.characters.glyph import parse_glyph, paths_of, reference, swept
 from brushloop.model.characters.plan import Patch, Reach, StrokePath, depth_of, trajectory
+from brushloop.model.characters.presses import dense, refine, stamped, written
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
 

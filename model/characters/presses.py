@@ -1,8 +1,7 @@
-"""Images of trajectories made of presses, images that are wanted, and refinement from the one to the other.
+"""Trajectories as presses laid over each other along the path, and refined until their image is the wanted one.
 
-The image of the patch is square, row 0 at its far (upper) edge. A pixel is as dark as the darkest mark on it: ink on
-ink stays ink. Marks of presses are laid over each other along the path: bristles do not lag, and no brush runs dry.
-`model.characters.lead` draws with a brush that is dragged.
+A pixel is as dark as the darkest mark on it: ink on ink stays ink. Bristles do not lag, and no brush runs dry.
+`model.characters.lead` draws with a brush that is dragged, and needs no torch.
 """
 
 from __future__ import annotations
@@ -12,18 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from brushloop.model.characters.glyph import Glyph
-from brushloop.model.characters.plan import Patch, Reach, StrokePath, grid, lengths_along
-from brushloop.model.outline import Outline
+from brushloop.model.arrays import Array, library, like
+from brushloop.model.characters.plan import Floats, Image, Reach
 from brushloop.model.raster import SIZE_PX, coverage
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import StrokeModel
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
 _RATE = (0.12, 0.12, 0.12, 0.1, 1.5)
 """Longest step of x, y, H (mm), alpha and heading (deg)."""
 _STIFF = (0.02, 0.02, 0.02, 0.002, 2e-5)
@@ -31,27 +26,31 @@ _STIFF = (0.02, 0.02, 0.02, 0.002, 2e-5)
 _WIDE_PX, _NARROW_PX = 2.0, 0.6
 
 
-def dense(points: Tensor, per_step: int) -> Tensor:
+def dense(points: Array, per_step: int) -> Array:
     """(N, 5) points with `per_step` - 1 more interpolated linearly between neighbours, ((N - 1) per_step + 1, 5)."""
-    share = torch.arange(per_step, dtype=points.dtype) / per_step
-    between = points[:-1, None] + share[:, None] * (points[1:] - points[:-1])[:, None]
-    return torch.cat((between.flatten(0, 1), points[-1:]))
+    share = like(np.arange(per_step) / per_step, points)[:, None]
+    between = points[:-1, None] + share * (points[1:] - points[:-1])[:, None]
+    return library(points).concat((between.reshape(-1, points.shape[1]), points[-1:]))
+
+
+def origins(points: Array, side_mm: float) -> Array:
+    """Where the brush axis meets the paper in presses at (M, 5) points, (M, 2) mm from the left and the far edge."""
+    xp = library(points)
+    x, y, depth, tilt, heading = (points[:, k] for k in range(5))
+    ahead, turn = depth * xp.tan(xp.deg2rad(tilt)), xp.deg2rad(heading)
+    return xp.stack((x + ahead * xp.cos(turn), side_mm - y - ahead * xp.sin(turn)), -1)
 
 
 def stamped(model: StrokeModel, points: Tensor, side_mm: float, size_px: int = SIZE_PX) -> Tensor:
     """The image (size, size) of presses at (M, 5) points; differentiable in all of them."""
     px_mm = side_mm / size_px
-    x, y, height, tilt, heading = points.unbind(-1)
-    shape = model.profile(height, tilt)
-    turn = torch.deg2rad(heading)
-    way = torch.stack((torch.cos(turn), -torch.sin(turn)), dim=-1)
-    origin = torch.stack((x, side_mm - y), dim=-1) + (height * torch.tan(torch.deg2rad(tilt)))[:, None] * way
+    shape, origin = model.profile(points[:, 2], points[:, 3]), origins(points, side_mm)
     with torch.no_grad():
         # Each mark is drawn on a separate tile, cut out of the image with a margin all around.
         reach = torch.maximum(-shape.x_min_mm, shape.x_max_mm) + 0.5 * shape.width_mm
         tile = min(math.ceil(2 * float(reach.max()) / px_mm) + 2, size_px)
         corner = (origin / px_mm - 0.5 * tile).round().clamp(-tile, size_px)
-    marks = coverage_at(shape, origin - corner * px_mm, heading, size_px=tile, px_mm=px_mm)
+    marks = coverage_at(shape, origin - corner * px_mm, points[:, 4], size_px=tile, px_mm=px_mm)
     wide = size_px + 2 * tile
     offset = torch.arange(tile)
     rows, columns = ((corner[:, k].long() + tile)[:, None] + offset for k in (1, 0))
@@ -62,38 +61,14 @@ def stamped(model: StrokeModel, points: Tensor, side_mm: float, size_px: int = S
 
 def written(model: StrokeModel, strokes: Sequence[Floats], side_mm: float, size_px: int = SIZE_PX) -> Image:
     """The image of whole trajectories, each (N, 5), with marks dense enough that edges join to a tenth of a pixel."""
+    px_mm = side_mm / size_px
     image = np.zeros((size_px, size_px), np.float32)
     for points in strokes:
         longest = float(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).max())
-        per_step = max(1, math.ceil(longest / (0.5 * side_mm / size_px)))
-        with torch.no_grad():
-            stroke = stamped(model, dense(torch.from_numpy(points), per_step), side_mm, size_px)
-        image = np.maximum(image, stroke.float().numpy())
+        presses = dense(points, max(1, math.ceil(longest / (0.5 * px_mm))))
+        shape, origin = model.profile(presses[:, 2], presses[:, 3]), origins(presses, side_mm)
+        image = np.maximum(image, coverage(shape, origin, presses[:, 4], size_px=size_px, px_mm=px_mm).max(axis=0))
     return image
-
-
-def reference(glyph: Glyph, patch: Patch, size_px: int = SIZE_PX) -> Image:
-    """The image of a character's outlines, with the exact coverage of each stroke."""
-    image = np.zeros((size_px, size_px), np.float32)
-    for stroke in glyph.strokes:
-        points = patch.to_mm(stroke.arcs)[None]
-        loop = Outline(points, np.ones(points.shape[:2]))
-        drawn = coverage(loop, (0.0, patch.side_mm), size_px=size_px, px_mm=patch.side_mm / size_px)
-        image = np.maximum(image, drawn[0])
-    return image
-
-
-def swept(paths: Sequence[StrokePath], side_mm: float, size_px: int = SIZE_PX) -> Image:
-    """The image of discs along paths: the intended look of a user's trajectory with widths."""
-    x, y = np.meshgrid(*grid(side_mm, size_px))
-    image = np.zeros((size_px, size_px))
-    for path in paths:
-        along = lengths_along(path.points)
-        at = np.linspace(0, along[-1], max(2, math.ceil(along[-1] / (0.25 * side_mm / size_px))))
-        for cx, cy, r in zip(*(np.interp(at, along, v) for v in (*path.points.T, path.half_width_mm)), strict=True):
-            edge = (r - np.hypot(x - cx, y - cy)) * size_px / side_mm
-            image = np.maximum(image, np.clip(0.5 + edge, 0, 1))
-    return image.astype(np.float32)
 
 
 def refine(
