@@ -192,24 +192,24 @@ def written(*, n: int | None = None, seed: int = 1) -> Sequence[Result]:
             with simulated_rig(folder, brush, RATE, seed) as rig:
                 words = ("--out", out, "--sessions", folder / "sessions", "--count", str(WRITINGS))
                 rig.run("write", CHARACTERS, *words, "--practice", "--learn", str(ROUNDS))
-            tables = [_table_3(place) for place in (out / "round-1", out)]
+            records = [read_written(place) for place in (out / "round-1", out)]
+            tables = [
+                {
+                    (row.character, row.pair): row
+                    for row in record.table_3
+                    if (row.alignment, row.tone, row.polarity) == HEADLINE
+                }
+                for record in records
+            ]
         for character, pair in itertools.product(CHARACTERS, (REFERENCE, SIMULATED)):
             first, last = (table[character, pair] for table in tables)
-            ratio = (100.0 - first.csim[2]) / max(100.0 - last.csim[2], 0.01)
-            where = (
-                f"{last.source}; CSIM {last.csim[0]:.1f} / {last.csim[1]:.1f} / {last.csim[2]:.1f}, SSIM "
-                f"{last.ssim[0]:.1f} / {last.ssim[1]:.1f} / {last.ssim[2]:.1f} (max / min / avg); {machine()}"
-            )
-            peer = f"the first round ({first.csim[2]:.1f})"
+            ratio = (100.0 - first.csim.avg) / max(100.0 - last.csim.avg, 0.01)
+            csim, ssim = ("{:.1f} / {:.1f} / {:.1f}".format(*of.range_and_avg) for of in (last.csim, last.ssim))
+            where = f"{records[1].source}; CSIM {csim}, SSIM {ssim} (max / min / avg); {machine()}"
+            peer = f"the first round ({first.csim.avg:.1f})"
             label = f"written.{character}.{pair}.{name}"
-            results.append(Result(label, last.csim[2], "% CSIM", peer, ratio, last.n, seed, where))
+            results.append(Result(label, last.csim.avg, "% CSIM", peer, ratio, last.csim.n, seed, where))
     return results
-
-
-def _table_3(folder: Path) -> dict[tuple[str, str], Any]:
-    """The headline rows of a report by character and pair."""
-    rows = read_written(folder).table_3
-    return {(r.character, r.pair): r for r in rows if (r.alignment, r.tone, r.polarity) == HEADLINE}
 
 
 def twin(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
 from brushloop.sessions.records import Header, Source
@@ -133,6 +134,40 @@ class Point:
 def source_point(source: Source) -> Point:
     """What the source of a recording says about its numbers."""
     return Point(True if source is Source.REAL else None, MEANING[source])
+
+
+def brush_and_size(header: Header) -> str:
+    """The brush and its size, where a header names them."""
+    size = ""
+    if header.brush_radius_mm is not None and header.brush_length_mm is not None:
+        size = f"R = {header.brush_radius_mm:g} mm, L = {header.brush_length_mm:g} mm"
+    return ", ".join(filter(None, (header.brush, size)))
+
+
+def recording_facts(
+    header: Header, recording: str, sha256: str, calibration: Calibration | None
+) -> list[tuple[str, str]]:
+    """Name and text of what is known of a recording, for a page's provenance."""
+    scale = ""
+    if calibration is not None:
+        low, high = calibration.mm_per_px_low, calibration.mm_per_px_high
+        scale = f"{calibration.named}: pix2len {calibration.mm_per_px:.5f} mm/px (95 % {low:.5f} to {high:.5f}), "
+        scale += f"board residual {calibration.rms_px:.3f} px"
+    facts = (
+        ("session", header.session_id),
+        ("source", str(header.source)),
+        ("recording", f"{recording}, sha256 {sha256}"),
+        ("recorded with", header.software),
+        ("robot", f"{header.robot} {header.robot_firmware}".strip()),
+        ("camera", f"{header.camera} {header.lens}".strip()),
+        ("brush", brush_and_size(header)),
+        ("ink, paper", ", ".join(filter(None, (header.ink, header.paper)))),
+        ("protocol", header.protocol),
+        ("origin", header.origin),
+        ("licence", header.licence),
+        ("calibration", scale),
+    )
+    return [(name, text) for name, text in facts if text]
 
 
 def png_uri(data: bytes) -> str:

@@ -1,4 +1,4 @@
-"""The one table of scores: every comparison of a captured press with an image, in memory.
+"""The one table of scores: every comparison of a captured press with images, in memory; and its statistics.
 
 Tables 1 and 2, CSV, Parquet, gates and figures are queries on it.
 """
@@ -7,35 +7,44 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, unpack
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, to_pixels
+from brushloop.calibrate.compare.score import similarity
+from brushloop.calibrate.presses import Press
+from brushloop.calibrate.report import source_label
+from brushloop.calibrate.stats import CEILING, Floats, Integers, Summary, average, summarise
 from brushloop.calibrate.stroke.measure import Measured
-from brushloop.sessions.records import Condition, Stroke
+from brushloop.sessions.records import Condition, Header, Stroke
 
-Values = NDArray[np.float64]
-Numbers = NDArray[np.int64]
+Cell = tuple[float, float]
+"""Depth in mm and tilt in deg."""
+MEASURES = ("csim", "ssim")
 
 
-@dataclass(frozen=True, slots=True)
-class Score:
-    """Similarity, from 0 to 1, of one captured press and what a model predicts for it."""
+class Score(NamedTuple):
+    """Similarity, from 0 to 1, of one captured press and what a model predicts for it: a line of `scores.csv`."""
 
-    session: str
+    session_id: str
     stroke_id: str
-    condition: Condition
+    depth_mm: float
     """As commanded."""
     reached_mm: float | None
     """Depth that the arm reached; None where the recording does not say."""
+    tilt_deg: float
     model: str
     """The model, or the kind of press that the press is compared with."""
     alignment: Alignment
     tone: Tone
     csim: float
     ssim: float
+    source: str
+    """Label of the recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +52,25 @@ class Row:
     """A press in the table."""
 
     session: str
+    source: str
+    """Label of its recording."""
     stroke: Stroke
     condition: Condition
     """As commanded."""
     measured: Measured
     cut: bool
-    packed: bytes
-    """`pack` of (len(KEYS) + 1, 128, 128): an image for each key, then the coverage on the millimetre field."""
+    """Whether it reaches the edge of its photograph, cell or field."""
+    images: Pixels
+    """(len(KEYS), 128, 128): what is compared."""
+    coverage: Pixels
+    """(128, 128): what a model is fitted to."""
 
-    def image(self, key: Key) -> Pixels:
-        """(128, 128) as it was captured."""
-        return unpack(self.packed)[KEYS.index(key)]
+    @classmethod
+    def of(cls, press: Press, header: Header) -> Row:
+        """The row of a press in a recording."""
+        images, label = to_pixels(np.stack(list(press.images.values()))), source_label(header.source, [header.brush])
+        about = header.session_id, label, press.stroke, press.condition, press.measured, press.cut
+        return cls(*about, images, to_pixels(press.coverage))
 
 
 class Scores:
@@ -67,9 +84,9 @@ class Scores:
         order = {name: number for number, name in enumerate(dict.fromkeys(row.session for row in rows))}
         for number, row in enumerate(rows):
             cells.setdefault((order[row.session], row.condition), []).append(number)
-        self.cells = [np.array(cells[key], np.int64) for key in sorted(cells)]
+        self.cells = [cells[key] for key in sorted(cells)]
         """Rows of each cell, which is one condition in one session, by session and condition."""
-        self.cell_of: Numbers = np.zeros(len(rows), np.int64)
+        self.cell_of: Integers = np.zeros(len(rows), np.int64)
         """(rows,) number of each row's cell."""
         for number, cell in enumerate(self.cells):
             self.cell_of[cell] = number
@@ -77,23 +94,75 @@ class Scores:
     def __iter__(self) -> Iterator[Score]:
         """The scores by session, order of capture and model; those that are missing are left out."""
         for row, of_row in zip(self.rows, self.values, strict=True):
-            about = (row.session, row.stroke.stroke_id, row.condition, row.stroke.reached_mm)
+            pressed = row.condition.depth_mm, row.stroke.reached_mm, row.condition.tilt_deg
             for model, values in zip(self.models, of_row.tolist(), strict=True):
                 for key, (csim, ssim) in zip(KEYS, values, strict=True):
                     if math.isfinite(csim):
-                        yield Score(*about, model, *key, csim, ssim)
+                        yield Score(row.session, row.stroke.stroke_id, *pressed, model, *key, csim, ssim, row.source)
 
-    def of(self, model: str) -> Values:
+    def of(self, model: str) -> Floats:
         """(rows, KEYS, 2) scores of one model."""
         return self.values[:, self.models.index(model)]
 
-    def of_key(self, model: str, key: Key) -> Values:
+    def of_key(self, model: str, key: Key) -> Floats:
         """(rows, 2) CSIM and SSIM of one model in one alignment and tone."""
         return self.of(model)[:, KEYS.index(key)]
 
-    def conditions(self) -> dict[Condition, Numbers]:
+    def conditions(self) -> dict[Condition, list[int]]:
         """Rows of each condition in any session, sorted by condition."""
-        found: dict[Condition, list[Numbers]] = {}
+        rows: dict[Condition, list[int]] = {}
         for cell in self.cells:
-            found.setdefault(self.rows[int(cell[0])].condition, []).append(cell)
-        return {condition: np.concatenate(found[condition]) for condition in sorted(found)}
+            rows.setdefault(self.rows[cell[0]].condition, []).extend(cell)
+        return dict(sorted(rows.items()))
+
+
+class Stat(Frozen):
+    """CSIM and SSIM of one model in one alignment and tone, in percent, over all cells or in one."""
+
+    model: str
+    alignment: Alignment
+    tone: Tone
+    cell: Cell | None
+    csim: Summary
+    ssim: Summary
+
+
+def find_stat(stats: Sequence[Stat], model: str, key: Key, cell: Cell | None = None) -> Stat | None:
+    """The statistics of one model, or None if it has none."""
+    wanted = (model, *key, cell)
+    return next((stat for stat in stats if (stat.model, stat.alignment, stat.tone, stat.cell) == wanted), None)
+
+
+def statistics(
+    model: str, percent: Floats, cells: Integers, cell: Cell | None = None, ceiling: Floats | None = None
+) -> Iterator[Stat]:
+    """Yield the statistics of a model's scores, (rows, KEYS, 2) percent, for each of `KEYS` in which it has any.
+
+    `cells` (rows,) are numbers of cells. With a `ceiling` of the same shape, each statistic says how far below it is.
+    """
+
+    def summary(values: Floats, top: Floats | None) -> Summary | None:
+        summary = average(values, cells) if model == CEILING else summarise(values, cells)
+        below = None if top is None else average(top - values, cells)
+        if summary is None or below is None:
+            return summary
+        return replace(summary, below_ceiling=below.avg, below_interval=below.avg_interval)
+
+    for k, (alignment, tone) in enumerate(KEYS):
+        csim, ssim = (summary(percent[:, k, j], None if ceiling is None else ceiling[:, k, j]) for j in (0, 1))
+        if csim is not None and ssim is not None:
+            yield Stat(model=model, alignment=alignment, tone=tone, cell=cell, csim=csim, ssim=ssim)
+
+
+def similarities(press: NDArray[Any], others: NDArray[Any]) -> Floats:
+    """(KEYS, 2) mean CSIM and SSIM of a press, (KEYS, 128, 128) from 0 to 1, and n others, (n, KEYS, 128, 128).
+
+    NaN where there is no other, or it is blank.
+    """
+
+    def of_key(k: int, other: NDArray[Any]) -> tuple[float, float]:
+        return similarity(press[k], other[k], KEYS[k][0]) if other[k].any() else (math.nan, math.nan)
+
+    if not len(others):
+        return np.full((len(KEYS), 2), np.nan)
+    return np.mean([[of_key(k, other) for k in range(len(KEYS))] for other in others], axis=0)

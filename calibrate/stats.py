@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Interval = tuple[float, float]
 """Ends of a 95 % interval."""
 SEED = 0
@@ -53,7 +54,7 @@ class Line:
     n: int
 
     @property
-    def interval(self) -> tuple[float, float]:
+    def interval(self) -> Interval:
         """95 % interval of the slope (Student's t with n - 2 degrees of freedom)."""
         reach = student_95(self.n - 2) * self.slope_se
         return self.slope - reach, self.slope + reach
@@ -79,23 +80,31 @@ def fit_line(x: Sequence[float], y: Sequence[float], weights: Sequence[float] | 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Summary of scores; intervals are None where there are too few scores."""
+    """Scores in percent; an interval is None where there are too few of them.
+
+    The ceiling is an average of its own, not of scores: it has no extremes and no median.
+    """
 
     n: int
-    max: float
-    min: float
     avg: float
-    median: float
     avg_interval: Interval | None = None
+    max: float | None = None
+    min: float | None = None
+    median: float | None = None
     median_interval: Interval | None = None
+    below_ceiling: float | None = None
+    """Points below the ceiling; None where no cell was pressed twice."""
+    below_interval: Interval | None = None
 
     @property
     def range_and_avg(self) -> tuple[float, float, float]:
         """Max, min and average, in the order of the paper's tables."""
+        assert self.max is not None, "the ceiling has no extremes"
+        assert self.min is not None, "the ceiling has no extremes"
         return self.max, self.min, self.avg
 
 
-def summarise(values: Floats, strata: NDArray[np.int64] | None = None) -> Summary | None:
+def summarise(values: Floats, strata: Integers | None = None) -> Summary | None:
     """Summarise (n,) scores without NaN; None if none is left. Intervals need strata, (n,) numbers.
 
     Strokes are resampled with replacement within their stratum (a cell of a session), so that the share of each cell
@@ -106,25 +115,19 @@ def summarise(values: Floats, strata: NDArray[np.int64] | None = None) -> Summar
     values = values[known]
     if not len(values):
         return None
-    intervals: tuple[Interval | None, Interval | None] = (None, None)
+    avg_interval, median_interval = None, None
     if strata is not None:
         strata = strata[known]
         _, counts = np.unique(strata, return_counts=True)
         by_cell = len(counts) >= MIN_CELLS and float(np.median(counts)) < MANY_PRESSES
         if by_cell or len(values) >= MIN_PRESSES * len(counts):
-            means, medians = _cell_draws(values, strata) if by_cell else _draws(values, strata)
-            intervals = _interval(means), _interval(medians)
-    return Summary(
-        len(values),
-        float(values.max()),
-        float(values.min()),
-        float(values.mean()),
-        float(np.median(values)),
-        *intervals,
-    )
+            draws = _cell_draws(values, strata) if by_cell else _draws(values, strata)
+            avg_interval, median_interval = map(_interval, draws)
+    avg, high, low, median = (_round(value) for value in (values.mean(), values.max(), values.min(), np.median(values)))
+    return Summary(len(values), avg, avg_interval, high, low, median, median_interval)
 
 
-def interval_over_groups(values: Floats, groups: NDArray[np.int64]) -> Interval | None:
+def interval_over_groups(values: Floats, groups: Integers) -> Interval | None:
     """Interval of the mean of (n,) values if whole groups were drawn anew; None for fewer than three groups.
 
     It is Student's, because a bootstrap of a few groups is too narrow.
@@ -138,7 +141,7 @@ def interval_over_groups(values: Floats, groups: NDArray[np.int64]) -> Interval 
     return mean - half, mean + half
 
 
-def _draws(values: Floats, strata: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _draws(values: Floats, strata: Integers) -> tuple[Floats, Floats]:
     """Means and medians of bootstrap samples."""
     order = np.argsort(strata, kind="stable")
     ordered = values[order]
@@ -148,7 +151,7 @@ def _draws(values: Floats, strata: NDArray[np.int64]) -> tuple[Floats, Floats]:
     return sampled.mean(axis=1), np.median(sampled, axis=1)
 
 
-def _cell_draws(values: Floats, strata: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def _cell_draws(values: Floats, strata: Integers) -> tuple[Floats, Floats]:
     """The same, resampling whole strata: each value counts as often as its stratum was drawn."""
     order = np.argsort(values, kind="stable")
     ordered = values[order]
@@ -166,17 +169,17 @@ def _draw_count(values: Floats) -> int:
 
 
 def _interval(draws: Floats) -> Interval:
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return float(low), float(high)
+    return _ends(np.quantile(draws, [0.025, 0.975]))
 
 
-@dataclass(frozen=True, slots=True)
-class Average:
-    """The mean over presses and its 95 % interval, None where cells and presses are too few for one."""
+def _ends(interval: Sequence[float] | Floats) -> Interval:
+    low, high = interval
+    return _round(low), _round(high)
 
-    mean: float
-    interval: Interval | None
-    n: int
+
+def _round(value: float) -> float:
+    """Round to six decimals; further digits would differ between machines."""
+    return round(float(value), 6)
 
 
 def others_of(press: int, count: int) -> list[int]:
@@ -194,7 +197,7 @@ def pair_means(count: int, scores: Callable[[int, list[int]], Floats]) -> Floats
     return np.array([scores(k, others_of(k, count)).mean(axis=0) for k in range(count)])
 
 
-def ceiling_values(pairs: Floats, cells: NDArray[np.int64]) -> Floats:
+def ceiling_values(pairs: Floats, cells: Integers) -> Floats:
     """(n,) percent, one for each press, whose mean is the ceiling; NaN for a press without another of its cell.
 
     `pairs` holds the mean score of each press with the others of its cell, `cells` the number of that cell. As pairs
@@ -212,7 +215,7 @@ def ceiling_values(pairs: Floats, cells: NDArray[np.int64]) -> Floats:
     return values
 
 
-def average(values: Floats, cells: NDArray[np.int64]) -> Average | None:
+def average(values: Floats, cells: Integers) -> Summary | None:
     """The average of `ceiling_values`, or of how much more they are than a model's scores; None without a value.
 
     The interval resamples whole cells: the error of a model is common to the presses of a cell. For fewer than three
@@ -220,10 +223,11 @@ def average(values: Floats, cells: NDArray[np.int64]) -> Average | None:
     """
     known = np.isfinite(values)
     values, cells = values[known], cells[known]
-    found = summarise(values, cells)
-    if found is None:
+    summary = summarise(values, cells)
+    if summary is None:
         return None
-    return Average(found.avg, interval_over_groups(values, cells) or found.avg_interval, found.n)
+    interval = interval_over_groups(values, cells)
+    return Summary(summary.n, summary.avg, summary.avg_interval if interval is None else _ends(interval))
 
 
 def is_near(below: float, interval: Interval | None, points: float = NEAR_POINTS) -> bool | None:
@@ -245,7 +249,7 @@ class Paired:
     """Two-sided, by flipping the signs of whole groups: exact up to 13 of them, else by 10,000 random flips."""
 
 
-def paired(before: Floats, after: Floats, groups: NDArray[np.int64]) -> Paired | None:
+def paired(before: Floats, after: Floats, groups: Integers) -> Paired | None:
     """`after` minus `before`, pair by pair, NaN left out; None where no pair is left.
 
     Pairs of one group, (n,) numbers, share an error, such as that of a model in one cell: they are flipped and drawn

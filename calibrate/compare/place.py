@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -272,13 +271,3 @@ def brush_of(header: Header) -> Brush:
 def to_pixels(image: Image) -> Pixels:
     """Convert ink in [0, 1] to 256 levels, like the camera's."""
     return np.rint(255.0 * image).astype(np.uint8)
-
-
-def pack(images: Pixels) -> bytes:
-    """Compress (n, 128, 128) images, which are mostly blank paper."""
-    return zlib.compress(np.ascontiguousarray(images).tobytes(), 1)
-
-
-def unpack(packed: bytes) -> Pixels:
-    """(n, 128, 128) images from `pack`."""
-    return np.frombuffer(zlib.decompress(packed), np.uint8).reshape(-1, SIZE_PX, SIZE_PX)

@@ -16,7 +16,7 @@ from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Floats, Grid, Pres
 from brushloop.calibrate.fit.fit import fit_presses, zero_touches
 from brushloop.calibrate.fit.prior import Prior
 from brushloop.calibrate.pool import Scheduler, finished, threads
-from brushloop.calibrate.stats import CEILING, Average, average, ceiling_values, pair_means
+from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
 from brushloop.calibrate.store import Arrays, Store, key_of
 from brushloop.model.arrays import as_batch
 from brushloop.model.ccdbsm import DomainError
@@ -48,7 +48,7 @@ class HeldOut:
     csim: float
     ssim: float
     n: int
-    below: Average | None = None
+    below: Summary | None = None
     """Points of CSIM below the ceiling; None for the ceiling itself, and where no cell was pressed twice."""
 
 

@@ -174,9 +174,9 @@ def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
     if not below:
         yield Point(False, "One combination of H and α does not show how the mark changes with depth or tilt.")
     elif (off := below.get(FITTED)) is not None:
-        span = "" if off.interval is None else f" (95 % {off.interval[0]:.1f} to {off.interval[1]:.1f})"
-        words = f"Held out, the fit is {off.mean:.1f} points of CSIM{span} below the ceiling"
-        yield Point(is_near(off.mean, off.interval), f"{words}; {NEAR_POINTS:g} or less is near.")
+        span = "" if off.avg_interval is None else " (95 % {:.1f} to {:.1f})".format(*off.avg_interval)
+        words = f"Held out, the fit is {off.avg:.1f} points of CSIM{span} below the ceiling"
+        yield Point(is_near(off.avg, off.avg_interval), f"{words}; {NEAR_POINTS:g} or less is near.")
     else:
         yield Point(None, "No combination was pressed twice, so the repeatability of the brush is not known here.")
     if captures.refused:

@@ -1,49 +1,130 @@
-"""Compare a session with the one that pressed its strokes again: paired by name, on the same fields, and scored."""
+"""Compare a session with the one that pressed its strokes again: paired by name, scored, and judged.
+
+A repetition is compared with its original as two presses of one condition are: the third row of Table 1.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.compare.place import Field, brush_of, simulated
+import numpy as np
+
+from brushloop.calibrate.artefact import load_artefact, made_by
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Image, Key, Tone, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import BrushFit
-from brushloop.calibrate.loop.scores import Pair, PairScore, Verdict, score_pairs, verdicts
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
+from brushloop.calibrate.report import Sealed, load_sealed
+from brushloop.calibrate.scores import MEASURES, Row, Scores, Stat, find_stat, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.calibrate.stats import Interval, interval_over_groups
 from brushloop.model.ccdbsm import DomainError
-from brushloop.sessions.records import Header, Source
+from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.terminal import Progress, unseen
 
 if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
+FILE = "loop.json"
+FORMAT = "brushloop-loop-2"
+MAX_BYTES = 8 * 1024 * 1024
+AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated"
+"""What is compared with an original: its repetition, other originals of its condition, the model's image of it."""
+GOAL_POINTS = 1.0
+"""Points by which re-pressed strokes may score below the originals' own repeatability."""
 NOT_AGAIN = "was not pressed again"
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A stroke and its repetition. Depth and tilt of `original` are as commanded, those of `again` as recovered."""
+
+    original: Press
+    again: Press
+    simulated: dict[Key, Image]
+    """The model's press at the recovered depth and tilt, (128, 128) each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Score of re-pressed minus another press, over the originals that have both, in points (percent)."""
+
+    alignment: Alignment
+    tone: Tone
+    measure: str
+    """`csim` or `ssim`."""
+    again: float
+    another: float
+    difference: float
+    interval: Interval | None
+    """Over the commanded conditions; None with fewer than three."""
+    n: int
+    holds: bool
+    """Whether the difference is at least minus `GOAL_POINTS`."""
+
+    @property
+    def certain(self) -> bool:
+        """Whether the whole interval lies on the same side of the limit."""
+        return self.interval is not None and all((end >= -GOAL_POINTS) == self.holds for end in self.interval)
+
+
+class LoopRecord(Sealed):
+    """A closed loop as stored in `loop.json`: everything but the images and the individual scores."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop loop compare"
+
+    format: str = FORMAT
+    source: Source
+    """Kind of ink of the session that pressed again."""
+    original: str
+    original_sha256: str
+    again: str
+    again_sha256: str
+    """Session ids, and the SHA-256 of each recording."""
+    model: str
+    """The model that recovered, or is assumed to have recovered, depth and tilt, and drew the generated images."""
+    in_sample: bool
+    """Whether that model was fitted to the original presses themselves."""
+    mm_per_px: float
+    """Scale of the millimetre field."""
+    pairs: int
+    goal_points: float
+    table_1: tuple[Stat, ...]
+    verdicts: tuple[Verdict, ...]
+    refused: tuple[Refused, ...]
+    software: str
+    command: str
+
+    def stat(self, compared: str, key: Key) -> Stat | None:
+        """One row of the table, or None if nothing was compared in this way."""
+        return find_stat(self.table_1, compared, key)
+
+
+def read_loop(path: Path) -> LoopRecord:
+    """Read a `loop.json`, or the one in a loop's folder. Raises `CalibrationError` if it is invalid or was edited."""
+    return load_sealed(path / FILE if path.is_dir() else path, LoopRecord, MAX_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopComparison:
     """The result of pressing a session's strokes again."""
 
+    record: LoopRecord
     original: OpenSession
     again: OpenSession
-    model: str
-    """The model that recovered, or is assumed to have recovered, depth and tilt, and drew the generated images."""
-    in_sample: bool
-    """Whether that model was fitted to the original presses themselves."""
-    field: Field
     pairs: list[Pair]
-    refused: list[Refused]
-    scores: list[PairScore]
-    verdicts: list[Verdict]
+    scores: Scores
+    """Of the original of each pair, against `AGAIN`, `ANOTHER` and `SIMULATED`."""
 
 
 def compare_sessions(
-    original: Path, again: Path, fit: Path | None, view: Field, progress: Progress = unseen
+    original: Path, again: Path, fit: Path | None, view: Field, command: str, progress: Progress = unseen
 ) -> LoopComparison:
     """Compare pair by pair. Raises `CalibrationError` where the two do not belong together."""
     first, second = open_session(original, kind="press"), open_session(again, kind="press")
@@ -65,11 +146,25 @@ def compare_sessions(
     if not pairs:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(where, f"not one pair can be compared{why}")
-    progress("compared", 0, 1)
-    scores = score_pairs(pairs, originals.values())
-    progress("compared", 1, 1)
-    in_sample = fitted_to == first.sha256
-    return LoopComparison(first, second, model.label, in_sample, view, pairs, refused, scores, verdicts(scores))
+    scores = score_pairs(pairs, originals.values(), first.header)
+    record = LoopRecord(
+        source=second.header.source,
+        original=first.header.session_id,
+        original_sha256=first.sha256,
+        again=second.header.session_id,
+        again_sha256=second.sha256,
+        model=model.label,
+        in_sample=fitted_to == first.sha256,
+        mm_per_px=view.mm_per_px,
+        pairs=len(pairs),
+        goal_points=GOAL_POINTS,
+        table_1=tuple(table_1(scores)),
+        verdicts=tuple(verdicts(scores)),
+        refused=tuple(refused),
+        software=made_by(),
+        command=command,
+    ).sealed()
+    return LoopComparison(record, first, second, pairs, scores)
 
 
 def by_name(originals: Iterable[Press], refused: list[Refused]) -> dict[str, Press]:
@@ -101,6 +196,42 @@ def pair_up(
     repeated = {pair.original.stroke.stroke_id for pair in pairs}
     refused.extend((name, NOT_AGAIN) for name in originals if name not in repeated)
     return pairs
+
+
+def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press], header: Header) -> Scores:
+    """Score repetition, other presses of the condition and simulation against the original of each pair."""
+    alike: dict[Condition, list[Press]] = {}
+    for press in originals:
+        alike.setdefault(press.condition, []).append(press)
+    scores = Scores([Row.of(pair.original, header) for pair in pairs], (AGAIN, ANOTHER, SIMULATED))
+    for pair, values in zip(pairs, scores.values, strict=True):
+        others = [press.images for press in alike[pair.original.condition] if press is not pair.original]
+        for of_kind, images in zip(values, ([pair.again.images], others, [pair.simulated]), strict=True):
+            stack = [list(image.values()) for image in images]
+            of_kind[:] = similarities(np.array(list(pair.original.images.values())), np.array(stack))
+    return scores
+
+
+def table_1(scores: Scores) -> Iterator[Stat]:
+    """The statistics of each comparison, in percent."""
+    for compared in scores.models:
+        yield from statistics(compared, 100.0 * scores.of(compared), scores.cell_of)
+
+
+def verdicts(scores: Scores) -> Iterator[Verdict]:
+    """Verdicts for each alignment, tone and measure; none if no condition was pressed twice."""
+    again, another = 100.0 * scores.of(AGAIN), 100.0 * scores.of(ANOTHER)
+    both = np.isfinite(another[:, 0, 0])
+    if not both.any():
+        return
+    again, another, cells = again[both], another[both], scores.cell_of[both]
+    for (k, key), (j, measure) in itertools.product(enumerate(KEYS), enumerate(MEASURES)):
+        differences = again[:, k, j] - another[:, k, j]
+        of_again, of_another, difference = (
+            float(values.mean()) for values in (again[:, k, j], another[:, k, j], differences)
+        )
+        interval, holds = interval_over_groups(differences, cells), difference >= -GOAL_POINTS
+        yield Verdict(*key, measure, of_again, of_another, difference, interval, len(cells), holds)
 
 
 def _replayed(header: Header) -> str | None:

@@ -15,7 +15,7 @@ from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.pool import cluster, threads
-from brushloop.calibrate.report import framed, source_note, write_files
+from brushloop.calibrate.report import framed, source_label, source_note, write_files
 from brushloop.calibrate.stroke.params import Params
 from brushloop.calibrate.validate import findings, tables
 from brushloop.calibrate.validate.inputs import URL, Extras, FittedSession, find_extras, one_source, open_session
@@ -164,12 +164,13 @@ def _write(
     """Write the files of a report; returns it, and notes on what was not written."""
     what, parts = "parts of the report made", 3
     progress(what, 0, parts)
-    digest = tables.write_csv(outcome, folder / SCORES)
+    digest = tables.write_csv(outcome.scores, folder / SCORES)
     notes: list[str] = []
     beside = [SCORES]
     if request.parquet is not False:
         try:
-            tables.write_parquet(outcome, folder / PARQUET)
+            label = source_label(outcome.sessions[0].header.source, (s.header.brush for s in outcome.sessions))
+            tables.write_parquet(outcome.scores, label, folder / PARQUET)
             beside.append(PARQUET)
         except CalibrationError as error:
             if request.parquet:

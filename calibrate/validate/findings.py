@@ -6,14 +6,14 @@ import itertools
 from collections.abc import Iterator
 
 from brushloop.calibrate.compare.paper import ORDER
-from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.place import Key
 from brushloop.calibrate.compare.score import Polarity
-from brushloop.calibrate.loop.scores import AGAIN, LoopRecord
-from brushloop.calibrate.loop.scores import ANOTHER as ANOTHER_ORIGINAL
-from brushloop.calibrate.report import Point, source_point
-from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
+from brushloop.calibrate.loop.compare import AGAIN, LoopRecord
+from brushloop.calibrate.loop.compare import ANOTHER as ANOTHER_ORIGINAL
+from brushloop.calibrate.report import Point, brush_and_size, source_point
+from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
 from brushloop.calibrate.validate.models import ANOTHER, BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT, PRESSES
-from brushloop.calibrate.validate.report import Report, Session, Stat
+from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session, missed_mm
 from brushloop.calibrate.writing.scores import REFERENCE
 from brushloop.sessions.records import Source
 
@@ -44,11 +44,10 @@ MEANING = {
 
 def measured(report: Report) -> str:
     """Summary of the strokes and models that were compared."""
-    cells = {stat.cell for stat in report.stats if stat.cell is not None}
     compared, strokes = (sum(getattr(s, name) for s in report.sessions) for name in ("compared", "strokes"))
     sessions = f"{len(report.sessions)} sessions" if len(report.sessions) > 1 else "one session"
-    where = f" at {len(cells)} combinations of press depth H and brush tilt α" if cells else ""
-    brush = next((session.brush for session in report.sessions if session.brush), "a brush that is not named")
+    where = f" at {len(report.cells)} combinations of press depth H and brush tilt α" if report.cells else ""
+    brush = next(filter(None, (brush_and_size(s.header) for s in report.sessions)), "a brush that is not named")
     left = "" if compared == strokes else f", {strokes - compared} more could not be used"
     models = sum(model.basis != PRESSES for model in report.models)
     return (
@@ -59,7 +58,9 @@ def measured(report: Report) -> str:
 
 def verdict(report: Report) -> Iterator[str]:
     """The report in at most three sentences: how well the model shown predicts, beside what, and on what ink."""
-    shown, top, bezier, published = (_avg(report, name) for name in (report.shown, CEILING, BEZIER_REFITTED, "ccd-bsm"))
+    shown, top, bezier, published = (
+        _csim(report, name) for name in (report.shown, CEILING, BEZIER_REFITTED, "ccd-bsm")
+    )
     if shown is not None:
         below = "" if top is None or shown.below_ceiling is None else f"{_below(shown)} of {top.avg:.1f} %"
         unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
@@ -76,14 +77,14 @@ def verdict(report: Report) -> Iterator[str]:
 
 def findings(report: Report) -> Iterator[str]:
     """How well the models predict: the ceiling, the best model that had not seen the strokes, the published one."""
-    again, top = _avg(report, ANOTHER), _avg(report, CEILING)
+    again, top = _csim(report, ANOTHER), _csim(report, CEILING)
     if again is not None and top is not None:
         yield (
             f"Repeatability of the brush: one press predicts another of the same H and α with a CSIM of "
             f"{again.avg:.1f} %. A perfect model of this brush, which draws the best image of each cell, would reach "
             f"{_interval(top)}: this is the ceiling, and no model can be expected to do better."
         )
-    held, bezier, tuned = (_avg(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT))
+    held, bezier, tuned = (_csim(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT))
     if held is not None:
         unseen = "on cells that the fit had not seen"
         yield f"Calibrated to this brush, CCD-BSM reaches {_interval(held)}{_below(held)}, {unseen}."
@@ -96,7 +97,7 @@ def findings(report: Report) -> Iterator[str]:
         yield f"A Bézier stroke fitted to the same captures reaches {_interval(bezier)}{peer}."
     yield from _pressed_again(report)
     yield from _characters(report)
-    published = [(model, _avg(report, model.name)) for model in report.models if model.name in ("ccd-bsmg", "ccd-bsm")]
+    published = [(model, _csim(report, model.name)) for model in report.models if model.name in ("ccd-bsmg", "ccd-bsm")]
     for model, stat in published:
         if stat is not None:
             yield f"{model.label} {model.basis}, given only the brush's size, H and α, reaches {_interval(stat)}."
@@ -108,23 +109,22 @@ def findings(report: Report) -> Iterator[str]:
 
 def _pressed_again(report: Report) -> Iterator[str]:
     for loop in report.loops:
-        again, other = (loop.row(what, Alignment.MM, Tone.BINARY) for what in (AGAIN, ANOTHER_ORIGINAL))
+        again, other = (loop.stat(what, STRICT) for what in (AGAIN, ANOTHER_ORIGINAL))
         if again is None:
             continue
-        others = "" if other is None else f", other presses of the same H and α {other.csim[2]:.1f} %"
+        others = "" if other is None else f", other presses of the same H and α {other.csim.avg:.1f} %"
         yield (
-            f"Pressed again from their photographs alone ({loop.again}), {again.n} strokes match their "
-            f"originals with a CSIM of {again.csim[2]:.1f} %{others}."
+            f"Pressed again from their photographs alone ({loop.again}), {again.csim.n} strokes match their "
+            f"originals with a CSIM of {again.csim.avg:.1f} %{others}."
         )
 
 
 def _characters(report: Report) -> Iterator[str]:
     for row in (row for record in report.written for row in record.table_3):
-        key = (row.pair, row.alignment, row.tone, row.polarity)
-        if key == (REFERENCE, Alignment.MM, Tone.BINARY, Polarity.INK):
+        if (row.pair, row.alignment, row.tone, row.polarity) == (REFERENCE, *STRICT, Polarity.INK):
             yield (
-                f"{row.character}, written {row.n} times by the arm, matches its reference ({row.reference}) with "
-                f"a CSIM of {row.csim[2]:.1f} %."
+                f"{row.character}, written {row.csim.n} times by the arm, matches its reference ({row.reference}) with "
+                f"a CSIM of {row.csim.avg:.1f} %."
             )
 
 
@@ -141,8 +141,7 @@ def _sizes(report: Report) -> Iterator[str]:
 
 def order(report: Report) -> str:
     """Whether the models rank in the paper's order, size-normalised and binary."""
-    stats = [(name, report.stat(name, Alignment.SIZE_NORMALISED, Tone.BINARY, "csim")) for name in ORDER]
-    csim = {name: stat.avg for name, stat in stats if stat is not None}
+    csim = {name: summary.avg for name in ORDER if (summary := _csim(report, name, NORMAL)) is not None}
     if len(csim) < 3:
         return ""
     wanted, ours = list(csim), sorted(csim, key=lambda name: -csim[name])
@@ -177,7 +176,7 @@ def trust(report: Report) -> Iterator[Point]:
         yield Point(False, f"{cut} strokes are cut by the edge of their photograph or cell: their scores are too low.")
     for session in report.sessions:
         if (scale := session.calibration) is not None:
-            width = (scale.high - scale.low) / scale.mm_per_px
+            width = (scale.mm_per_px_high - scale.mm_per_px_low) / scale.mm_per_px
             words = f"scale known to ±{50 * width:.3f} %, board seen to {scale.rms_px:.2f} px."
             yield Point(width <= WIDE_SCALE, f"{session.session_id}: {words}")
     yield from _models(report)
@@ -191,7 +190,7 @@ def trust(report: Report) -> Iterator[Point]:
 def _collection(session: Session) -> Iterator[Point]:
     """Points that the recording alone does not show: planned strokes that were left out, and paper that moved."""
     name, miss, collected = session.session_id, session.deepest_miss, session.collected
-    if miss is not None and abs(miss.reached_mm - miss.depth_mm) > MISSED_MM:
+    if miss is not None and missed_mm(miss) > MISSED_MM:
         yield Point(
             False,
             f"{name}: commanded and reached depth differ by more than {MISSED_MM:g} mm, most at "
@@ -215,17 +214,16 @@ def _collection(session: Session) -> Iterator[Point]:
 
 def _models(report: Report) -> Iterator[Point]:
     """How well the ceiling is known, and where the calibrated model stands."""
-    repeats = [stat.n for stat in report.stats if stat.cell is not None and stat.model == CEILING]
-    if not repeats:
+    repeats = [stat.csim.n for stat in report.stats if stat.cell is not None and stat.model == CEILING]
+    if _csim(report, CEILING) is None:
         words = "No cell was pressed twice: the repeatability of the brush is unknown, and there is no ceiling."
         yield Point(False, words)
-    elif min(repeats) < FEW_REPEATS:
+    elif min(repeats, default=FEW_REPEATS) < FEW_REPEATS:
         words = f"Some cells were pressed only {min(repeats)} times, so the ceiling is rough."
         yield Point(None, f"{words} The paper presses ten times.")
-    held, bezier = (_avg(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED))
+    held, bezier = (_csim(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED))
     if held is not None and held.below_ceiling is not None:
-        low, high = held.below_low, held.below_high
-        near = is_near(held.below_ceiling, None if low is None or high is None else (low, high))
+        near = is_near(held.below_ceiling, held.below_interval)
         how = {True: "within", False: "not within", None: "not certainly within"}[near]
         words = f"{NEAR_POINTS} points of the ceiling (mm, binary, CSIM): {_points(held)}."
         yield Point(near, f"The calibrated model is {how} {words}")
@@ -247,24 +245,25 @@ def _loop(loop: LoopRecord) -> Point:
     )
 
 
-def _avg(report: Report, model: str) -> Stat | None:
-    return report.stat(model, Alignment.MM, Tone.BINARY, "csim")
+def _csim(report: Report, model: str, key: Key = STRICT) -> Summary | None:
+    stat = report.stat(model, key)
+    return None if stat is None else stat.csim
 
 
-def _span(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f" (95 % {low:.1f} to {high:.1f})"
+def _span(interval: Interval | None) -> str:
+    return "" if interval is None else " (95 % {:.1f} to {:.1f})".format(*interval)
 
 
-def _interval(stat: Stat) -> str:
-    return f"{stat.avg:.1f} %{_span(stat.avg_low, stat.avg_high)}"
+def _interval(csim: Summary) -> str:
+    return f"{csim.avg:.1f} %{_span(csim.avg_interval)}"
 
 
-def _points(stat: Stat) -> str:
-    return f"{stat.below_ceiling:.1f} points{_span(stat.below_low, stat.below_high)}"
+def _points(csim: Summary) -> str:
+    return f"{csim.below_ceiling:.1f} points{_span(csim.below_interval)}"
 
 
-def _below(stat: Stat) -> str:
-    return "" if stat.below_ceiling is None else f", {_points(stat)} below the ceiling"
+def _below(csim: Summary) -> str:
+    return "" if csim.below_ceiling is None else f", {_points(csim)} below the ceiling"
 
 
 def _label(report: Report, name: str) -> str:

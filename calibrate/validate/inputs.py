@@ -24,8 +24,8 @@ from brushloop.calibrate.errors import CalibrationError, one_line
 from brushloop.calibrate.files import read_bounded, replacing
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
-from brushloop.calibrate.loop.scores import FILE as LOOP_FILE
-from brushloop.calibrate.loop.scores import LoopRecord, read_loop
+from brushloop.calibrate.loop.compare import FILE as LOOP_FILE
+from brushloop.calibrate.loop.compare import LoopRecord, read_loop
 from brushloop.calibrate.report import png_uri
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.session import open_session as open_recording
@@ -237,9 +237,7 @@ def find_extras(
             if not written and path.parent.parent not in folders and (why := _foreign(record, sessions, folders)):
                 notes.append(f"{path} is left out: {why}; --written uses it")
                 continue
-            _check_source(path, [record.source, *(row.source for row in record.table_3)], sessions)
-            if any(row.session_id != record.session for row in record.table_3):
-                raise CalibrationError(str(path), "table_3: has rows of another session than its own")
+            _check_source(path, record.source, sessions)
             picture = path.parent / PICTURE
             characters[record.digest] = record, figure_13(picture, record) if picture.exists() else ""
         if not picture.exists():
@@ -283,9 +281,7 @@ def _foreign(record: WrittenRecord, sessions: Sequence[OpenSession], folders: Se
 
 
 def _check_loop(path: Path, record: LoopRecord, sessions: Sequence[OpenSession]) -> None:
-    _check_source(path, [record.source, *(row.source for row in record.table_1)], sessions)
-    if any((row.original, row.again) != (record.original, record.again) for row in record.table_1):
-        raise CalibrationError(str(path), "table_1: has rows of other sessions than its own")
+    _check_source(path, record.source, sessions)
     if record.original_sha256 in {session.sha256 for session in sessions}:
         return
     names = [session.header.session_id for session in sessions]
@@ -295,12 +291,10 @@ def _check_loop(path: Path, record: LoopRecord, sessions: Sequence[OpenSession])
     raise CalibrationError(str(path), f"repeats {record.original}, not {', '.join(names)}")
 
 
-def _check_source(path: Path, sources: Sequence[Source], sessions: Sequence[OpenSession]) -> None:
-    here = one_source(sessions)
-    for source in sources:
-        if source != here:
-            recording = sessions[0].recording.path.name
-            raise CalibrationError(str(path), f"is of {source}, {recording} of {here}: one report cannot hold both")
+def _check_source(path: Path, source: Source, sessions: Sequence[OpenSession]) -> None:
+    here, recording = one_source(sessions), sessions[0].recording.path.name
+    if source != here:
+        raise CalibrationError(str(path), f"is of {source}, {recording} of {here}: one report cannot hold both")
 
 
 @contextmanager

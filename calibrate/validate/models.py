@@ -78,6 +78,19 @@ KINDS_OF_PRESS = (
     ),
 )
 """What stands in the tables beside the models."""
+BEZIER_LEFT_OUT = ModelInfo(
+    name=BEZIER_REFITTED,
+    label="Bezier refitted",
+    definition="Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other "
+    "cells.",
+    basis=HELD_OUT,
+)
+BRUSH_LEFT_OUT = ModelInfo(
+    name=FITTED_HELD_OUT,
+    label="CCD-BSM calibrated",
+    definition="CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other cells.",
+    basis=HELD_OUT,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,14 +105,6 @@ class Model:
     def name(self) -> str:
         """Its name."""
         return self.info.name
-
-
-@dataclass(frozen=True, slots=True)
-class Refitted:
-    """What was fitted to the other cells of a session; None where they are too few for it."""
-
-    press: FittedPress | None
-    bezier: RefittedBezier | None
 
 
 def in_order(models: Sequence[Model]) -> list[Model]:
@@ -155,33 +160,16 @@ def _generators(session: FittedSession, files: Sequence[Path], view: Field) -> l
     return models
 
 
-def held_out(fits: Mapping[Condition, Refitted], view: Field, *, fitted: bool) -> list[Model]:
-    """Models fitted without the cell that they predict: a Bezier, and CCD-BSM if it is `fitted`."""
+def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBezier | None], view: Field) -> Model:
+    """A model that was fitted without the cell that it predicts; None where the other cells are too few."""
 
-    def of(condition: Condition, part: str) -> FittedPress | RefittedBezier:
-        refitted = getattr(fits[condition], part) if condition in fits else None
-        if refitted is None:
-            why = "the other cells do not determine this press"
-            raise DomainError("depth_mm", condition.depth_mm, "other cells", why)
-        return refitted
+    def predict(at: Condition) -> Pixels:
+        fit = fits.get(at)
+        if fit is None:
+            raise DomainError("depth_mm", at.depth_mm, "other cells", "the other cells do not determine this press")
+        return levels_of(images_of(fit.outline(at.depth_mm, at.tilt_deg), 0.0, view))
 
-    def drawn(part: str) -> Callable[[Condition], Pixels]:
-        return lambda at: levels_of(images_of(of(at, part).outline(at.depth_mm, at.tilt_deg), 0.0, view))
-
-    bezier = ModelInfo(
-        name=BEZIER_REFITTED,
-        label="Bezier refitted",
-        definition="Two mirrored cubic Bezier curves; ends, belly and shoulder regressed on the captures of all other "
-        "cells.",
-        basis=HELD_OUT,
-    )
-    ours = ModelInfo(
-        name=FITTED_HELD_OUT,
-        label="CCD-BSM calibrated",
-        definition="CCD-BSM's lengths with gains, powers, profile and edges fitted to the captures of all other cells.",
-        basis=HELD_OUT,
-    )
-    return [*([Model(ours, drawn("press"))] if fitted else []), Model(bezier, drawn("bezier"))]
+    return Model(info, predict)
 
 
 def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field, number: int) -> Model:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import textwrap
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,23 @@ import numpy as np
 
 from brushloop.calibrate.artefact import FOLDER
 from brushloop.calibrate.compare.paper import TABLE_3
-from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone
+from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
-from brushloop.calibrate.report import BLUE, ORANGE, dress, ink_uri, overlay_uri, plot, plot_uri, render, source_note
-from brushloop.calibrate.scores import Row
+from brushloop.calibrate.report import (
+    BLUE,
+    ORANGE,
+    dress,
+    ink_uri,
+    overlay_uri,
+    plot,
+    plot_uri,
+    recording_facts,
+    render,
+    source_note,
+)
+from brushloop.calibrate.scores import Cell, Row, Stat
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import findings, tables
 from brushloop.calibrate.validate.inputs import FittedSession
@@ -29,8 +40,9 @@ from brushloop.calibrate.validate.models import (
     FITTED_HELD_OUT,
     GENERATOR_HELD_OUT,
     LAMBDAS,
+    ModelInfo,
 )
-from brushloop.calibrate.validate.report import Report, Session
+from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session
 from brushloop.calibrate.validate.run import Outcome
 from brushloop.model.ccdbsm import DomainError
 
@@ -39,8 +51,7 @@ CALIBRATED = (
     *("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED_HELD_OUT),
     *(FITTED, "bezier", BEZIER_REFITTED),
 )
-NORMAL, STRICT = (Alignment.SIZE_NORMALISED, Tone.BINARY), (Alignment.MM, Tone.BINARY)
-GRAY_MM: Key = (Alignment.MM, Tone.GRAY)
+GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
 MAX_REFUSED = 200
 ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
@@ -91,6 +102,7 @@ def page_of(
     """
     shown, names = report.model(report.shown), [session.session_id for session in report.sessions]
     best, worst = _extremes(outcome, report.shown)
+    columns = [model for name in CELL_COLUMNS if (model := report.model(name)) is not None]
     return render(
         "presses.html.j2",
         report=report,
@@ -103,21 +115,16 @@ def page_of(
         findings=list(findings.findings(report)),
         trust=list(findings.trust(report)),
         order=findings.order(report),
-        tables={
-            "one": tables.table_1(report, NORMAL),
-            "two": tables.table_2(report, NORMAL),
-            # The paper has no such table, and its numbers could not be compared with these.
-            "strict": [replace(row, paper=None) for row in tables.table_2(report, STRICT) if row.ours],
-        },
-        table_three=tables.table_3(report),
+        table_one=tables.table_1(report),
+        table_two=tables.table_2(report, NORMAL),
+        strict=tables.table_2(report, STRICT),
+        table_three=list(tables.table_3(report)),
         figures_13=[(record.session, uri) for record, uri in zip(report.written, figures_13, strict=False) if uri],
         paper_three=list(TABLE_3.values()),
         plot=_distributions(outcome, report),
-        full=[
-            {"alignment": alignment, "tone": tone, "rows": tables.full(report, (alignment, tone))}
-            for alignment, tone in KEYS
-        ],
-        cells=_cells(report) if report.cells_told else None,
+        keys=KEYS,
+        cell_columns=columns,
+        cells=[_cell(report, cell, columns) for cell in report.cells],
         samples=[_pictured(outcome, k, report.shown) for k in _first_of_cells(outcome, MAX_SAMPLES)],
         side=_side_by_side(outcome),
         shown=shown.label if shown is not None else "",
@@ -147,19 +154,18 @@ def _extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
         return [], []
     csim = outcome.scores.of_key(model, STRICT)[:, 0]
     known = np.flatnonzero(np.isfinite(csim))
-    order = known[np.argsort(csim[known], kind="stable")]
+    order: list[int] = known[np.argsort(csim[known], kind="stable")].tolist()
     count = min(EXTREMES, max(1, len(order) // 2))
-    return order[::-1][:count].tolist(), order[:count].tolist()
+    return order[::-1][:count], order[:count]
 
 
 def _pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     """A press with what the model predicts for it, their difference, and their scores: the paper's figures 7 and 8."""
-    row, captured = outcome.scores.rows[k], outcome.scores.rows[k].image(GRAY_MM)
-    image = _predicted(outcome, row, model)
-    images = {"captured": _ink(captured)}
-    if image is not None:
-        a, b = (np.asarray(one[ROWS] / 255.0, np.float32) for one in (captured, image))
-        images |= {"predicted": ink_uri(b), "difference": overlay_uri(a, b)}
+    row = outcome.scores.rows[k]
+    captured, predicted = _captured(row), _predicted(outcome, row, model)
+    images = {"captured": ink_uri(captured)}
+    if predicted is not None:
+        images |= {"predicted": ink_uri(predicted), "difference": overlay_uri(captured, predicted)}
     csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k] if model else (np.nan, np.nan)
     return {"row": row, "images": images, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
 
@@ -168,13 +174,8 @@ def _side_by_side(outcome: Outcome) -> dict[str, Any]:
     """Some captures next to the prediction of every model: the paper's figures 10 and 11."""
     every = (model.info for group in outcome.models.values() for model in group)
     labels = {info.name: info.label for info in every if info.name not in LAMBDAS}
-    lines: list[dict[str, Any]] = []
-    for k in _first_of_cells(outcome, MAX_CELLS):
-        row = outcome.scores.rows[k]
-        images = [_predicted(outcome, row, name) for name in labels]
-        shown = ["" if image is None else _ink(image) for image in images]
-        lines.append({"row": row, "captured": _ink(row.image(GRAY_MM)), "models": shown})
-    return {"labels": list(labels.values()), "lines": lines}
+    rows = [outcome.scores.rows[k] for k in _first_of_cells(outcome, MAX_CELLS)]
+    return {"labels": list(labels.values()), "lines": [(row, _drawn(outcome, row, labels)) for row in rows]}
 
 
 def _of_one_cell(outcome: Outcome, names: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -184,31 +185,35 @@ def _of_one_cell(outcome: Outcome, names: Sequence[str]) -> Iterator[tuple[str, 
         return
     row = outcome.scores.rows[chosen[len(chosen) // 2]]
     labels = {model.name: model.info.label for model in outcome.models[row.session]}
-    yield "captured", _ink(row.image(GRAY_MM))
-    for name in names:
-        image = _predicted(outcome, row, name)
-        if image is not None:
-            yield labels[name], _ink(image)
+    captured, *drawn = _drawn(outcome, row, names)
+    yield "captured", captured
+    yield from ((labels[name], image) for name, image in zip(names, drawn, strict=True) if image)
 
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
     """The first capture of each condition; with more than `most` of them, of evenly spaced ones."""
-    first = [int(rows[0]) for rows in outcome.scores.conditions().values()]
+    first = [rows[0] for rows in outcome.scores.conditions().values()]
     count = min(len(first), most)
     return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
 
 
-def _predicted(outcome: Outcome, row: Row, name: str) -> Pixels | None:
-    """(128, 128) gray on the millimetre field, or None if the model does not predict this press."""
+def _drawn(outcome: Outcome, row: Row, names: Iterable[str]) -> list[str]:
+    """A capture and what each of these models predicts for it, as pictures; empty where it predicts nothing."""
+    predicted = (_predicted(outcome, row, name) for name in names)
+    return [ink_uri(_captured(row)), *("" if image is None else ink_uri(image) for image in predicted)]
+
+
+def _captured(row: Row) -> Image:
+    return np.asarray(row.images[GRAY_MM][ROWS] / 255.0, np.float32)
+
+
+def _predicted(outcome: Outcome, row: Row, name: str) -> Image | None:
+    """Gray on the millimetre field, or None if the model does not predict this press."""
     model = next((model for model in outcome.models[row.session] if model.name == name), None)
     try:
-        return None if model is None else model.predict(row.condition)[KEYS.index(GRAY_MM)]
+        return None if model is None else np.asarray(model.predict(row.condition)[GRAY_MM][ROWS] / 255.0, np.float32)
     except DomainError:
         return None
-
-
-def _ink(image: Pixels) -> str:
-    return ink_uri(np.asarray(image[ROWS] / 255.0, np.float32))
 
 
 def _distributions(outcome: Outcome, report: Report) -> str:
@@ -220,7 +225,7 @@ def _distributions(outcome: Outcome, report: Report) -> str:
         for place, model in enumerate(reversed(models)):
             values = 100.0 * outcome.scores.of_key(model.name, key)[:, 0]
             values = values[np.isfinite(values)]
-            stat = report.stat(model.name, *key, "csim")
+            stat = report.stat(model.name, key)
             if stat is None:
                 continue
             if len(values) > 3 and np.ptp(values) > 1e-6:
@@ -229,10 +234,9 @@ def _distributions(outcome: Outcome, report: Report) -> str:
                     body.set(facecolor=BLUE, alpha=0.18)
             some = values[:: max(1, -(-len(values) // MAX_POINTS))]
             axis.plot(some, place + 0.14 * rng.uniform(-1, 1, len(some)), ".", ms=3, alpha=0.5, color=BLUE)
-            if stat.avg_low is not None:
-                span = [stat.avg_low, stat.avg_high]
-                axis.plot(span, [place] * 2, color=ORANGE, lw=2.5, solid_capstyle="butt")
-            axis.plot(stat.avg, place, "|", ms=15, mew=2.5, color=ORANGE)
+            if stat.csim.avg_interval is not None:
+                axis.plot(stat.csim.avg_interval, [place] * 2, color=ORANGE, lw=2.5, solid_capstyle="butt")
+            axis.plot(stat.csim.avg, place, "|", ms=15, mew=2.5, color=ORANGE)
         axis.set_yticks(range(len(models)), [model.label for model in reversed(models)])
         dress(axis, f"{key[0]}, binary", "CSIM, %", grid="x")
     axes[1].set_yticklabels([])
@@ -244,10 +248,13 @@ def _by_strokes(report: Report) -> str:
     """CSIM on presses that were not fitted, against the number of presses that were."""
     figure, axis = plot(1, 1, (6.4, 3.2))
     for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
-        counts = sorted({step.strokes for step in report.by_strokes if step.model == name})
-        means = [np.mean([s.csim for s in report.by_strokes if (s.model, s.strokes) == (name, n)]) for n in counts]
-        if counts:
-            axis.plot(counts, means, "o-", ms=4, color=colour, label=f"{name} fitted")
+        csim: dict[int, list[float]] = {}
+        for step in report.by_strokes:
+            if step.model == name:
+                csim.setdefault(step.strokes, []).append(step.csim)
+        if csim:
+            means = [np.mean(csim[count]) for count in sorted(csim)]
+            axis.plot(sorted(csim), means, "o-", ms=4, color=colour, label=f"{name} fitted")
     ticks = sorted({step.strokes for step in report.by_strokes})
     axis.set_xscale("log")
     axis.set_xticks(ticks, [str(n) for n in ticks])
@@ -267,37 +274,29 @@ def _curves(curves: Sequence[Curve]) -> str:
     return plot_uri(figure)
 
 
-def _cells(report: Report) -> dict[str, Any]:
-    """Average CSIM of the models of `CELL_COLUMNS` in each cell."""
-    columns = [model for name in CELL_COLUMNS if (model := report.model(name)) is not None]
-    rows: list[dict[str, Any]] = []
-    for cell in sorted({stat.cell for stat in report.stats if stat.cell is not None}):
-        stats = [report.stat(model.name, *STRICT, "csim", cell) for model in columns]
-        rows.append({"cell": cell, "n": max((s.n for s in stats if s is not None), default=0), "stats": stats})
-    return {"labels": [model.label for model in columns], "rows": rows}
+def _cell(report: Report, cell: Cell, columns: Sequence[ModelInfo]) -> tuple[Cell, int, list[Stat | None]]:
+    """A cell, its number of presses, and the scores of these models there."""
+    stats = [report.stat(model.name, STRICT, cell) for model in columns]
+    return cell, max((stat.csim.n for stat in stats if stat is not None), default=0), stats
 
 
 def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dict[str, Any]:
     """The parts of that section; empty if it has none."""
 
-    def rows(names: Sequence[str]) -> list[dict[str, str]]:
+    def rows(names: Sequence[str], needed: Sequence[str]) -> list[tuple[ModelInfo, str, str]]:
+        models = [model for name in names if (model := report.model(name)) is not None]
+        if not any(model.name in needed for model in models):
+            return []
         return [
-            {
-                "label": model.label,
-                "basis": model.basis,
-                "mm": tables.pair(report, name, Alignment.MM),
-                "normal": tables.pair(report, name, Alignment.SIZE_NORMALISED),
-            }
-            for name in names
-            if (model := report.model(name)) is not None
+            (model, tables.pair(report, model.name, STRICT), tables.pair(report, model.name, NORMAL))
+            for model in models
         ]
 
-    lambdas = any(report.model(name) is not None for name in LAMBDAS)
-    calibrated = any(report.model(name) is not None for name in (FITTED_HELD_OUT, FITTED))
+    lambdas = rows((*LAMBDAS, "ccd-bsm"), tuple(LAMBDAS))
     parts = {
-        "lambdas": rows((*LAMBDAS, "ccd-bsm")) if lambdas else [],
+        "lambdas": lambdas,
         "lambda_images": list(_of_one_cell(outcome, (*LAMBDAS, "ccd-bsm"))) if lambdas else [],
-        "calibrated": rows(CALIBRATED) if calibrated else [],
+        "calibrated": rows(CALIBRATED, (FITTED_HELD_OUT, FITTED)),
         "steps": _by_strokes(report) if report.by_strokes else "",
         "curves": _curves(curves) if curves else "",
     }
@@ -306,46 +305,17 @@ def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dic
 
 def provenance(session: Session) -> list[tuple[str, str]]:
     """Name and text of what is known of a recording."""
-    header = session.header
-    rows = [
-        ("session", session.session_id),
-        ("source", str(header.source)),
-        ("recording", f"{session.recording}, sha256 {session.recording_sha256}"),
-        ("recorded with", header.software),
-        ("robot", f"{header.robot} {header.robot_firmware}".strip()),
-        ("camera", f"{header.camera} {header.lens}".strip()),
-        ("brush", session.brush),
-        ("ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)),
-        ("protocol", header.protocol),
-        ("origin", header.origin),
-        ("licence", header.licence),
-        ("calibration", _calibration(session)),
-        ("brush fit", session.fit),
-        ("strokes", _strokes(session)),
-        ("zero touch", "" if session.collected is None else ", ".join(session.collected.touches)),
-    ]
-    return [(name, text) for name, text in rows if text]
-
-
-def _strokes(session: Session) -> str:
-    collected = session.collected
-    if collected is None:
-        return f"{session.strokes} captured, {session.compared} compared"
-    planned = "" if collected.planned is None else f"{collected.planned} planned, "
-    return (
-        f"{planned}{collected.photographed} photographed, {len(collected.pressed_again)} of them pressed again, "
-        f"{len(collected.left_out)} left out, {session.strokes} counted, {session.compared} compared"
-    )
-
-
-def _calibration(session: Session) -> str:
-    scale = session.calibration
-    if scale is None:
-        return ""
-    return (
-        f"{scale.named}: pix2len {scale.mm_per_px:.5f} mm/px (95 % {scale.low:.5f} to {scale.high:.5f}), "
-        f"board residual {scale.rms_px:.3f} px"
-    )
+    collected, counts = session.collected, f"{session.strokes} captured, {session.compared} compared"
+    if collected is not None:
+        planned = "" if collected.planned is None else f"{collected.planned} planned, "
+        counts = (
+            f"{planned}{collected.photographed} photographed, {len(collected.pressed_again)} of them pressed again, "
+            f"{len(collected.left_out)} left out, {session.strokes} counted, {session.compared} compared"
+        )
+    touches = "" if collected is None else ", ".join(collected.touches)
+    used = (("brush fit", session.fit), ("strokes", counts), ("zero touch", touches))
+    facts = recording_facts(session.header, session.recording, session.recording_sha256, session.calibration)
+    return [*facts, *((name, text) for name, text in used if text)]
 
 
 def _of_others(report: Report) -> Iterator[list[tuple[str, str]]]:

@@ -8,7 +8,7 @@ cells has its own tuning, in a folder named after a hash of its inputs; a killed
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.place import FINE, Field, Image, brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.fit.heldout import folds
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.store import key_of
@@ -115,7 +114,7 @@ def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condi
 
 def tuned_by_cell(
     session: OpenSession,
-    fits: Mapping[Condition, FittedPress | None],
+    folds: Sequence[tuple[Sequence[Condition], FittedPress | None]],
     generator: Path,
     steps: int,
     work: Path,
@@ -123,15 +122,13 @@ def tuned_by_cell(
 ) -> dict[Condition, Path]:
     """File of the generator tuned without each cell, by cell; empty for fewer than two cells.
 
-    `fits` has for each cell the brush that was fitted without its fold, with the same `FOLDS`, None for a session
+    `folds` are the cells that are left out together and the brush that was fitted without them, None for a session
     without a fit. Raises what `load_generator` and training raise.
     """
-    left_out = folds(list(fits), FOLDS)
     digest = file_sha256(generator)
     files: dict[Condition, Path] = {}
     aligned: AlignedStrokes | None = None
-    for number, fold in enumerate(left_out):
-        fit = fits[fold[0]]
+    for number, (fold, fit) in enumerate(folds):
         brush = () if fit is None else (fit.values, fit.edges, fit.ends)
         inputs = session.sha256, session.calibration_digest, digest, steps, LEARNING_RATE, fold, IMAGES, *brush
         folder = work / "tuned" / key_of("tune", *inputs)[:32]
@@ -142,7 +139,7 @@ def tuned_by_cell(
                 aligned = aligned or align_captures([session], generator)
                 write_captures(_with_images(aligned, session, fit, generator), captures, fold)
             what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
-            steps_done = _TrainingProgress(progress, what, number * steps, len(left_out) * steps)
+            steps_done = _TrainingProgress(progress, what, number * steps, len(folds) * steps)
             _tune(folder, captures, generator, str(session.header.source), steps, steps_done)
         files |= dict.fromkeys(fold, path)
     return files

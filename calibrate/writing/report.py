@@ -34,6 +34,7 @@ from brushloop.calibrate.writing.scores import FILE as NUMBERS
 from brushloop.calibrate.writing.scores import (
     HEADLINE,
     PAIRS,
+    PAPER_ROWS,
     PICTURE,
     REFERENCE,
     Character,
@@ -92,6 +93,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         model=written.plan.model,
         cell_mm=written.plan.cell_mm,
         tables=_tables(written.table),
+        paper_rows=PAPER_ROWS,
         characters=list(_characters(written)),
         refused=written.refused,
         cut=[stroke_id for one in written.characters for stroke_id in one.cut],
@@ -111,7 +113,7 @@ def summary(written: WritingComparison) -> Iterator[str]:
     yield f"{count} characters written, {len(written.refused)} not compared ({written.header.source})"
     for row in written.table:
         if row.polarity is Polarity.INK and row.tone is Tone.BINARY:
-            csim, ssim = (" / ".join(f"{value:.2f}" for value in three) for three in (row.csim, row.ssim))
+            csim, ssim = ("{:.2f} / {:.2f} / {:.2f}".format(*of.range_and_avg) for of in (row.csim, row.ssim))
             yield f"{row.character} {row.alignment}, {row.pair}: CSIM {csim}, SSIM {ssim}"
 
 

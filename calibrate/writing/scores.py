@@ -8,21 +8,21 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
+from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3, Triple
+from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3
 from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, prepare_cell, to_tone
 from brushloop.calibrate.compare.score import Polarity, similarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.report import Sealed, load_sealed
 from brushloop.calibrate.session import calibration_of
-from brushloop.calibrate.stats import others_of, summarise
+from brushloop.calibrate.stats import Summary, others_of, summarise
 from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, points_digest
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, Recording
@@ -30,7 +30,7 @@ from brushloop.sessions.records import Header, Source
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FILE, PICTURE = "written.json", "figure-13.png"
-FORMAT = "brushloop-written-1"
+FORMAT = "brushloop-written-2"
 MAX_BYTES = 8 * 1024 * 1024
 Key = tuple[Alignment, Tone, Polarity]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
@@ -79,31 +79,19 @@ class WrittenScore:
     ssim: float
 
 
-class Table3Row(BaseModel):
-    """Max, min, avg and median over the writings of one character, in percent."""
+class Table3Row(Frozen):
+    """One comparison over the writings of one character, in percent."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    source: Source
-    """`loopback rig` or `real capture`."""
-    session_id: str
     character: str
     reference: str
     """The font, or the user's picture."""
-    model: str
     pair: str
     """What was compared with what."""
     alignment: Alignment
     tone: Tone
     polarity: Polarity
-    n: Annotated[int, Field(ge=1)]
-    csim: Triple
-    ssim: Triple
-    csim_median: float
-    ssim_median: float
-    paper_row: str | None = None
-    paper_csim: Triple | None = None
-    paper_ssim: Triple | None = None
+    csim: Summary
+    ssim: Summary
 
 
 class WrittenRecord(Sealed):
@@ -178,43 +166,28 @@ def _score(one: Character, stroke_id: str, pair: str, key: Key, fixed: Ink, othe
     return WrittenScore(one.name, stroke_id, pair, *key, float(csim), float(ssim))
 
 
-def table_3(
-    scores: Iterable[WrittenScore], *, source: Source, session_id: str, model: str, references: dict[str, str]
-) -> list[Table3Row]:
+def table_3(scores: Iterable[WrittenScore], references: dict[str, str]) -> list[Table3Row]:
     """The rows, by character, then in the order of `KEYS` and `PAIRS`; `references` name each character's reference."""
-    grouped: dict[tuple[str, Alignment, Tone, Polarity, str], list[WrittenScore]] = {}
+    grouped: dict[tuple[str, Alignment, Tone, Polarity, str], list[tuple[float, float]]] = {}
     for s in scores:
-        grouped.setdefault((s.character, s.alignment, s.tone, s.polarity, s.pair), []).append(s)
+        grouped.setdefault((s.character, s.alignment, s.tone, s.polarity, s.pair), []).append((s.csim, s.ssim))
     rows: list[Table3Row] = []
     for (character, reference), key, pair in itertools.product(references.items(), KEYS, PAIRS):
-        found = grouped.get((character, *key, pair))
-        if not found:
-            continue
-        csim, ssim = (summarise(100.0 * np.array([getattr(s, what) for s in found])) for what in ("csim", "ssim"))
-        assert csim is not None, "scores are finite"
-        assert ssim is not None, "scores are finite"
-        paper = PAPER_ROWS.get(pair)
-        rows.append(
-            Table3Row(
-                source=source,
-                session_id=session_id,
+        percent = 100.0 * np.array(grouped.get((character, *key, pair), [])).reshape(-1, 2)
+        csim, ssim = summarise(percent[:, 0]), summarise(percent[:, 1])
+        if csim is not None and ssim is not None:
+            alignment, tone, polarity = key
+            row = Table3Row(
                 character=character,
                 reference=reference,
-                model=model,
                 pair=pair,
-                alignment=key[0],
-                tone=key[1],
-                polarity=key[2],
-                n=len(found),
-                csim=csim.range_and_avg,
-                ssim=ssim.range_and_avg,
-                csim_median=csim.median,
-                ssim_median=ssim.median,
-                paper_row=paper.label if paper else None,
-                paper_csim=paper.csim if paper else None,
-                paper_ssim=paper.ssim if paper else None,
+                alignment=alignment,
+                tone=tone,
+                polarity=polarity,
+                csim=csim,
+                ssim=ssim,
             )
-        )
+            rows.append(row)
     return rows
 
 
@@ -258,13 +231,7 @@ def compare_written(
     counting = counted(characters, "characters compared", len(characters), progress)
     scores = [score for one in counting for score in score_character(one)]
     header = recording.header
-    table = table_3(
-        scores,
-        source=header.source,
-        session_id=header.session_id,
-        model=plan.model,
-        references={one.name: one.reference_name for one in characters},
-    )
+    table = table_3(scores, {one.name: one.reference_name for one in characters})
     return WritingComparison(header, recording.path, digest, calibration, plan, characters, scores, table, refused)
 
 

@@ -5,41 +5,48 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import numpy as np
+
 from brushloop.calibrate.compare.place import KEYS
-from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, LoopRecord, PairScore, table_1, verdicts
+from brushloop.calibrate.loop.compare import AGAIN, ANOTHER, SIMULATED, LoopRecord, table_1, verdicts
+from brushloop.calibrate.scores import Row, Scores
+from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
-from brushloop.sessions.records import Condition, Source
+from brushloop.sessions.records import Condition, Source, Stroke
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 
 
-def pair_scores(step: float = 0.001) -> list[PairScore]:
+def pair_scores(step: float = 0.001) -> Scores:
     """Six presses of three cells, each pressed again: .94 like its original, another press .95."""
-    made: list[PairScore] = []
-    for number, ((alignment, tone), what) in itertools.product(range(6), itertools.product(KEYS, LEVELS)):
-        csim = LEVELS[what] + number * step
-        condition = Condition(11.0 + number // 2, 0.0)
-        made.append(PairScore(f"{number:03d}", f"{number:03d}~1", condition, what, alignment, tone, csim, csim - 0.1))
-    return made
+    blank, sizes = np.zeros((len(KEYS) + 1, 128, 128), np.uint8), Measured(1.0, 1.0, 1.0, 1.0, 1.0)
+    rows = [
+        Row("grid", "", Stroke(stroke_id=f"{k:03d}", kind="press", still=k), at, sizes, False, blank[:-1], blank[-1])
+        for k in range(6)
+        for at in [Condition(11.0 + k // 2, 0.0)]
+    ]
+    scores = Scores(rows, tuple(LEVELS))
+    levels = np.array(list(LEVELS.values())) + step * np.arange(6)[:, None]
+    scores.values[:] = np.stack([levels, levels - 0.1], axis=-1)[:, :, None]
+    return scores
 
 
 def loop_record(original: str, original_sha256: str, source: Source = Source.LOOPBACK, **changes: Any) -> LoopRecord:
     """A sealed loop of that session; `changes` are made before it is sealed."""
-    again = f"{original}-replay"
     scores = pair_scores()
     record = LoopRecord(
         source=source,
         original=original,
         original_sha256=original_sha256,
-        again=again,
+        again=f"{original}-replay",
         again_sha256="0" * 64,
         model="CCD-BSM fitted",
         in_sample=True,
         mm_per_px=0.3,
         pairs=6,
         goal_points=1.0,
-        table_1=tuple(table_1(scores, source=source, original=original, again=again, model="CCD-BSM fitted")),
+        table_1=tuple(table_1(scores)),
         verdicts=tuple(verdicts(scores)),
         refused=(),
         software="brushloop test",
@@ -48,7 +55,7 @@ def loop_record(original: str, original_sha256: str, source: Source = Source.LOO
     return record.model_copy(update=changes).sealed()
 
 
-def table_of(character: str = "字", source: Source = Source.LOOPBACK, **named: str) -> list[Table3Row]:
+def table_of(character: str = "字", reference: str = "a font") -> tuple[Table3Row, ...]:
     """Table 3 of one character, written twice: CSIM .8 and .9, where paper counts .99."""
     scores = [
         WrittenScore(character, f"x-r{k}", pair, alignment, tone, polarity, csim, csim - 0.1)
@@ -56,23 +63,19 @@ def table_of(character: str = "字", source: Source = Source.LOOPBACK, **named: 
         for (alignment, tone, polarity), pair in itertools.product(WRITTEN_KEYS, PAIRS)
         if k == 0 or pair != PLANNED
     ]
-    references = {character: named.get("reference", "a font")}
-    session = named.get("session", "write-01")
-    return table_3(
-        scores, source=source, session_id=session, model=named.get("model", "CCD-BSM"), references=references
-    )
+    return tuple(table_3(scores, {character: reference}))
 
 
-def written_record(rows: tuple[Table3Row, ...], **changes: Any) -> WrittenRecord:
-    """A sealed record of those rows; `changes` are made before it is sealed."""
+def written_record(source: Source = Source.LOOPBACK, **changes: Any) -> WrittenRecord:
+    """A sealed record of one character; `changes` are made before it is sealed."""
     record = WrittenRecord(
-        source=rows[0].source,
-        session=rows[0].session_id,
+        source=source,
+        session="write-01",
         recording_sha256="1" * 64,
         brush="",
-        model=rows[0].model,
+        model="CCD-BSM",
         cell_mm=70.0,
-        table_3=rows,
+        table_3=table_of(),
         refused=(),
         figure_13_sha256="2" * 64,
         software="brushloop test",

@@ -56,8 +56,8 @@ def test_its_interval_holds_the_truth_and_is_no_narrower_for_pairs_that_share_pr
         values, number, _ = session(100 + seed, 3)
         found = average(values, number)
         assert found is not None
-        assert found.interval is not None
-        held += found.interval[0] <= truth <= found.interval[1]
+        assert found.avg_interval is not None
+        held += found.avg_interval[0] <= truth <= found.avg_interval[1]
     assert held >= 36
 
 
@@ -93,8 +93,8 @@ def test_a_model_is_near_where_the_interval_of_the_difference_says_so() -> None:
     # The cells differ by much more than the model is below the ceiling in each.
     found = average(ceiling - (ceiling - 1.0 + 0.1 * cells), cells)
     assert found is not None
-    assert found.mean == pytest.approx(0.8)
-    assert is_near(found.mean, found.interval, points=1.5) is True
-    assert is_near(found.mean, found.interval, points=0.9) is None
-    assert is_near(found.mean, found.interval, points=0.1) is False
+    assert found.avg == pytest.approx(0.8)
+    assert is_near(found.avg, found.avg_interval, points=1.5) is True
+    assert is_near(found.avg, found.avg_interval, points=0.9) is None
+    assert is_near(found.avg, found.avg_interval, points=0.1) is False
     assert is_near(2.0, None) is False

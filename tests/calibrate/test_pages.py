@@ -17,10 +17,9 @@ from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.intrinsics import fit_lens, lens_file
 from brushloop.calibrate.board.lens import Gray, Lens
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
-from brushloop.calibrate.compare.place import KEYS, Field, Tone
-from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison
-from brushloop.calibrate.loop.report import record_of, write_loop
-from brushloop.calibrate.loop.scores import Pair, score_pairs, verdicts
+from brushloop.calibrate.compare.place import KEYS, Tone
+from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts
+from brushloop.calibrate.loop.report import write_loop
 from brushloop.calibrate.pages.lens import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stroke.measure import Measured
@@ -32,6 +31,7 @@ from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
 from tests.calibrate.given import CALIBRATION
+from tests.calibrate.records import loop_record
 from tests.photographed import imported, photograph
 
 if TYPE_CHECKING:
@@ -106,7 +106,6 @@ def _loop(folder: Path) -> str:
 
     first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
     pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
-    scores = score_pairs(pairs, [first, second])
     original, again = (
         SimpleNamespace(
             header=Header(session_id=name, source=Source.LOOPBACK, software="test", brush=TWIN),
@@ -116,9 +115,11 @@ def _loop(folder: Path) -> str:
         )
         for name in ("grid", "replay")
     )
-    refused = [("a-r02", NOT_AGAIN), ("x<u>", "is blank")]
-    made = LoopComparison(original, again, "CCD-BSM", True, Field(), pairs, refused, scores, verdicts(scores))
-    return write_loop(made, record_of(made, "brushloop loop"), folder / "loop").read_text(encoding="utf-8")
+    scores = score_pairs(pairs, [first, second], original.header)
+    rows = {"table_1": tuple(table_1(scores)), "verdicts": tuple(verdicts(scores))}
+    record = loop_record("grid", "ab", refused=(("a-r02", NOT_AGAIN), ("x<u>", "is blank")), **rows)
+    loop = LoopComparison(record, original, again, pairs, scores)
+    return write_loop(loop, folder / "loop").read_text(encoding="utf-8")
 
 
 def _written(folder: Path) -> str:
@@ -144,9 +145,7 @@ def _written(folder: Path) -> str:
         plan=PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,)),
         characters=[one],
         scores=scores,
-        table=table_3(
-            scores, source=Source.LOOPBACK, session_id="write-01", model="CCD-BSM", references={"字": "a font"}
-        ),
+        table=table_3(scores, {"字": "a font"}),
     )
     return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
 

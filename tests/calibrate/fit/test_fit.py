@@ -131,10 +131,10 @@ def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
     assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
     below = rows[FITTED].below
     assert below is not None
-    assert below.mean == pytest.approx(rows[CEILING].csim - rows[FITTED].csim)
-    assert below.mean < 2.5
-    assert below.interval is not None
-    assert below.interval[0] < below.mean < below.interval[1]
+    assert below.avg == pytest.approx(rows[CEILING].csim - rows[FITTED].csim, abs=1e-6)
+    assert below.avg < 2.5
+    assert below.avg_interval is not None
+    assert below.avg_interval[0] < below.avg < below.avg_interval[1]
     assert rows[CEILING].below is None
 
 

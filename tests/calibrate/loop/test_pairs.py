@@ -9,16 +9,25 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.compare.place import Alignment, Field, Tone
-from brushloop.calibrate.loop.compare import by_name, pair_up
-from brushloop.calibrate.loop.scores import AGAIN, ANOTHER, SIMULATED, Pair, PairScore, score_pairs, scores_of, verdicts
+from brushloop.calibrate.loop.compare import (
+    AGAIN,
+    ANOTHER,
+    SIMULATED,
+    Pair,
+    by_name,
+    pair_up,
+    score_pairs,
+    verdicts,
+)
 from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
+from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.stats import interval_over_groups
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Stroke
+from brushloop.sessions.records import Header, Source, Stroke
 from tests.calibrate.given import CALIBRATION
 
 MODEL = stroke_model("ccd-bsm", Brush())
@@ -54,9 +63,8 @@ def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pai
     return pair_up(by_name(originals, refused), again, MODEL, Field(), refused), dict(refused)
 
 
-def percent(scores: list[PairScore], what: str) -> list[float]:
-    """CSIM in the strict comparison."""
-    return [100.0 * score.csim for score in scores_of(scores, what, STRICT)]
+def scored(pairs: list[Pair], originals: Iterable[Press]) -> Scores:
+    return score_pairs(pairs, originals, Header(session_id="grid", source=Source.LOOPBACK, software="test"))
 
 
 ORIGINALS = [
@@ -75,21 +83,22 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
     names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
     assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
     assert refused == {"b-r01": "was not pressed again"}
-    scores = score_pairs(pairs, ORIGINALS)
-    assert min(percent(scores, AGAIN)) == pytest.approx(100.0)
-    assert max(percent(scores, ANOTHER)) < 98.0
-    assert np.mean(percent(scores, SIMULATED)) > 99.0
-    found = verdicts(scores)
-    assert len(found) == 8
-    assert all(verdict.holds and verdict.n == 2 for verdict in found)
+    scores = scored(pairs, ORIGINALS)
+    csim = {what: scores.of_key(what, STRICT)[:, 0] for what in scores.models}
+    assert csim[AGAIN].min() == pytest.approx(1.0)
+    assert csim[ANOTHER].max() < 0.98
+    assert csim[SIMULATED].mean() > 0.99
+    first, *others = verdicts(scores)
+    assert len(others) == 7
+    assert all(verdict.holds and verdict.n == 2 for verdict in (first, *others))
     # One cell only: nothing says how sure that is.
-    assert found[0].low is None
-    assert not found[0].certain
+    assert first.interval is None
+    assert not first.certain
 
 
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
     again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
-    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
+    scores = scored(paired(ORIGINALS, again)[0], ORIGINALS)
     [strict] = [v for v in verdicts(scores) if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")]
     assert strict.difference < -2.0
     assert not strict.holds
@@ -114,9 +123,9 @@ def test_what_repeats_nothing_is_named() -> None:
 
 def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
     again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
-    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
-    assert scores_of(scores, ANOTHER, STRICT) == []
-    assert verdicts(scores) == []
+    scores = scored(paired(ORIGINALS, again)[0], ORIGINALS)
+    assert np.isnan(scores.of(ANOTHER)).all()
+    assert list(verdicts(scores)) == []
 
 
 def test_the_interval_draws_whole_groups() -> None:

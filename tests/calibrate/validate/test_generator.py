@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.validate.inputs import FittedSession
-from brushloop.calibrate.validate.report import load_report
+from brushloop.calibrate.validate.report import NORMAL, load_report
 from brushloop.calibrate.validate.tuning import align_captures
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.generator.data import load_captures
@@ -70,13 +70,11 @@ def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, gene
     said = invoke("validate", session, "--out", tmp_path, *given)
     assert "CCD-BSMG trained on exact images of CCD-BSM, given only the brush's size" in said
     report = load_report(tmp_path / "report.json")
-    mine, exact = (
-        report.stat(name, Alignment.SIZE_NORMALISED, Tone.BINARY, "csim") for name in ("ccd-bsmg", "ccd-bsm")
-    )
-    assert mine is not None
+    drawn, exact = (report.stat(name, NORMAL) for name in ("ccd-bsmg", "ccd-bsm"))
+    assert drawn is not None
     assert exact is not None
-    assert mine.n == exact.n == 10
-    assert mine.avg == pytest.approx(exact.avg, abs=6.0)
+    assert drawn.csim.n == exact.csim.n == 10
+    assert drawn.csim.avg == pytest.approx(exact.csim.avg, abs=6.0)
     rival = report.model("ccd-bsmg")
     assert rival is not None
     assert rival.basis == "trained on exact images of CCD-BSM"
@@ -93,11 +91,11 @@ def test_a_tuned_generator_is_judged_on_cells_that_it_has_not_seen(
     assert rival is not None
     assert rival.basis == "fitted, held-out cells"
     plain, tuned = (
-        report.stat(name, Alignment.SIZE_NORMALISED, Tone.GRAY, "csim") for name in ("ccd-bsmg", "ccd-bsmg-heldout")
+        report.stat(name, (Alignment.SIZE_NORMALISED, Tone.GRAY)) for name in ("ccd-bsmg", "ccd-bsmg-heldout")
     )
     assert plain is not None
     assert tuned is not None
-    assert tuned.avg > plain.avg + 3.0
+    assert tuned.csim.avg > plain.csim.avg + 3.0
     folds = {path.parent.name for path in (tmp_path / "work" / "tuned").rglob("generator.safetensors")}
     assert len(folds) == 5
     tuned_generator = tmp_path / "work" / "tuned" / min(folds) / "generator.safetensors"

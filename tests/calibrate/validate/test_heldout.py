@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.compare.place import Alignment, Field, Tone
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import read_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.fit.run import fit_session
@@ -26,10 +26,8 @@ def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path
     rows = {NAMES[row.model]: row for row in fitted.held_out if row.model in NAMES}
     assert set(rows) == set(NAMES.values())
     for name, row in rows.items():
-        for measure in ("csim", "ssim"):
-            stat = report.stat(name, Alignment.MM, Tone.BINARY, measure)
-            assert stat is not None
-            assert (stat.avg, stat.n) == (pytest.approx(getattr(row, measure), abs=0.005), row.n)
-        below = report.stat(name, Alignment.MM, Tone.BINARY, "csim")
-        assert below is not None
-        assert below.below_ceiling == (None if row.below is None else pytest.approx(row.below.mean, abs=0.005))
+        stat = report.stat(name)
+        assert stat is not None
+        assert (stat.csim.avg, stat.ssim.avg) == pytest.approx((row.csim, row.ssim), abs=0.005)
+        assert stat.csim.n == row.n
+        assert stat.csim.below_ceiling == (None if row.below is None else pytest.approx(row.below.avg, abs=0.005))

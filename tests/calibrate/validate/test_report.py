@@ -6,25 +6,25 @@ import csv
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.place import Alignment, Tone
+from brushloop.calibrate.compare.place import KEYS
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.scores import Score
+from brushloop.calibrate.presses import Press
+from brushloop.calibrate.scores import Row, Scores
+from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.validate.findings import trust
 from brushloop.calibrate.validate.page import provenance
 from brushloop.calibrate.validate.report import Collected, Report, load_report
-from brushloop.calibrate.validate.run import Outcome
-from brushloop.calibrate.validate.tables import SCORE_COLUMNS, GateMissed, parse_gate, score_rows
+from brushloop.calibrate.validate.tables import GateMissed, parse_gate
 from brushloop.sessions.events import Remark
 from brushloop.sessions.recording import Recording, add_remark
-from brushloop.sessions.records import Condition, Source
+from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
 
 MODELS = ("ccd-bsm", "bezier", "bezier-refitted", "ellipse", "line", "circle", "qbc", "another press")
@@ -53,26 +53,23 @@ def report(folder: Path) -> Report:
 
 def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> None:
     for model in MODELS:
-        for alignment in Alignment:
-            for tone in Tone:
-                for measure in ("csim", "ssim"):
-                    stat = report.stat(model, alignment, tone, measure)
-                    assert stat is not None
-                    assert stat.n == 10
-                    assert 0.0 < stat.min <= stat.median <= stat.max <= 100.0
-                    assert stat.avg_low <= stat.avg <= stat.avg_high
-    cell = report.stat("ccd-bsm", Alignment.MM, Tone.BINARY, "csim", (15.0, 5.0))
+        for key in KEYS:
+            stat = report.stat(model, key)
+            assert stat is not None
+            for of in (stat.csim, stat.ssim):
+                assert of.n == 10
+                assert 0.0 < of.min <= of.median <= of.max <= 100.0
+                assert of.avg_interval[0] <= of.avg <= of.avg_interval[1]
+    cell = report.stat("ccd-bsm", cell=(15.0, 5.0))
     assert cell is not None
-    assert cell.n == 2
+    assert cell.csim.n == 2
 
 
 def test_a_refitted_bezier_has_not_seen_what_it_predicts_and_beats_the_published_one(report: Report) -> None:
-    refitted, published = (
-        report.stat(name, Alignment.MM, Tone.BINARY, "csim") for name in ("bezier-refitted", "bezier")
-    )
+    refitted, published = (report.stat(name) for name in ("bezier-refitted", "bezier"))
     assert refitted is not None
     assert published is not None
-    assert refitted.avg > published.avg + 5.0
+    assert refitted.csim.avg > published.csim.avg + 5.0
     rival = report.model("bezier-refitted")
     assert rival is not None
     assert rival.basis == "fitted, held-out cells"
@@ -125,13 +122,14 @@ def test_csv_and_parquet_hold_the_same_scores(folder: Path) -> None:
 
 
 def test_every_score_of_a_twin_is_labelled_as_one() -> None:
-    header = SimpleNamespace(
-        session_id="s", source=Source.LOOPBACK, brush="simulated bristle bundle (twin of monday, simulated), R = 5 mm"
-    )
-    score = Score("s", "a", Condition(11.0, 0.0), None, "ccd-bsm", Alignment.MM, Tone.BINARY, 0.9, 0.9)
-    outcome = SimpleNamespace(sessions=[SimpleNamespace(header=header)], scores=[score])
-    labels = {one[SCORE_COLUMNS.index("source")] for one in score_rows(cast(Outcome, outcome))}
-    assert labels == {"loopback rig, brush twin of monday, simulated"}
+    brush = "simulated bristle bundle (twin of monday, simulated), R = 5 mm"
+    header = Header(session_id="s", source=Source.LOOPBACK, software="test", brush=brush)
+    blank = np.zeros((128, 128), np.float32)
+    stroke = Stroke(stroke_id="a", kind="press", still=0)
+    press = Press(stroke, dict.fromkeys(KEYS, blank), blank, (0.0, 0.0), Measured(1, 1, 1, 1, 1), False, ())
+    scores = Scores([Row.of(press, header)], ["ccd-bsm"])
+    scores.values[:] = 0.9
+    assert {score.source for score in scores} == {"loopback rig, brush twin of monday, simulated"}
 
 
 def test_an_edited_report_is_not_read(folder: Path, tmp_path: Path) -> None:
@@ -154,18 +152,25 @@ def test_a_gate_that_holds_passes_and_one_that_is_missed_exits_5(session: Path, 
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    "text", ["csim>=0.9", "csim_mean>=0.9", "csim_avg>=90", "csim_avg>=x", "csim_avg=0.9", "a:b:csim_avg>=0.9", ""]
+)
+def test_what_is_no_gate_is_refused_before_any_work(text: str) -> None:
+    with pytest.raises(CalibrationError, match=r"expected \[MODEL:\]\[ALIGNMENT:\]\[TONE:\]csim_avg>=0.90"):
+        parse_gate(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
     [
-        ("csim>=0.9", "expected"),
-        ("csim_mean>=0.9", "'mean' is not one of"),
-        ("csim_avg>=90", "90 is outside 0 to 1"),
-        ("csim_avg>=x", "not a number"),
-        ("a:b:csim_avg>=0.9", "names two models"),
+        ("csim_avg>=0.90", ("", ("size-normalised", "binary"), "csim", "avg", ">=", 0.9)),
+        ("mm:ssim_min > .5", ("", ("mm", "binary"), "ssim", "min", ">", 0.5)),
+        ("bezier:csim_max<=1", ("bezier", ("size-normalised", "binary"), "csim", "max", "<=", 1.0)),
+        ("another press:mm:gray:csim_median<1", ("another press", ("mm", "gray"), "csim", "median", "<", 1.0)),
     ],
 )
-def test_what_is_no_gate_is_refused_before_any_work(text: str, words: str) -> None:
-    with pytest.raises(CalibrationError, match=words):
-        parse_gate(text)
+def test_a_gate_names_model_images_and_statistic(text: str, parts: tuple[object, ...]) -> None:
+    gate = parse_gate(text)
+    assert (gate.model, gate.key, gate.measure, gate.statistic, gate.op, gate.limit) == parts
 
 
 def test_only_the_models_asked_for_and_an_unknown_one_is_refused(session: Path, tmp_path: Path) -> None:
@@ -200,7 +205,7 @@ def test_ablations_show_lambda_and_the_number_of_strokes(session: Path, tmp_path
     given = ("--model", "ccd-bsm", "--model", "ccd-bsm-lambda-1", "--model", "ccd-bsm-lambda-pi/2")
     run(session, "--out", tmp_path / "out", *given, "--ablations", "--curves", f"QBC={curve}")
     report = load_report(tmp_path / "out" / "report.json")
-    assert report.stat("ccd-bsm-lambda-1", Alignment.MM, Tone.BINARY, "csim") is not None
+    assert report.stat("ccd-bsm-lambda-1") is not None
     by_count = {step.strokes: step.csim for step in report.by_strokes if step.model == "CCD-BSM"}
     assert sorted(by_count) == [1, 2, 3, 5]
     assert by_count[5] > by_count[1]

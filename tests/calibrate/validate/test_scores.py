@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, levels_of, pack, simulated
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, levels_of, simulated
 from brushloop.calibrate.pool import threads
 from brushloop.calibrate.presses import PrepareJob, prepare_job
-from brushloop.calibrate.scores import Row, Scores
+from brushloop.calibrate.scores import Row, Scores, similarities
 from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.validate.inputs import open_session
 from brushloop.calibrate.validate.models import ANOTHER, REPEATED
@@ -37,17 +37,17 @@ def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndar
     return np.rint(230.0 * (1.0 - 0.92 * np.asarray(mark[0])[:800])).astype(np.uint8)
 
 
-def packed(page: np.ndarray) -> bytes:
-    """The press of a page, as it is compared."""
+def images_of(page: np.ndarray) -> np.ndarray:
+    """(KEYS, 128, 128): the press of a page, as it is compared."""
     stroke = Stroke(stroke_id="a", kind="press", still=0, cell_mm=CELL, anchor_mm=ANCHOR)
-    arrays = prepare_job(PrepareJob(Capture(stroke, encode_png(page), "test"), CALIBRATION, Field()))
-    return pack(np.rint(255 * arrays["images"]).astype(np.uint8))
+    return prepare_job(PrepareJob(Capture(stroke, encode_png(page), "test"), CALIBRATION, Field()))["images"]
 
 
 def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, np.ndarray]:
     """(KEYS, 2) scores of every model's press of that command."""
-    images = tuple((pack(levels_of(simulated(model, depth_mm, tilt_deg, Field()))),) for model in MODELS.values())
-    return dict(zip(MODELS, score_job(ScoreJob(packed(page), images))["values"], strict=True))
+    images = tuple(levels_of(simulated(model, depth_mm, tilt_deg, Field()))[None] for model in MODELS.values())
+    press = np.rint(255 * images_of(page)).astype(np.uint8)
+    return dict(zip(MODELS, score_job(ScoreJob(press, images))["values"], strict=True))
 
 
 @pytest.mark.parametrize("model", ["ccd-bsm", "ellipse", "line"])
@@ -77,11 +77,12 @@ def test_a_wrong_place_or_size_is_forgiven_when_normalised_but_not_in_mm(
 
 
 def test_scores_of_several_images_are_averaged_and_of_none_are_missing() -> None:
-    near, far = packed(page_of(13.0, 5.0)), packed(page_of(15.0, 5.0))
-    one, other, both, none = score_job(ScoreJob(near, ((near,), (far,), (near, far), ())))["values"]
+    near, far = images_of(page_of(13.0, 5.0)), images_of(page_of(15.0, 5.0))
+    one, other, both, none = (similarities(near, np.array(images)) for images in ([near], [far], [near, far], []))
     assert one == pytest.approx(1.0)
     assert both == pytest.approx((one + other) / 2)
     assert np.isnan(none).all()
+    assert np.isnan(similarities(near, np.zeros((1, *near.shape)))).all()
 
 
 def test_the_field_holds_every_cell_of_the_grid() -> None:
@@ -96,27 +97,17 @@ def test_the_field_holds_every_cell_of_the_grid() -> None:
 def test_the_table_is_in_order_of_capture_and_its_cells_in_order_of_session_and_condition() -> None:
     shallow, upright, tilted = Condition(20.0, 0.0), Condition(11.0, 0.0), Condition(11.0, 10.0)
     order = [("b", shallow), ("b", upright), ("b", tilted), ("b", shallow), ("a", shallow), ("a", upright)]
+    sizes, blank = Measured(1.0, 1.0, 1.0, 1.0, 1.0), np.zeros((4, 128, 128), np.uint8)
     rows = [
-        Row(
-            name,
-            Stroke(stroke_id=str(k), kind="press", still=k),
-            condition,
-            Measured(1.0, 1.0, 1.0, 1.0, 1.0),
-            False,
-            b"",
-        )
+        Row(name, "", Stroke(stroke_id=str(k), kind="press", still=k), condition, sizes, False, blank, blank[0])
         for k, (name, condition) in enumerate(order)
     ]
     scores = Scores(rows, ["line", "circle"])
-    assert [cell.tolist() for cell in scores.cells] == [[1], [2], [0, 3], [5], [4]]
+    assert scores.cells == [[1], [2], [0, 3], [5], [4]]
     assert scores.cell_of.tolist() == [2, 0, 1, 2, 4, 3]
-    assert {at: rows.tolist() for at, rows in scores.conditions().items()} == {
-        upright: [1, 5],
-        tilted: [2],
-        shallow: [0, 3, 4],
-    }
+    assert scores.conditions() == {upright: [1, 5], tilted: [2], shallow: [0, 3, 4]}
     scores.values[4, 1] = 0.5
-    assert [(s.session, s.stroke_id, s.model, s.csim) for s in scores] == [("a", "4", "circle", 0.5)] * len(KEYS)
+    assert [(s.session_id, s.stroke_id, s.model, s.csim) for s in scores] == [("a", "4", "circle", 0.5)] * len(KEYS)
 
 
 def test_the_repetition_is_scored_against_its_original_only(

@@ -41,7 +41,7 @@ from brushloop.calibrate.writing.scores import (
 )
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Source, Stroke
+from brushloop.sessions.records import Stroke
 from tests.calibrate.given import CALIBRATION
 from tests.calibrate.records import written_record
 
@@ -133,22 +133,20 @@ def character() -> Character:
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
     scores = list(score_character(character()))
-    rows = table_3(
-        scores, source=Source.LOOPBACK, session_id="s", model="CCD-BSM", references={"x": "font of the test"}
-    )
+    rows = table_3(scores, {"x": "font of the test"})
     assert len(rows) == len(KEYS) * 4
     strict = {row.pair: row for row in rows if (row.alignment, row.tone, row.polarity) == STRICT}
-    assert [strict[pair].n for pair in (SIMULATED, REFERENCE, PLANNED, ANOTHER)] == [3, 3, 1, 3]
-    assert strict[REFERENCE].csim[0] == pytest.approx(100.0)
-    assert strict[REFERENCE].csim[0] > strict[REFERENCE].csim[2] > strict[REFERENCE].csim[1]
-    assert strict[REFERENCE].paper_row == "robot writing"
+    assert [strict[pair].csim.n for pair in (SIMULATED, REFERENCE, PLANNED, ANOTHER)] == [3, 3, 1, 3]
+    csim = strict[REFERENCE].csim
+    assert csim.max == pytest.approx(100.0)
+    assert csim.max > csim.avg > csim.min
     assert strict[REFERENCE].reference == "font of the test"
     # The middle one is nearest to the two others.
     another = {s.stroke_id: s.csim for s in scores if s.pair == ANOTHER and (s.alignment, s.tone, s.polarity) == STRICT}
     assert max(another, key=lambda name: another[name]) == "x-r02"
 
     path = tmp_path / "written.json"
-    path.write_text(written_record(tuple(rows)).to_json())
+    path.write_text(written_record(table_3=tuple(rows)).to_json())
     assert list(read_written(tmp_path).table_3) == rows
     path.write_text(path.read_text().replace("loopback rig", "real capture"))
     with pytest.raises(CalibrationError, match=r"written\.json: was edited"):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from brushloop.calibrate.loop.scores import read_loop
+from brushloop.calibrate.loop.compare import read_loop
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from tests.waiting import wait_until
@@ -71,8 +71,8 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     assert report["refused"] == []
     assert report["in_sample"]
     rows = read_loop(session / "loop").table_1
-    assert {row.what for row in rows} == {"re-pressed", "recovered, simulated"}
-    assert all(row.n == 6 and row.source == "loopback rig" for row in rows)
+    assert {row.model for row in rows} == {"re-pressed", "recovered, simulated"}
+    assert all(row.csim.n == 6 for row in rows)
     # No patch was pressed twice: the brush's repeatability is not known, and nothing is claimed.
     assert report["verdicts"] == []
     with (session / "loop" / "loop.csv").open(encoding="utf-8") as file:
