@@ -11,7 +11,7 @@ from brushloop.collect.headless import RunnableEngine, obey, stop_signals
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.browser import SessionBrowser
 from brushloop.collect.tui.pictures import Pictures, Preview
-from brushloop.collect.tui.themes import chosen_file
+from brushloop.collect.tui.terminal import theme_file
 
 
 class ScreenCrashed(Exception):
@@ -25,7 +25,7 @@ def run_screen(
 
     `again` makes the engine that resumes a session after a stop. Returns the engine that ran last.
     """
-    app = OperatorApp(engine, again=again, pictures=Pictures(preview), theme_file=chosen_file())
+    app = OperatorApp(engine, again=again, pictures=Pictures(preview), theme_file=theme_file())
     with _signals(app):
         engine.start()
         _run(app)
@@ -36,7 +36,7 @@ def run_screen(
 
 def run_browser(browser: SessionBrowser) -> None:
     """Show the start screen, and run what is started from it; raises what ended the last run."""
-    app = OperatorApp(browser=browser, pictures=Pictures("auto"), theme_file=chosen_file())
+    app = OperatorApp(browser=browser, pictures=Pictures("auto"), theme_file=theme_file())
     with _signals(app):
         _run(app)
         if app.engine is not None:

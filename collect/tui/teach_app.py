@@ -16,9 +16,8 @@ from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.teach_guide import ScreenGuide, Teaching
 from brushloop.collect.tui.teach_screen import GO_ON, LEAVE, TeachScreen
-from brushloop.collect.tui.terminal import PlainApp
+from brushloop.collect.tui.terminal import PlainApp, theme_file
 from brushloop.collect.tui.text import SOFTWARE_STOP
-from brushloop.collect.tui.themes import chosen_file
 from brushloop.collect.tui.widgets import HelpScreen
 
 Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
@@ -143,7 +142,7 @@ def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Pat
 
     However the screen ends, nobody watches the arm from here on: whatever moves it is stopped.
     """
-    app = TeachApp(work, name, pictures, chosen_file())
+    app = TeachApp(work, name, pictures, theme_file())
 
     def on_signal(_: int) -> None:
         app.teaching.stop()

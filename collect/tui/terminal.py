@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 from collections.abc import Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TextIO
 
@@ -19,9 +19,30 @@ from textual.color import Color
 from textual.drivers.linux_driver import LinuxDriver
 from textual.filter import LineFilter
 from textual.screen import Screen
+from textual.theme import BUILTIN_THEMES
 
-from brushloop.collect.tui.themes import THEMES, TITLES, chosen, keep
 from brushloop.sessions.terminal import inert
+
+DARK = "textual-dark"
+MAX_BYTES = 64
+
+
+def theme_file() -> Path:
+    """Where the choice of colours is kept for the next start."""
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(state) / "brushloop" / "theme"
+
+
+def chosen_theme(file: Path | None) -> str:
+    """The theme that was chosen last; dark where none was, or where the file holds anything else."""
+    if file is None:
+        return DARK
+    try:
+        with file.open("rb") as stream:
+            name = stream.read(MAX_BYTES).decode("ascii", "replace").strip()
+    except OSError:
+        return DARK
+    return name if name in BUILTIN_THEMES else DARK
 
 
 class TerminalDriver(LinuxDriver):
@@ -53,19 +74,18 @@ class PlainApp(App[None]):
         """`theme_file` keeps the choice of colours; None where it is not kept."""
         super().__init__(driver_class=TerminalDriver)
         self._theme_file = theme_file
-        for theme in THEMES:
-            self.register_theme(theme)
-        self.theme = chosen(theme_file)
+        self.theme = chosen_theme(theme_file)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """List the themes that are not shown now."""
-        for name, (title, what) in TITLES.items():
-            if name != self.theme:
-                yield SystemCommand(title, what, partial(self._choose_theme, name))
+        """Only the choice of colours: textual's own way to quit would leave a moving arm."""
+        yield SystemCommand("Colours", "Choose dark, light or other colours", self.action_change_theme)
 
-    def _choose_theme(self, name: str) -> None:
-        self.theme = name
-        keep(self._theme_file, name)
+    def watch_theme(self, name: str) -> None:
+        """Keep a choice; where the folder cannot be written, it holds until the program ends."""
+        if self._theme_file is not None and name != chosen_theme(self._theme_file):
+            with contextlib.suppress(OSError):
+                self._theme_file.parent.mkdir(parents=True, exist_ok=True)
+                self._theme_file.write_text(f"{name}\n", encoding="ascii")
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Add `PlainLines` after textual's own filters."""
