@@ -15,8 +15,7 @@ from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from brushloop.sessions.export import Cropper
-    from brushloop.sessions.recording import Recording
+    pass
 
 LEFT_OUT = 3
 """Exit code of an export that left strokes out."""
@@ -133,20 +132,11 @@ def export(
 
     Ends with exit code 3 if strokes could not be cropped; they are named.
     """
-    from brushloop.calibrate.errors import CalibrationError
-    from brushloop.sessions.export import export as write
+    from brushloop.calibrate.export import export as write
     from brushloop.sessions.terminal import shown
 
-    if not crops and calibration is not None:
-        raise CalibrationError("--calibration", "needs --crops")
-
-    def make_cropper(recording: Recording) -> Cropper:
-        from brushloop.calibrate.presses import cropper_of
-
-        return cropper_of(recording, calibration)
-
     with shown() as progress:
-        left_out = write(session, out, kind, progress, make_cropper if crops else None)
+        left_out = write(session, out, kind, progress, crops=crops, calibration=calibration)
     say(f"Exported into {out}")
     for stroke_id, reason in left_out:
         say(f"left out: {stroke_id}: {reason}", err=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.sessions import disk
-from brushloop.sessions.disk import unwritable
+from brushloop.sessions.disk import check_writable
 from brushloop.sessions.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,15 +31,9 @@ def check_target(path: Path, ending: str, *inputs: Path | None) -> None:
         raise CalibrationError(str(path), f"must end in {ending}")
     if path.is_dir():
         raise CalibrationError(str(path), "is a folder")
-    check_folder(path.parent)
+    check_writable(path.parent)
     if any(one is not None and one.exists() and path.exists() and path.samefile(one) for one in inputs):
         raise CalibrationError(str(path), "is the input; it is not overwritten")
-
-
-def check_folder(folder: Path) -> None:
-    """Check before any work that a folder is writable or can be created. Raises `CalibrationError`."""
-    if (found := unwritable(folder)) is not None:
-        raise CalibrationError(str(found[0]), found[1])
 
 
 @contextmanager

@@ -27,6 +27,7 @@ from brushloop.calibrate.compare.place import (
     simulated,
 )
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.fit.command import FitRequest, FitResult, fit_presses
@@ -37,7 +38,6 @@ from brushloop.calibrate.validate.command import validate as run_validation
 from brushloop.calibrate.validate.inputs import local_path
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.similarity import csim, ssim
-from brushloop.sessions.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
 from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Condition, Header
 

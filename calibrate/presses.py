@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from contextlib import nullcontext
 from dataclasses import astuple, dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -29,15 +28,13 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.pool import Scheduler, threads
-from brushloop.calibrate.session import OpenSession, calibration_of
+from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.store import Arrays, key_of
 from brushloop.calibrate.stroke.measure import Measured, measure
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.export import Crop, Cropper
-from brushloop.sessions.messages import encode_png
-from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Condition, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -179,22 +176,3 @@ def crop(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Mask,
     """
     raster, steps = rectified(capture, calibration, Field())
     return raster, steps.ink if capture.stroke.kind == "drag" else steps.prepared.mask, steps.prepared
-
-
-def cropper_of(recording: Recording, calibration_path: Path | None = None) -> Cropper:
-    """What `sessions export --crops` cuts strokes out with, by the calibration given, else by the one in use.
-
-    Raises `CalibrationError` where a session was not calibrated; an import needs no calibration.
-    """
-    first = next(recording.stroke_records())
-    calibration = calibration_of(recording, first, recording.sha256, calibration_path)
-
-    def encoded(capture: Capture) -> Crop | str:
-        try:
-            raster, ink, prepared = crop(capture, calibration)
-        except (CaptureRefused, SessionDamaged) as error:
-            return error.what
-        pictures = encode_png(raster), encode_png(255 * ink.astype(np.uint8))
-        return Crop(*pictures, PX_PER_MM, prepared.anchor_px, "; ".join(prepared.flags))
-
-    return encoded

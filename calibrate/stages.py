@@ -21,6 +21,7 @@ from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Sof
 from brushloop.calibrate.stroke.preprocess import Steps, preprocess, to_levels
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.records import Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 COLUMNS = 4
@@ -57,7 +58,7 @@ def show_stroke(session: Path, stroke: str, out: Path, progress: Progress = unse
     Raises `CalibrationError` where the session was not calibrated.
     """
     recording = Recording(session)
-    for capture in counted(recording.captures(), "strokes read", recording.strokes(), progress):
+    for capture in counted(recording.captures(), "strokes read", recording.counts[Topic.STROKE], progress):
         if stroke in ("", capture.stroke.stroke_id):
             break
     else:

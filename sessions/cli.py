@@ -8,11 +8,11 @@ Heavy imports wait until a command runs. Additional exit codes: 3 repaired, but 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from brushloop.sessions.terminal import say
+from brushloop.sessions.terminal import say, shown
 
 LOSSY, DAMAGED = 3, 6
 Session = Annotated[Path, typer.Argument(help="A session's folder, or its .mcap file.")]
@@ -55,15 +55,13 @@ def verify(session: Session) -> None:
 
     Exit code 0: everything is intact. 6: something is damaged, and is named.
     """
-    from brushloop.sessions.terminal import shown
     from brushloop.sessions.verify import verify_session
 
     with shown() as progress:
         verdict = verify_session(session, progress)
-    for finding in verdict.findings:
-        say(f"damaged: {finding.file}: {finding.what}")
-    for note in verdict.notes:
-        say(f"note: {note}")
+    for file, problems in verdict.findings.items():
+        say(*(f"damaged: {file}: {problem}" for problem in problems))
+    say(*(f"note: {note}" for note in verdict.notes))
     read = f"{verdict.files} files, {verdict.strokes} strokes, {verdict.messages} messages"
     if verdict.sound:
         say(f"{verdict.session} ({verdict.state}) is sound: {read}")
@@ -84,11 +82,8 @@ def repair(session: Session) -> None:
     from brushloop.sessions.repair import repair_session
 
     report = repair_session(session, time.time_ns)
-    for line in report.did:
-        say(line)
-    for line in report.lost:
-        say(f"lost: {line}")
-    if report.lossless:
+    say(*report.did, *(f"lost: {line}" for line in report.lost))
+    if not report.lost:
         what = "nothing was lost" if report.did else "was sound; nothing was changed"
         say(f"{report.session}: {what}, {report.strokes} strokes")
         return
@@ -103,7 +98,7 @@ def close(session: Annotated[Path, typer.Argument(help="The folder of a session 
 
     from brushloop.sessions.store import SessionStore
 
-    store = SessionStore(session.resolve(), None, time.time_ns)
+    store = SessionStore(session.resolve(), time.time_ns)
     try:
         final = store.close()
     finally:
@@ -116,8 +111,10 @@ def import_(
     folder: Annotated[Path, typer.Argument(help="Folder of photographs.")],
     csv: Annotated[Path, typer.Option(help="Table with a `file` column, px_per_mm, and one column per parameter.")],
     out: Annotated[Path | None, typer.Option(help="New session folder; sessions/<folder's name> by default.")] = None,
-    kind: Annotated[str, typer.Option(help="press (vertical presses) or drag (strokes that travel).")] = "drag",
-    px_per_mm: Annotated[float | None, typer.Option(help="Scale, where the table has none.")] = None,
+    kind: Annotated[
+        Literal["press", "drag"], typer.Option(help="press (vertical presses) or drag (strokes that travel).")
+    ] = "drag",
+    px_per_mm: Annotated[float | None, typer.Option(min=0.01, max=1e4, help="Scale, where the table has none.")] = None,
     licence: Annotated[str, typer.Option(help="Licence of the photographs, kept in the recording.")] = "",
     origin: Annotated[str, typer.Option(help="Where they come from, kept in the recording.")] = "",
     brush: Annotated[str, typer.Option(help="Description of the brush.")] = "",
@@ -130,7 +127,6 @@ def import_(
     from importlib.metadata import version
 
     from brushloop.sessions.imports import ImportOptions, import_photographs
-    from brushloop.sessions.terminal import shown
 
     options = ImportOptions(kind, px_per_mm, licence, origin, brush, brush_radius_mm, brush_length_mm, simulated)
     target = out or Path("sessions") / folder.resolve().name

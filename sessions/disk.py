@@ -1,7 +1,6 @@
 """Files: safe names, disk space, durable writes, ways to place a file without losing another, and cells of CSV files.
 
-The journal of a session received from elsewhere may contain any name, and its folder may contain links in place of
-files. Every name that is read from a session is checked by `bare_name`, and every folder by `check_folder`, first. A
+The folder of a session received from elsewhere may contain links in place of files: `check_folder` checks it first. A
 text that a spreadsheet would run as a formula is written into a CSV file with an apostrophe before it.
 """
 
@@ -32,7 +31,6 @@ SESSION_ID = re.compile(r"[0-9A-Za-z][0-9A-Za-z._-]{0,99}")
 SEGMENT_NAME = re.compile(r"(\d{4,})-([a-z_]+)-([0-9A-Za-z_.-]+?)\.mcap(\.part)?")
 """File of a step: serial, kind, start of the key, and `.part` while unfinished."""
 SNAPSHOT_NAMES = ("rig.toml", "protocol.toml", "rig.effective.json")
-MAX_NAME_BYTES = 255
 NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 FORMULA_START = re.compile(r"'*[=+\-@\t\r\n＝＋－＠]")
 """Text that a spreadsheet runs, also where apostrophes precede it."""
@@ -121,40 +119,32 @@ def staged_folder(out: Path) -> Generator[Path]:
 
 
 def set_aside(path: Path, tag: str) -> Path:
-    """Give the file a second name in its folder (`x.mcap.damaged-1`), and return that name.
+    """Keep a copy of the file under a second name in its folder (`x.mcap.damaged-1`), and return that name.
 
     A file with the same content gets the same name again. Raises `SessionError` where the disk fails.
     """
     try:
         for number in itertools.count(1):
             kept = path.with_name(f"{path.name}.{tag}-{number}")
-            if not kept.exists():
-                _link(path, kept)
+            if kept.exists() and filecmp.cmp(path, kept, shallow=False):
                 return kept
-            if filecmp.cmp(path, kept, shallow=False):
+            if not kept.exists():
+                with path.open("rb") as source, kept.open("xb") as target:
+                    shutil.copyfileobj(source, target)
+                    sync(target)
                 return kept
     except OSError as error:
         raise disk_error(path, "cannot keep a copy", error) from error
     raise AssertionError
 
 
-def _link(path: Path, kept: Path) -> None:
-    try:
-        os.link(path, kept)
-    except OSError:  # exFAT, for one, has no links
-        with path.open("rb") as source, kept.open("xb") as target:
-            shutil.copyfileobj(source, target)
-            sync(target)
-
-
-def unwritable(folder: Path) -> tuple[Path, str] | None:
-    """Path that prevents writing into a folder, or creating it, and the reason; None if it can be written."""
+def check_writable(folder: Path) -> None:
+    """Raise `InputError` unless the folder can be written to, or created."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not there.is_dir():
-        return there, "is a file; a folder is needed"
+        raise InputError(there, "is a file; a folder is needed")
     if not os.access(there, os.W_OK | os.X_OK):
-        return there, "may not be written: it is read-only, or another user's"
-    return None
+        raise InputError(there, "may not be written: it is read-only, or another user's")
 
 
 def file_sha256(path: Path) -> str:
@@ -173,16 +163,6 @@ def check_digest(path: Path, sha256: str) -> None:
         raise SessionDamaged(path, f"cannot read: {in_one_line(error)}") from None
     if digest != sha256:
         raise SessionDamaged(path, "has changed since it was recorded (sha256 differs from the journal)")
-
-
-def bare_name(value: object) -> str:
-    """Return the name of a file in the session's folder. Raises `ValueError` for a name that could lead elsewhere."""
-    if not isinstance(value, str):
-        raise ValueError("is not a string")
-    plain = value.isprintable() and "/" not in value and "\\" not in value
-    if value in ("", ".", "..") or not plain or len(value.encode("utf-8", "replace")) > MAX_NAME_BYTES:
-        raise ValueError(f"is {value[:60]!r}, allowed is the name of a file in the session's folder")
-    return value
 
 
 def check_folder(folder: Path) -> None:

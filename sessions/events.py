@@ -9,13 +9,13 @@ import re
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
-from brushloop.sessions.disk import bare_name
 from brushloop.sessions.records import Check, Condition, Header
 from brushloop.sessions.records import Event as Value
 
 MAX_NUMBER = 10**9
+MAX_NAME_CHARS = 120
 _SERIAL = re.compile(r"\d{1,9}(?=-)")
 
 
@@ -33,9 +33,9 @@ class StepKind(StrEnum):
     SELF_CHECK = "self_check"  # press an uneven triangle of marks, which shows a mirrored, turned or stretched rig
 
 
-FileName = Annotated[str, AfterValidator(bare_name)]
-StepFile = Annotated[str, AfterValidator(bare_name), Field(pattern=r"\.mcap$")]
-SnapshotFile = Annotated[str, AfterValidator(bare_name), Field(pattern=r"\.(toml|json)$")]
+StepFile = Annotated[str, Field(pattern=r"^\w[\w .-]*\.mcap(\.part)?$", max_length=MAX_NAME_CHARS)]
+SnapshotFile = Annotated[str, Field(pattern=r"^\w[\w .-]*\.(toml|json)$", max_length=MAX_NAME_CHARS)]
+"""Names of files in the session's folder: a journal from elsewhere may hold any name, also one that leads elsewhere."""
 Whole = Annotated[int, Field(ge=0, le=MAX_NUMBER, strict=True)]
 Number = Annotated[float, Field(strict=True)]
 TimeNs = Annotated[int, Field(gt=-(2**63), lt=2**63, strict=True)]
@@ -106,15 +106,11 @@ class BoardResult(Value):
     checks: tuple[Check, ...] = ()
 
 
-class TouchResult(Value):
-    """One point of the paper, in the base frame; its highest and lowest touch are `span_mm` apart."""
+class TouchResult(TouchedPoint):
+    """One point of the paper, in the base frame."""
 
     kind: Literal[StepKind.TOUCH] = StepKind.TOUCH
     method: str
-    x_mm: Number
-    y_mm: Number
-    z_mm: Number
-    span_mm: Number | None = None
 
 
 class SelfCheckResult(Value):
@@ -204,34 +200,32 @@ class Process(_Event):
     event: Literal["process"] = "process"
 
 
-class Begin(_Event):
-    """An attempt at a step began. Its patches are used from now on, whatever becomes of it."""
+class _Step(_Event):
+    """An attempt at a step."""
 
-    event: Literal["begin"] = "begin"
     key: str
     kind: StepKind
     attempt: Whole
     sheet: Whole
     patches: tuple[Whole, ...] = ()
-    press: Press | None = None
+    """Patches that it marks."""
     file: StepFile
 
 
-class Done(_Event):
+class Begin(_Step):
+    """An attempt at a step began. Its patches are used from now on, whatever becomes of it."""
+
+    event: Literal["begin"] = "begin"
+    press: Press | None = None
+
+
+class Done(_Step):
     """A step is finished, and never done again."""
 
     event: Literal["done"] = "done"
-    key: str
-    attempt: Whole
-    file: StepFile
     sha256: str
     counts: Counts
     result: StepResult
-
-    @property
-    def kind(self) -> StepKind:
-        """What the step did."""
-        return self.result.kind
 
     @property
     def press(self) -> Press | None:
@@ -240,6 +234,10 @@ class Done(_Event):
         if isinstance(result, PressResult | CaptureResult):
             return result.press
         return result.skipped if isinstance(result, DipResult) else None
+
+    def begin(self) -> Begin:
+        """The begin of the step, at the time of its end."""
+        return Begin(**self.model_dump(include=set(_Step.model_fields)), press=self.press)
 
 
 class StepEvent(Value):
@@ -307,7 +305,7 @@ class Doubt(_Event):
 
     event: Literal["doubt"] = "doubt"
     sheet: Whole
-    file: FileName
+    file: StepFile
 
 
 class Remark(_Event):

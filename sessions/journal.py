@@ -16,7 +16,6 @@ import os
 import re
 import zlib
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -24,7 +23,7 @@ from typing import Any, TypeVar, cast
 from brushloop.sessions import events
 from brushloop.sessions.disk import check_file, fsync_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, disk_error
-from brushloop.sessions.events import Begin, Done, Event, Lost, Press, Repaired, parse_event, serial_of
+from brushloop.sessions.events import Begin, Done, Event, Lost, Repaired, parse_event, serial_of
 from brushloop.sessions.records import Header, Topic
 
 JOURNAL_NAME = "journal.jsonl"
@@ -66,7 +65,6 @@ class RunState:
     sheet: int = 0
     begun: int = 0
     """Attempts begun; the next one's serial number."""
-    processes: int = 0
     ended: str = ""
     """How the last run ended; empty if its process was cut off before it could say so."""
 
@@ -86,26 +84,12 @@ class RunState:
         """Results of one kind, in order of time."""
         return [step.result for step in self.files.values() if isinstance(step.result, kind)]
 
-    def not_photographed(self) -> list[Press]:
-        """Presses without a capture of the same take."""
-        waiting: dict[tuple[str, int], Press] = {}
-        for step in self.files.values():
-            match step.result:
-                case events.PressResult(press=press):
-                    waiting[press.stroke_id, press.take] = press
-                case events.CaptureResult(press=press):
-                    waiting.pop((press.stroke_id, press.take), None)
-                case _:
-                    pass
-        return list(waiting.values())
-
     def apply(self, event: Event) -> None:
         """Apply the next event. Raises `DoneTwice` for a step that was done already; the state is then unchanged."""
         match event:
             case events.Open():
                 self.opened = event
             case events.Process():
-                self.processes += 1
                 self.ended = ""
                 self.cut += [(begin, KILLED) for begin in self.running.values()]
                 self.running.clear()
@@ -183,9 +167,7 @@ class Reading:
     faults: list[str] = field(default_factory=list[str])
     """All problems, such as `line 5 does not match its CRC`; every command uses this list. Empty without damage."""
     missing: int = 0
-    """Number of lines between others that are gone or cannot be read."""
-    unread_at_end: int = 0
-    """Number of lines behind all others that cannot be read."""
+    """Number of lines that are gone from between others, or cannot be read."""
     torn: bytes = b""
     """Last line, cut off by a crash: the next process removes it."""
     next_seq: int = 1
@@ -264,7 +246,7 @@ def undamaged(path: Path) -> Reading:
     """A journal whose every line can be trusted. Raises `SessionDamaged` for any other."""
     reading = read(read_journal(path))
     if reading.faults:
-        raise SessionDamaged(path, f"{reading.faults[0]}{_more(reading.faults)}")
+        raise SessionDamaged(path, f"{'; '.join(reading.faults[:3])}")
     return reading
 
 
@@ -278,17 +260,17 @@ def read_header(folder: Path, state: RunState) -> Header:
 def _decoded(reading: Reading, data: bytes) -> list[Entry]:
     """Lines that can be used; the others are reported."""
     *pieces, tail = data.split(b"\n")
+    lines = [*pieces, tail] if tail else pieces
     entries: list[Entry] = []
-    for number, raw in enumerate([*pieces, tail] if tail else pieces, start=1):
+    for number, raw in enumerate(lines, start=1):
         try:
             entries.append(decode_line(raw, number))
-            reading.unread_at_end = 0
         except ValueError as error:
             if number > len(pieces) and _END.search(raw) is None:
                 reading.torn = tail
             else:
                 reading.faults.append(f"line {number} {error}")
-                reading.unread_at_end += 1
+    reading.missing = len(lines) - bool(reading.torn) - (entries[-1].number if entries else 0)
     return entries
 
 
@@ -296,33 +278,17 @@ def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entr
     """The lines of the session as they were written; those of others, or lines that stand elsewhere, are reported."""
     if entries and not session:
         session = Counter(entry.session for entry in entries).most_common(1)[0][0]
-    by_seq: dict[int, Entry] = {}
-    foreign: list[Entry] = []
-    ahead = 0
-    for entry in entries:
-        if entry.session != session:
-            foreign.append(entry)
-            ahead -= 1
-        elif entry.seq in by_seq:
-            reading.faults.append(f"line {entry.number} stands twice: it is numbered {entry.seq}")
-            ahead -= 1
-        else:
-            by_seq[entry.seq] = entry
-            if entry.seq - entry.number != ahead:
-                what = f"is numbered {entry.seq}: lines before it are missing or out of place"
-                reading.faults.append(f"line {entry.number} {what}")
-            ahead = entry.seq - entry.number
-    if foreign:
-        of = f"is of another session, {foreign[0].session[:100]!r}"
-        reading.faults.append(f"line {foreign[0].number} {of}{_more(foreign)}")
+    own = [entry for entry in entries if entry.session == session]
+    for entry in [entry for entry in entries if entry.session != session][:1]:
+        reading.faults.append(f"line {entry.number} is of another session, {entry.session[:100]!r}")
+    for entry in [entry for entry in own if entry.seq != entry.number][:1]:
+        what = "lines before it are missing, out of place or stand twice"
+        reading.faults.append(f"line {entry.number} is numbered {entry.seq}: {what}")
+    by_seq = {entry.seq: entry for entry in own}
     last = max(by_seq, default=0)
     reading.next_seq = last + 1
-    reading.missing = last - len(by_seq)
+    reading.missing += last - len(by_seq)
     return [by_seq[seq] for seq in sorted(by_seq)]
-
-
-def _more(problems: Sequence[object]) -> str:
-    return f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
 
 
 class Journal:

@@ -50,27 +50,27 @@ Record = tuple[Schema | None, Channel, Message]
 class McapFile:
     """A file by the index at its end, or, where that is damaged, record by record as far as that goes.
 
-    Raises `InputError` where it cannot be opened; damage is collected in `damage`.
+    With `check` all of it is read once, every CRC is checked, and messages are counted; none is decoded. Raises
+    `InputError` where it cannot be opened; damage is collected in `damage`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, check: bool = False) -> None:
         self.path = path
         self.damage: list[str] = []
         """Descriptions of what is damaged, as far as it was read."""
         self.index: Summary | None = None
         """None if it is damaged."""
         self._chunks: dict[int, ChunkIndex | None] = {}
-        """Known chunks by their place, in the order in which they were written; None without an index."""
-        self._contents: dict[int, Counter[int]] | None = None
-        """Messages by channel in each sound chunk, once `check` has read them."""
+        """Known chunks by their place, in the order in which they were written, if all was checked only the sound ones;
+        None without an index."""
         self.counts: Counter[str] = Counter()
-        """Messages by topic in the sound chunks, once `check` has read them."""
+        """Messages by topic in the sound chunks, if all was checked."""
         self.channels: dict[int, tuple[Schema | None, Channel]] = {}
-        """Channels by number, each with its schema; without an index those that `check` found."""
+        """Channels by number, each with its schema; without an index those of the sound chunks, if all was checked."""
         self.header: dict[str, Any] | None = None
         """Values of the header, also where they do not match their CRC; None for a file without a header."""
         self.session = ""
-        """Id of the session of a header that matches its CRC."""
+        """Id of the session of a header that matches its CRC; empty where none does."""
         self._attached: list[int] = []
         with opened(path) as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -78,77 +78,73 @@ class McapFile:
             with self._noting("its index"):
                 self.index = _summary(file)
             self._list(file)
+            if check:
+                self._check(file)
+
+    def sound(self) -> McapFile:
+        """The file itself. Raises `InputError` if it is none of MCAP, `SessionDamaged` if anything is damaged."""
+        if self.damage:
+            kind = InputError if self.damage[0] == _NOT_MCAP else SessionDamaged
+            raise kind(self.path, f"cannot read: {'; '.join(self.damage)}")
+        return self
 
     @property
-    def stated(self) -> dict[str, int]:
+    def stated(self) -> Counter[str]:
         """Messages by topic according to the index, without reading them; empty if it is damaged."""
         statistics = None if self.index is None else self.index.statistics
         counts = {} if statistics is None else statistics.channel_message_counts
-        return dict(self._by_topic({number: count for number, count in counts.items() if number in self.channels}))
-
-    def may_be_of(self, session: str) -> bool:
-        """Whether the file is of this session, as far as its header can be read."""
-        return self.session in ("", session)
+        return self._by_topic({number: count for number, count in counts.items() if number in self.channels})
 
     def messages(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
         """Messages in the order in which they were written, all or those on some topics, every CRC checked.
 
         They are not sorted by log time: a stroke would precede its still if the host's clock was set back between them.
-        Chunks that `check` found damaged are left out. Raises `SessionDamaged`.
+        If all was checked, damaged chunks are left out. Raises `SessionDamaged`.
         """
         wanted = None if topics is None else frozenset(topics)
         numbers = {n for n, (_, channel) in self.channels.items() if wanted is None or channel.topic in wanted}
         with self._reading() as file:
             for offset, index in self._chunks.items():
-                if self._contents is None:
-                    inside = index.message_index_offsets if index is not None else None
-                else:
-                    inside = self._contents.get(offset, Counter[int]())
-                if inside is not None and numbers.isdisjoint(inside):
+                inside = {} if index is None else index.message_index_offsets
+                if inside and numbers.isdisjoint(inside):
                     continue
                 for message in _messages(_chunk(file, offset)):
                     schema, channel = self.channels[message.channel_id]
                     if message.channel_id in numbers:
                         yield schema, channel, message
 
-    def packed_chunks(self) -> Iterator[tuple[bytes, ChunkIndex, Counter[int]]]:
-        """Every chunk as its bytes, with the indexes of its messages, and its messages by channel, as `check` read it.
-
-        Raises `SessionDamaged`.
-        """
+    def packed_chunks(self) -> Iterator[tuple[bytes, ChunkIndex]]:
+        """Every chunk as its bytes, with the indexes of its messages. Raises `SessionDamaged`."""
         with self._reading() as file:
-            for offset, counts in (self._contents or {}).items():
-                index = self._chunks[offset]
+            for offset, index in self._chunks.items():
                 size = 0 if index is None else index.chunk_length + index.message_index_length
                 if index is None or size > _size(file):
                     raise McapError("a chunk is not as the index states")
                 file.seek(offset)
-                yield file.read(size), index, counts
+                yield file.read(size), index
 
     def attachments(self) -> Iterator[Attachment]:
-        """Attached files, byte for byte, but those that `check` found damaged. Raises `SessionDamaged`."""
+        """Attached files, byte for byte; if all was checked, but those that are damaged. Raises `SessionDamaged`."""
         with self._reading() as file:
             for offset in self._attached:
                 yield _attachment(file, offset)
 
-    def check(self) -> None:
-        """Check every CRC in the file and count its messages; none is decoded."""
-        attached, self._attached, self._contents = self._attached, [], {}
-        with opened(self.path) as file:
-            for offset in self._chunks:
-                with self._noting(f"the chunk at byte {offset}"):
-                    counts = self._read_chunk(file, offset)
-                    self.counts += self._by_topic(counts)
-                    self._contents[offset] = counts
-            for offset in attached:
-                with self._noting(f"the attachment at byte {offset}"):
-                    _attachment(file, offset)
-                    self._attached.append(offset)
-            if not self.damage:
-                with self._noting("its data"):
-                    _check_data(file)
-        if not self.damage and self.stated != dict(self.counts):
-            self.damage.append(f"holds {dict(self.counts)}, but its index says {self.stated}")
+    def _check(self, file: IO[bytes]) -> None:
+        attached, self._attached = self._attached, []
+        chunks, self._chunks = self._chunks, {}
+        for offset, index in chunks.items():
+            with self._noting(f"the chunk at byte {offset}"):
+                self.counts += self._by_topic(self._read_chunk(file, offset))
+                self._chunks[offset] = index
+        for offset in attached:
+            with self._noting(f"the attachment at byte {offset}"):
+                _attachment(file, offset)
+                self._attached.append(offset)
+        if not self.damage:
+            with self._noting("its data"):
+                _check_data(file)
+        if not self.damage and self.stated != self.counts:
+            self.damage.append(f"holds {dict(self.counts)}, but its index says {dict(self.stated)}")
 
     def _list(self, file: IO[bytes]) -> None:
         """Take over what the index lists, whose channels a lost chunk may have held; without one, look for it."""
@@ -233,36 +229,12 @@ class McapFile:
                 raise SessionDamaged(self.path, f"cannot read: {in_one_line(error)}") from None
 
 
-def open_mcap(path: Path) -> McapFile:
-    """A finished file, by its index. Raises `InputError` for any other file, `SessionDamaged` for a damaged one."""
-    return _undamaged(McapFile(path))
-
-
-def scan(path: Path) -> McapFile:
-    """Read a file once, every CRC checked. Raises `InputError` where it cannot be opened; damage is never raised."""
-    found = McapFile(path)
-    found.check()
-    return found
-
-
-def scan_sound(path: Path) -> McapFile:
-    """Like `scan`, but raises `SessionDamaged` where anything is damaged."""
-    return _undamaged(scan(path))
-
-
 def opened(path: Path) -> IO[bytes]:
     """Open a recording. Raises `InputError`."""
     try:
         return path.open("rb")
     except OSError as error:
         raise InputError(path, f"cannot open: {in_one_line(error)}") from None
-
-
-def _undamaged(found: McapFile) -> McapFile:
-    if found.damage:
-        kind = InputError if found.damage[0] == _NOT_MCAP else SessionDamaged
-        raise kind(found.path, f"cannot read: {'; '.join(found.damage)}")
-    return found
 
 
 def _summary(file: IO[bytes]) -> Summary:

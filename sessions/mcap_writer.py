@@ -25,27 +25,15 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 import zstandard
+from mcap import records as mcap
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    McapRecord,
-    Message,
-    Schema,
-    Statistics,
-)
-from mcap.records import Header as FileHeader
+from mcap.records import Channel, ChunkIndex, McapRecord, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from brushloop.sessions.disk import file_sha256, fsync_folder, sync
 from brushloop.sessions.errors import SessionDamaged, SessionError, disk_error
-from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, scan_sound
+from brushloop.sessions.mcap_file import MESSAGE_START, RECORD_START, McapFile
 from brushloop.sessions.records import HEADER_FILE, Event, Header, Topic
 
 if TYPE_CHECKING:
@@ -96,7 +84,7 @@ def channel_of(topic: Topic, kind: type[Event | Protobuf]) -> tuple[Schema, Chan
 class McapWriter:
     """Writes one file, from its header to `finish`. What is buffered reaches the file with `flush`. Never fsyncs."""
 
-    def __init__(self, file: IO[bytes], library: str) -> None:
+    def __init__(self, file: IO[bytes], header: Header) -> None:
         self._file = file
         self._compressor = zstandard.ZstdCompressor(level=1)  # smaller here than level 3, and faster
         self._records = bytearray()
@@ -106,26 +94,19 @@ class McapWriter:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._chunks: list[ChunkIndex] = []
-        self._attachments: list[AttachmentIndex] = []
+        self._attachments: list[mcap.AttachmentIndex] = []
         self._counts: Counter[int] = Counter()
         self._crc = 0
         """Of everything written to the file so far."""
         self._write(MCAP0_MAGIC)
-        self._write(_packed(FileHeader(profile="", library=library)))
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Number of messages by topic, without those of the chunk in progress."""
-        counts: Counter[str] = Counter()
-        for number, count in self._counts.items():
-            counts[self.channels[number].topic] += count
-        return counts
+        self._write(_packed(mcap.Header(profile="", library=header.software)))
+        self.add_attachment(HEADER_FILE, header.model_dump_json().encode())
 
     def add_attachment(self, name: str, data: bytes) -> None:
         """Write an attached file, JSON or TOML."""
         offset, media_type = self._file.tell(), f"application/{Path(name).suffix[1:]}"
-        length = self._write(_packed(Attachment(0, 0, name, media_type, data)))
-        self._attachments.append(AttachmentIndex(offset, length, 0, 0, len(data), name, media_type))
+        length = self._write(_packed(mcap.Attachment(0, 0, name, media_type, data)))
+        self._attachments.append(mcap.AttachmentIndex(offset, length, 0, 0, len(data), name, media_type))
 
     def add_channel(self, schema: Schema | None, channel: Channel) -> None:
         """Put a channel and its schema into the chunk in progress; their numbers must be free."""
@@ -168,20 +149,21 @@ class McapWriter:
 
     def copy_file(self, path: Path) -> None:
         """Add all chunks of a file of the same session as they are, every CRC checked. Raises `SessionDamaged`."""
-        source = scan_sound(path)
+        source = McapFile(path, check=True).sound()
         for number, (schema, channel) in source.channels.items():
             if number not in self.channels:
                 self.add_channel(schema, channel)
             elif self.channels[number].topic != channel.topic:
                 raise SessionDamaged(path, f"has {channel.topic} under the number of {self.channels[number].topic}")
         self._end_chunk()
-        for data, index, counts in source.packed_chunks():
+        for data, index in source.packed_chunks():
             shift = self._file.tell() - index.chunk_start_offset
             self._write(data)
             offsets = {number: at + shift for number, at in index.message_index_offsets.items()}
             start = index.chunk_start_offset + shift
             self._chunks.append(replace(index, chunk_start_offset=start, message_index_offsets=offsets))
-            self._counts.update(counts)
+        for number, (_schema, channel) in source.channels.items():
+            self._counts[number] += source.counts[channel.topic]
 
     def flush(self) -> None:
         """End the chunk in progress unless it has no messages, and hand everything to the operating system."""
@@ -191,9 +173,9 @@ class McapWriter:
     def finish(self) -> None:
         """End the chunk in progress and write the index. The file stays open."""
         self._end_chunk()
-        self._write(_packed(DataEnd(self._crc)))
+        self._write(_packed(mcap.DataEnd(self._crc)))
         start = self._file.tell()
-        statistics = Statistics(
+        statistics = mcap.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self.channels),
             channel_message_counts=dict(self._counts),
@@ -207,9 +189,9 @@ class McapWriter:
         summary: list[McapRecord] = [*self.schemas.values(), *self.channels.values(), statistics]
         summary += [*self._chunks, *self._attachments]
         data = b"".join(map(_packed, summary))
-        footer = _packed(Footer(start, 0, 0))[:-4]  # its CRC covers all but itself
+        footer = _packed(mcap.Footer(start, 0, 0))[:-4]  # its CRC covers all but itself
         self._write(data)
-        self._write(_packed(Footer(start, 0, zlib.crc32(footer, zlib.crc32(data)))))
+        self._write(_packed(mcap.Footer(start, 0, zlib.crc32(footer, zlib.crc32(data)))))
         self._write(MCAP0_MAGIC)
 
     def _end_chunk(self) -> None:
@@ -219,7 +201,7 @@ class McapWriter:
         first_ns = min(min(index[::2]) for index in self._index.values())
         last_ns = max(max(index[::2]) for index in self._index.values())
         packed = self._compressor.compress(records)
-        chunk = _packed(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(records), len(records)))
+        chunk = _packed(mcap.Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(records), len(records)))
         length = self._write(chunk)
         at, offsets = start + length, dict[int, int]()
         for number, index in self._index.items():
@@ -255,18 +237,11 @@ def _packed(record: McapRecord) -> bytes:
     return builder.end()
 
 
-def start_mcap(file: IO[bytes], header: Header) -> McapWriter:
-    """Begin an MCAP file with the session's header."""
-    writer = McapWriter(file, header.software)
-    writer.add_attachment(HEADER_FILE, header.model_dump_json().encode())
-    return writer
-
-
 @contextlib.contextmanager
 def new_mcap(path: Path, header: Header, attachments: Mapping[str, bytes]) -> Generator[McapWriter]:
     """A new file to copy messages into; finished and durable after the block. Raises `OSError`."""
     with path.open("xb") as file:
-        writer = start_mcap(file, header)
+        writer = McapWriter(file, header)
         for name, data in attachments.items():
             writer.add_attachment(name, data)
         yield writer
@@ -280,8 +255,7 @@ class SegmentWriter:
     Raises `SessionError` where either file exists: recordings are never overwritten.
     """
 
-    def __init__(self, final: Path, header: Header, *first: Outgoing) -> None:
-        """`first` are the first messages of the file."""
+    def __init__(self, final: Path, header: Header) -> None:
         self.final = final
         self._part = final.with_name(final.name + ".part")
         self._header = header
@@ -289,8 +263,6 @@ class SegmentWriter:
         self._error: Exception | None = None
         self.counts: Counter[str] = Counter()
         """Messages by topic, those in the queue among them."""
-        for outgoing in first:
-            self._put(outgoing)
         try:
             if final.exists():
                 raise FileExistsError
@@ -307,9 +279,6 @@ class SegmentWriter:
         self._raise_error()
         if self._queue.qsize() >= QUEUE_LIMIT:
             raise SessionError(self._part, f"{QUEUE_LIMIT} messages wait: the disk does not keep up")
-        self._put(outgoing)
-
-    def _put(self, outgoing: Outgoing) -> None:
         self.counts[outgoing.topic] += 1
         self._queue.put(outgoing)
 
@@ -347,7 +316,7 @@ class SegmentWriter:
             self._error = error
 
     def _write_all(self) -> None:
-        writer = start_mcap(self._file, self._header)
+        writer = McapWriter(self._file, self._header)
         writer.flush()
         flushed = time.monotonic()
         while True:

@@ -7,9 +7,8 @@ session stays byte for byte as recorded. Photographs are read one at a time.
 
 from __future__ import annotations
 
-import statistics
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -18,9 +17,9 @@ from pydantic import ValidationError
 
 from brushloop.sessions.disk import SEGMENT_NAME, check_companions, check_folder, file_sha256
 from brushloop.sessions.errors import InputError, SessionDamaged, in_one_line
-from brushloop.sessions.events import Begin, CaptureResult, Remark, StepEvent
+from brushloop.sessions.events import Begin, Remark, StepEvent
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, replay, undamaged
-from brushloop.sessions.mcap_file import McapFile, Record, open_mcap
+from brushloop.sessions.mcap_file import McapFile, Record
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.records import Event, Header, Stroke, Topic
 
@@ -29,15 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _E = TypeVar("_E", bound=Event)
-_K = TypeVar("_K")
 REMARKS_NAME = "remarks.jsonl"
-LEAST_S = 2.0
-"""Smallest difference between waits that can be visible in the ink, s."""
-SPREADS = 3.0
-"""Median absolute deviations within which waits count as alike."""
-LEAST_STROKES = 4
-"""Number of strokes below which no wait can be called an outlier."""
-
 MAX_ATTACHMENT_BYTES = 1024 * 1024
 STILLS_KEPT = 8
 """Stills kept in memory: a stroke refers to one shortly before it, so older ones can be dropped."""
@@ -69,7 +60,7 @@ class Recording:
         if state is not None and state.is_open:
             raise InputError(path, "is still open: run the same `brushloop collect` again to finish it")
         self.path = find_recording(path, state)
-        self._file = open_mcap(self.path)
+        self._file = McapFile(self.path).sound()
         self.header = parse_header(self._file)
 
     @property
@@ -78,7 +69,7 @@ class Recording:
         return file_sha256(self.path)
 
     @property
-    def counts(self) -> dict[str, int]:
+    def counts(self) -> Counter[str]:
         """Messages by topic according to the index, without reading them."""
         return self._file.stated
 
@@ -88,10 +79,6 @@ class Recording:
             if attachment.name == name and len(attachment.data) <= MAX_ATTACHMENT_BYTES:
                 return attachment.data
         raise InputError(self.path, f"holds no {name} of at most {MAX_ATTACHMENT_BYTES} bytes")
-
-    def strokes(self) -> int:
-        """Number of strokes according to the index, without reading them."""
-        return self.counts.get(Topic.STROKE, 0)
 
     def stroke_records(self) -> Iterator[Stroke]:
         """Strokes as they were commanded, without their stills. Raises `SessionDamaged`."""
@@ -191,33 +178,6 @@ def _event(path: Path, kind: type[_E], data: bytes) -> _E:
         return kind.model_validate_json(data)
     except ValidationError as error:
         raise SessionDamaged(path, in_one_line(error)) from None
-
-
-def waits_of(state: RunState) -> dict[int, float]:
-    """Seconds from dip to touch, by number of the still that shows the stroke; of those that were measured."""
-    captures = state.results(CaptureResult)
-    return {one.still: one.press.dip_to_touch_s for one in captures if one.press.dip_to_touch_s is not None}
-
-
-def limit_s(waits: Iterable[float]) -> tuple[float, float] | None:
-    """Median of a session's waits and the distance from it that counts as alike; None for too few waits."""
-    known = list(waits)
-    if len(known) < LEAST_STROKES:
-        return None
-    median = statistics.median(known)
-    return median, max(LEAST_S, SPREADS * statistics.median(abs(wait - median) for wait in known))
-
-
-def unlike(waits: Mapping[_K, float]) -> dict[_K, str]:
-    """Reason for each stroke whose wait differs from the others'."""
-    if (limit := limit_s(waits.values())) is None:
-        return {}
-    median, most_s = limit
-    return {
-        key: f"touched the paper {wait:.1f} s after its dip, the others after {median:.1f} s"
-        for key, wait in waits.items()
-        if abs(wait - median) > most_s
-    }
 
 
 def add_remark(folder: Path, remark: Remark) -> None:

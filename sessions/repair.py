@@ -14,16 +14,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 
 from pydantic import ValidationError
 
 from brushloop.sessions import events
-from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside, sync
+from brushloop.sessions.disk import file_sha256, fsync_folder, holds, set_aside, write_durably
 from brushloop.sessions.errors import SessionDamaged, disk_error
 from brushloop.sessions.events import Begin, Done, Event, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, encode_line, read_header
-from brushloop.sessions.mcap_file import McapFile, Record, scan, scan_sound
+from brushloop.sessions.mcap_file import McapFile, Record
 from brushloop.sessions.mcap_writer import Outgoing, new_mcap
 from brushloop.sessions.recording import check_path, find_recording, parse_header
 from brushloop.sessions.records import HEADER_FILE, Header, Stroke, Topic
@@ -54,11 +53,6 @@ class Report:
     strokes: int = 0
     """Finished strokes in the session after the repair."""
 
-    @property
-    def lossless(self) -> bool:
-        """Whether everything recorded was recovered."""
-        return not self.lost
-
 
 def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
     """Repair a session's folder, or one MCAP file. Raises `SessionDamaged` if nothing can be rebuilt.
@@ -81,21 +75,34 @@ def repair_session(path: Path, now_ns: Callable[[], int]) -> Report:
 
 
 def _repair_file(path: Path) -> Report:
-    """Repair one MCAP file: an import, or a merged file without its session. Raises `SessionDamaged`."""
+    """Repair one MCAP file, an import or a merged file without its session, from what can be read of it.
+
+    Raises `SessionDamaged`.
+    """
     verdict = verify_session(path)
     report = Report(path.name, strokes=verdict.strokes)
     if verdict.sound:
         return report
-    file = scan(path)
+    file, lost = McapFile(path, check=True), report.lost
     if file.header is None:
         raise SessionDamaged(path, "has lost its header; it cannot be repaired")
     if not file.session:
-        report.lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
-    kept, counts, lost = _rewrite(file, parse_header(file))
-    why = "; ".join(finding.what for finding in verdict.findings)
+        lost.append("the certainty of its header: it does not match its CRC, and is kept as it was read")
+    strokes: dict[str, bool] = {}
+    attached = {one.name: one.data for one in file.attachments() if one.name != HEADER_FILE}
+    kept, counts = _replace_damaged(path, parse_header(file), _whole(file, strokes), attached)
+    why = "; ".join(what for problems in verdict.findings.values() for what in problems)
     report.did.append(f"wrote {path.name} again from what can be read of it: {why}{kept}")
-    report.lost += lost
     report.strokes = counts.get(Topic.STROKE, 0)
+    lost += [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
+    gone = file.stated - Counter(counts)
+    gone[Topic.STROKE] -= list(strokes.values()).count(False)
+    lost += [f"messages on {topic}: {count}" for topic, count in gone.items() if count > 0]
+    if file.index is None and len(file.damage) > 1:
+        lost.append("anything else behind the damage: without its index its amount is unknown")
+    if file.index is not None:
+        names = {one.name for one in file.index.attachment_indexes} - {HEADER_FILE, *attached}
+        lost += [f"the attached file {name}" for name in sorted(names)]
     return report
 
 
@@ -105,7 +112,7 @@ class _FolderRepair:
     def __init__(self, evidence: Evidence, now_ns: Callable[[], int]) -> None:
         self._evidence, self._verdict = evidence, judge(evidence)
         self._folder, self._final, self._state = evidence.folder, evidence.final, evidence.state
-        self._final_problems = [one.what for one in self._verdict.findings if one.file == self._final.name]
+        self._final_problems = self._verdict.findings.get(evidence.final.name, [])
         self._now_ns = now_ns
         self._header = read_header(evidence.folder, evidence.state)
         self._report = Report(evidence.folder.name)
@@ -188,15 +195,14 @@ class _FolderRepair:
         # Those kept aside come last: what was replaced just now is among them.
         for pattern in ("*.mcap", "*.mcap.damaged-*") if steps else ():
             for path in sorted(self._folder.glob(pattern)):
-                file = scan(path)
-                if file.may_be_of(self._evidence.session):
+                file = McapFile(path, check=True)
+                if file.session in ("", self._evidence.session):
                     yield from _in_steps(file, steps)
 
     def _write_again(self, step: Done, records: list[Record]) -> None:
         path, why = self._folder / step.file, self._verdict.damaged[step.file]
-        begin = [step_message(self._begins[step.file])] if step.file in self._begins else []
-        end = step_message(step.model_copy(update={"sha256": ""}))
-        kept, counts = _replace_damaged(path, self._header, [*begin, *records, end])
+        begin, end = self._begins[step.file], step.model_copy(update={"sha256": ""})
+        kept, counts = _replace_damaged(path, self._header, [step_message(begin), *records, step_message(end)])
         missing = dict(Counter(step.counts) - Counter(counts))
         t_ns, sha256 = self._now_ns(), file_sha256(path)
         self._log(events.Repaired(t_ns=t_ns, file=step.file, sha256=sha256, counts=counts, missing=missing, why=why))
@@ -262,49 +268,27 @@ def _whole(file: McapFile, strokes: dict[str, bool]) -> Iterator[Record]:
         yield schema, channel, message
 
 
-def _rewrite(file: McapFile, header: Header) -> tuple[str, dict[str, int], list[str]]:
-    """Write a damaged recording again from what can be read of it.
-
-    Returns where the damaged file is kept, the messages by topic, and descriptions of what was lost.
-    """
-    strokes: dict[str, bool] = {}
-    attached = {one.name: one.data for one in file.attachments() if one.name != HEADER_FILE}
-    kept, counts = _replace_damaged(file.path, header, _whole(file, strokes), attached)
-    lost = [f"stroke {name}: its photograph is lost" for name, whole in strokes.items() if not whole]
-    gone = Counter(file.stated) - Counter(counts)
-    unknown = gone.pop(Topic.STROKE, 0) - len(lost)
-    if unknown > 0:
-        lost.append(f"strokes that cannot be read: {unknown}")
-    lost += [f"messages on {topic}: {count}" for topic, count in gone.items()]
-    if file.index is None and len(file.damage) > 1:
-        lost.append("anything else behind the damage: without its index its amount is unknown")
-    if file.index is not None:
-        names = {one.name for one in file.index.attachment_indexes} - {HEADER_FILE, *attached}
-        lost += [f"the attached file {name}" for name in sorted(names)]
-    return kept, counts, lost
-
-
 def _in_steps(file: McapFile, damaged: Mapping[object, Done]) -> Iterator[tuple[Done, list[Record]]]:
     """What is readable of damaged steps in a file, without the messages of their begin and end.
 
     They are found by their key and attempt, or by the number of a still: their begin, their end or both may be lost.
     """
-    records, step = list[Record](), None
-    for record in [*file.messages(), None]:
-        event = parsed_step(record[2].data) if record is not None and record[1].topic == Topic.STEP else None
-        if record is None or isinstance(event, Begin):
+    records, step, over = list[Record](), None, False
+    for record in file.messages():
+        _schema, channel, message = record
+        event = parsed_step(message.data) if channel.topic == Topic.STEP else None
+        if over or isinstance(event, Begin):
             if step is not None:
                 yield step, records
             records, step = [], None
+        over = isinstance(event, Done)
         if event is not None:
             step = step or damaged.get((event.key, event.attempt))
-        elif record is not None:
+        else:
             records.append(record)
-            step = step or (damaged.get(record[2].sequence) if record[1].topic == Topic.STILL else None)
-        if isinstance(event, Done):
-            if step is not None:
-                yield step, records
-            records, step = [], None
+            step = step or (damaged.get(message.sequence) if channel.topic == Topic.STILL else None)
+    if step is not None:
+        yield step, records
 
 
 def _worth(step: Done, records: list[Record]) -> tuple[bool, int]:
@@ -322,7 +306,7 @@ def _replace_damaged(
     path: Path,
     header: Header,
     messages: Iterable[Record | Outgoing],
-    attached: Mapping[str, bytes] = MappingProxyType({}),
+    attached: Mapping[str, bytes] | None = None,
 ) -> tuple[str, dict[str, int]]:
     """Write a file with these contents in place of `path`, and keep the damaged one beside it.
 
@@ -332,13 +316,13 @@ def _replace_damaged(
     fresh = path.with_name(path.name + ".repair")
     try:
         fresh.unlink(missing_ok=True)  # left by a killed repair: only a copy
-        with new_mcap(fresh, header, attached) as writer:
+        with new_mcap(fresh, header, attached or {}) as writer:
             for message in messages:
                 if isinstance(message, Outgoing):
                     writer.record(message)
                 else:
                     writer.copy(*message)
-        counts = dict(scan_sound(fresh).counts)
+        counts = dict(McapFile(fresh, check=True).sound().counts)
         return _put_in_place(fresh, path), counts
     except OSError as error:
         raise disk_error(path, "cannot write its repaired copy", error) from error
@@ -347,9 +331,8 @@ def _replace_damaged(
 def _write_anew(path: Path, data: bytes) -> str:
     """Replace a file; returns where the damaged one is kept. Raises `OSError`."""
     fresh = path.with_name(path.name + ".repair")
-    with fresh.open("wb") as file:
-        file.write(data)
-        sync(file)
+    fresh.unlink(missing_ok=True)
+    write_durably(fresh, data)
     return _put_in_place(fresh, path)
 
 

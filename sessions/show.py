@@ -6,9 +6,8 @@ Only journals and headers are read, no photographs.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,19 +23,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, KILLED, RunState, read_head
 from brushloop.sessions.recording import Recording, check_path, merged_file, remarks_of
 from brushloop.sessions.records import Header, Topic
 
-Cell = tuple[float | None, float | None]
-"""H in mm and alpha in degrees; None where a recording does not state them."""
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
-
-
-@dataclass(frozen=True, slots=True)
-class GridCell:
-    """Number of strokes of one (H, alpha); `planned` is None if the protocol does not state it."""
-
-    depth_mm: float | None
-    tilt_deg: float | None
-    strokes: int
-    planned: int | None
 
 
 @dataclass(slots=True)
@@ -57,10 +44,10 @@ class Details:
     """Number of strokes that the run kept and that were not marked bad since."""
     marked_bad: int = 0
     planned: int | None = None
-    grid: list[GridCell] = field(default_factory=list[GridCell])
+    conditions: dict[str, str] = field(default_factory=dict[str, str])
+    """Strokes of each condition, such as `1 of 2` for `H 13 mm, alpha 5 deg`."""
     sheets: dict[int, list[int]] = field(default_factory=dict[int, list[int]])
     """Patches that were pressed on each sheet, or may have been; sheets are counted from 1."""
-    processes: int = 0
     messages: dict[str, int] = field(default_factory=dict[str, int])
     file: str = ""
     """The merged file, once there is one."""
@@ -74,10 +61,10 @@ def details(path: Path) -> Details:
         return _of_journal(path.resolve())
     recording = Recording(path)
     shown = Details(recording.header.session_id, "recording", recording.header)
-    strokes = list(recording.stroke_records())
-    shown.strokes = len(strokes)
-    shown.grid = _grid(((stroke.depth_mm, stroke.tilt_deg) for stroke in strokes), _planned(recording.header))
-    shown.messages = recording.counts
+    pressed = [(stroke.depth_mm, stroke.tilt_deg) for stroke in recording.stroke_records()]
+    shown.strokes = len(pressed)
+    shown.conditions, _ = _conditions(pressed, recording.header)
+    shown.messages = dict(recording.counts)
     shown.file = recording.path.name
     return shown
 
@@ -86,7 +73,6 @@ def _of_journal(folder: Path) -> Details:
     state = replay(folder / JOURNAL_NAME)
     header = read_header(folder, state)
     shown = Details(folder.name, "open" if state.closed is None else "closed", header)
-    shown.processes = state.processes
     shown.finished = dict(Counter(str(step.kind) for step in state.files.values()))
     shown.void, shown.next = _cut(state)
     shown.messages = state.counts()
@@ -95,11 +81,9 @@ def _of_journal(folder: Path) -> Details:
     shown.sheets.setdefault(state.sheet + 1, [])
     bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
     kept = [capture for capture in state.results(CaptureResult) if capture.kept]
-    counted = [capture.press.condition for capture in kept if capture.still not in bad]
-    shown.strokes, shown.marked_bad = len(counted), len(kept) - len(counted)
-    planned = _planned(header)
-    shown.grid = _grid(((condition.depth_mm, condition.tilt_deg) for condition in counted), planned)
-    shown.planned = sum(planned.values()) if planned else None
+    pressed = [capture.press.condition for capture in kept if capture.still not in bad]
+    shown.strokes, shown.marked_bad = len(pressed), len(kept) - len(pressed)
+    shown.conditions, shown.planned = _conditions([(one.depth_mm, one.tilt_deg) for one in pressed], header)
     shown.repairs = [f"{repair.event} {repair.file}: {repair.why}" for repair in state.repairs]
     final = merged_file(folder, state)
     if state.closed is not None and final.is_file():
@@ -124,19 +108,20 @@ class _GridPlan(BaseModel):
     repeats: Annotated[int, Field(ge=0)]
 
 
-def _planned(header: Header) -> dict[Cell, int]:
-    """Strokes that a grid plans for each condition; empty for any other recording."""
+def _conditions(pressed: list[tuple[float | None, float | None]], header: Header) -> tuple[dict[str, str], int | None]:
+    """Strokes by depth and tilt, and how many a grid plans in all; None for any other recording."""
+    planned: dict[tuple[float | None, float | None], str] = {}
     try:
         plan = _GridPlan.model_validate_json(header.protocol)
+        for depth_mm in plan.depths_mm:
+            planned |= {(depth_mm, tilt_deg): f" of {plan.repeats}" for tilt_deg in plan.tilts_deg}
+        total = plan.repeats * len(planned)
     except ValidationError:
-        return {}
-    return {(depth, tilt): plan.repeats for depth in plan.depths_mm for tilt in plan.tilts_deg}
-
-
-def _grid(pressed: Iterable[Cell], planned: dict[Cell, int]) -> list[GridCell]:
-    have = Counter(pressed)
-    cells = sorted({*have, *planned}, key=lambda cell: (cell[0] is None, cell[0] or 0.0, cell[1] or 0.0))
-    return [GridCell(*cell, have[cell], planned.get(cell)) for cell in cells]
+        total = None
+    counts = Counter(pressed)
+    known = sorted({*counts, *planned}, key=lambda pair: (pair[0] is None, pair[0] or 0.0, pair[1] or 0.0))
+    names = {pair: "not given" if None in pair else f"H {pair[0]:g} mm, alpha {pair[1]:g} deg" for pair in known}
+    return {names[pair]: f"{counts[pair]}{planned.get(pair, '')}" for pair in known}, total
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,15 +157,16 @@ def _summary(folder: Path) -> Summary | None:
         return None
     recording = Recording(folder)
     state_name = "imported" if recording.header.source.imported else "closed"
-    return Summary(folder.name, state_name, recording.header.source, recording.strokes(), recording.path.name)
+    return Summary(
+        folder.name, state_name, recording.header.source, recording.counts[Topic.STROKE], recording.path.name
+    )
 
 
 def renderables(details: Details) -> Iterator[RenderableType]:
     """Parts to print, top to bottom."""
     yield _facts(details)
-    if details.grid:
-        yield _grid_table(details)
-    for title, lines in (("Cut attempts", details.void), ("Repaired", details.repairs)):
+    strokes = [f"{name}: {count}" for name, count in details.conditions.items()]
+    for title, lines in (("Strokes", strokes), ("Cut attempts", details.void), ("Repaired", details.repairs)):
         if lines:
             yield Text(title, "bold")
             yield from (f"  {line}" for line in lines)
@@ -198,37 +184,13 @@ def _facts(details: Details) -> Table:
     if details.next:
         table.add_row("next", f"{details.next} (under way when the last process ended)")
     for sheet, used_patches in details.sheets.items():
-        table.add_row(f"sheet {sheet}", f"{len(used_patches)} patches used: {ranges(used_patches)}")
+        table.add_row(f"sheet {sheet}", f"{len(used_patches)} patches used")
     for name in DEVICES:
         if value := getattr(details.header, name):
             table.add_row(name.replace("_", " "), value)
-    processes = f", {details.processes} processes" if details.processes else ""
-    table.add_row("recorded by", f"{details.header.software}, schema {details.header.schema_version}{processes}")
+    table.add_row("recorded by", f"{details.header.software}, schema {details.header.schema_version}")
     messages = ", ".join(f"{count} {topic}" for topic, count in sorted(details.messages.items()))
     table.add_row("messages", messages or "none")
     if details.file:
         table.add_row("recording", details.file)
     return table
-
-
-def _grid_table(details: Details) -> Table:
-    depths_mm = dict.fromkeys(cell.depth_mm for cell in details.grid)
-    tilts_deg = sorted({cell.tilt_deg for cell in details.grid}, key=lambda tilt: (tilt is None, tilt or 0.0))
-    strokes = {
-        (cell.depth_mm, cell.tilt_deg): str(cell.strokes) if cell.planned is None else f"{cell.strokes}/{cell.planned}"
-        for cell in details.grid
-    }
-    table = Table("H \\ alpha", *(_number(tilt, "°") for tilt in tilts_deg), title="Strokes per cell of the grid")
-    for depth in depths_mm:
-        table.add_row(_number(depth, " mm"), *(strokes.get((depth, tilt), "") for tilt in tilts_deg))
-    return table
-
-
-def ranges(patches: list[int]) -> str:
-    """Patches as `0-3, 7`, with consecutive numbers joined."""
-    runs = [[patch for _, patch in run] for _, run in groupby(enumerate(patches), lambda pair: pair[1] - pair[0])]
-    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs) or "none"
-
-
-def _number(value: float | None, unit: str) -> str:
-    return "not given" if value is None else f"{value:g}{unit}"

@@ -5,7 +5,6 @@ The engine writes only through this.
 
 from __future__ import annotations
 
-import datetime as dt
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,26 +24,15 @@ from brushloop.sessions.disk import (
     write_durably,
 )
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError, SessionLocked, disk_error
-from brushloop.sessions.events import (
-    Begin,
-    Done,
-    Event,
-    Press,
-    StepEvent,
-    StepKind,
-    StepResult,
-    serial_of,
-)
+from brushloop.sessions.events import Begin, Done, Event, Press, StepEvent, StepKind, StepResult, serial_of
 from brushloop.sessions.journal import JOURNAL_NAME, Journal, RunState, read_header, replay
-from brushloop.sessions.mcap_file import scan_sound
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter, new_mcap
 from brushloop.sessions.recording import merged_file
 from brushloop.sessions.records import REPAIRS_FILE, Header, Topic
 
 STEP_BYTES = 64 * 1024 * 1024
 """Room needed on the disk before a step begins: more than the photographs and poses of any one step."""
-Snapshots = dict[str, str]
-"""File name -> text of the configuration that a session was started with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,44 +46,39 @@ class Attempt:
 
 
 class SessionStore:
-    """One session open for writing, under its lock; without a header, an existing one is resumed.
+    """One open session, under its lock; opening it resumes it.
 
-    A new session needs a header and `snapshots`, the texts of its configuration, which the journal keeps as well.
-    Raises `InputError` if no session can be resumed, and `SessionDamaged` (its note names `brushloop sessions repair`).
+    Raises `InputError` if it cannot be resumed, and `SessionDamaged` (its note names `brushloop sessions repair`).
     """
 
-    def __init__(
-        self, folder: Path, header: Header | None, now_ns: Callable[[], int], snapshots: Snapshots | None = None
-    ) -> None:
+    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
         self.folder = folder
         self._now_ns = now_ns
-        if header is None:
-            if not (folder / JOURNAL_NAME).is_file():
-                raise InputError(folder, f"holds no {JOURNAL_NAME}: not a session that was collected")
-            check_folder(folder)
+        if not (folder / JOURNAL_NAME).is_file():
+            raise InputError(folder, f"holds no {JOURNAL_NAME}: not a session that was collected")
+        check_folder(folder)
         self._lock = lock(folder)
         self._journal: Journal | None = None
         try:
-            self.state = RunState() if header is not None else replay(folder / JOURNAL_NAME)
+            self.state = replay(folder / JOURNAL_NAME)
             if self.state.closed is not None:
                 raise InputError(folder, "is closed; a finished recording is never changed")
-            self.header = header or read_header(folder, self.state)
-            self._journal = Journal(folder / JOURNAL_NAME, self.header.session_id)
-            if header is not None:
-                self._log(events.Open(t_ns=now_ns(), header=header, snapshots=snapshots or {}))
+            self.header = read_header(folder, self.state)
             self._check_serials()
+            self._journal = Journal(folder / JOURNAL_NAME, self.header.session_id)
             self._log(events.Process(t_ns=now_ns()))
-        except SessionDamaged as error:
-            error.add_note(f"Try `brushloop sessions repair {folder}`.")
-            self.release()
-            raise
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, SessionDamaged):
+                error.add_note(f"Try `brushloop sessions repair {folder}`.")
             self.release()
             raise
 
     @classmethod
-    def create(cls, folder: Path, header: Header, snapshots: Snapshots, now_ns: Callable[[], int]) -> SessionStore:
-        """Make a new session folder. Raises `InputError` where it exists."""
+    def create(cls, folder: Path, header: Header, snapshots: dict[str, str], now_ns: Callable[[], int]) -> SessionStore:
+        """Make a new session folder and open it. Raises `InputError` where it exists.
+
+        `snapshots` are the texts of its configuration by file name, which the journal keeps as well.
+        """
         try:
             folder.mkdir(parents=True)
             for name, text in snapshots.items():
@@ -105,7 +88,12 @@ class SessionStore:
             raise InputError(folder, "exists already; recordings are never overwritten") from None
         except OSError as error:
             raise disk_error(folder, "cannot create", error) from error
-        return cls(folder, header, now_ns, snapshots)
+        journal = Journal(folder / JOURNAL_NAME, header.session_id)
+        try:
+            journal.append(events.Open(t_ns=now_ns(), header=header, snapshots=snapshots))
+        finally:
+            journal.close()
+        return cls(folder, now_ns)
 
     def begin(self, key: str, kind: StepKind, *, patches: tuple[int, ...] = (), press: Press | None = None) -> Attempt:
         """Journal that an attempt starts, then open its file.
@@ -133,20 +121,16 @@ class SessionStore:
             file=f"{serial:04d}-{kind}-{key[:8]}.mcap",
         )
         self._log(begin)
-        return Attempt(begin, serial, SegmentWriter(self.folder / begin.file, self.header, step_message(begin)))
+        writer = SegmentWriter(self.folder / begin.file, self.header)
+        writer.write(step_message(begin))
+        return Attempt(begin, serial, writer)
 
     def done(self, attempt: Attempt, result: StepResult) -> None:
         """Finish the file, then journal `done`: after this the step is never done again."""
         begin, writer = attempt.begin, attempt.writer
-        done = Done(
-            t_ns=self._now_ns(),
-            key=begin.key,
-            attempt=begin.attempt,
-            file=begin.file,
-            sha256="",
-            counts={**writer.counts, Topic.STEP: 2},
-            result=result,
-        )
+        step = begin.model_dump(exclude={"event", "press", "t_ns"})
+        counts = {**writer.counts, Topic.STEP: 2}
+        done = Done(**step, t_ns=self._now_ns(), sha256="", counts=counts, result=result)
         writer.write(step_message(done))
         self._log(done.model_copy(update={"sha256": writer.finish()}))
 
@@ -227,7 +211,7 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
         with new_mcap(part, header, attachments) as writer:
             for file in state.files:
                 writer.copy_file(folder / file)
-        counts = dict(scan_sound(part).counts)
+        counts = dict(McapFile(part, check=True).sound().counts)
         if counts != expected:
             raise SessionDamaged(part, f"holds {counts}, but the journal says {expected}")
         part.rename(final)
@@ -240,31 +224,6 @@ def merge_session(folder: Path, state: RunState, header: Header, tag: str = "sup
 def step_message(event: Begin | Done) -> Outgoing:
     """The message that tells the begin or the end of a step in its file."""
     return Outgoing(Topic.STEP, event.t_ns, event.t_ns, serial_of(event.file), StepEvent(step=event))
-
-
-def next_session_id(root: Path, label: str, today: dt.date) -> str:
-    """Return `2026-11-21-grid-01` with the first number that is free under `root`."""
-    for number in range(1, 1000):
-        session_id = f"{today.isoformat()}-{label}-{number:02d}"
-        if not (root / session_id).exists():
-            return session_id
-    raise InputError(root, f"has 999 sessions of {today.isoformat()}-{label}")
-
-
-def open_sessions(root: Path) -> list[Path]:
-    """Folders under `root` whose journal was opened and has no `closed` event, oldest first.
-
-    A session that is damaged or holds links is left out, so that it stands in no other's way.
-    """
-    found: list[Path] = []
-    for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")):
-        try:
-            check_folder(journal.parent)
-            if replay(journal).is_open:
-                found.append(journal.parent)
-        except SessionError:
-            continue
-    return found
 
 
 def lock(folder: Path) -> FileLock:

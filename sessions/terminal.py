@@ -1,16 +1,15 @@
 """Print to a terminal, where control characters in text from files, names or devices are shown, never executed.
 
-The progress of long work goes to stderr: a bar on a terminal, elsewhere a few plain lines.
+The progress of long work is a bar on stderr, where that is a terminal.
 """
 
 from __future__ import annotations
 
 import re
 import sys
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import typer
 
@@ -22,8 +21,6 @@ Progress = Callable[[str, int, int], None]
 """Called with a description of the work, the number done and the total."""
 T = TypeVar("T")
 Request = TypeVar("Request")
-QUIET_S = 5.0
-"""Without a terminal, progress is printed at most this often; shorter work prints nothing."""
 _ACTED_ON = re.compile(
     # Control characters of ASCII and Latin-1 (an escape sequence begins with one), except the tab.
     "[\x00-\x08\x0a-\x1f\x7f-\x9f"
@@ -76,18 +73,12 @@ def plain_console(*, stderr: bool = False, columns: int | None = None) -> Consol
     """
     from rich.console import Console  # noqa: TID251 - the one place
     from rich.segment import Segment
-    from rich.text import Text
 
     class PlainConsole(Console):
-        def render_str(self, text: str, **options: Any) -> Text:
-            # Escaped before the layout, so that columns are as wide as what is shown.
-            return super().render_str(plain(text, keep="\n"), **options)
-
         def on_broken_pipe(self) -> None:
             raise  # rich would exit with the code of a defect
 
         def _render_buffer(self, buffer: Iterable[Segment]) -> str:
-            # Texts and columns that were not made by `render_str` pass here too.
             return super()._render_buffer(
                 part if part.control else Segment(plain(part.text, keep="\n"), part.style) for part in buffer
             )
@@ -117,7 +108,7 @@ def counted(items: Iterable[T], what: str, total: int, progress: Progress) -> It
 def shown() -> Generator[Progress]:
     """Show progress until the end of the block."""
     if not sys.stderr.isatty():
-        yield lines_of(time.monotonic)
+        yield unseen
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -150,16 +141,3 @@ def show_work(work: Callable[[Request, Progress], Result], request: Request) -> 
         result = work(request, progress)
     say(*result.lines())
     return result
-
-
-def lines_of(clock_s: Callable[[], float]) -> Progress:
-    """Progress as lines for a terminal or a log that shows no bar."""
-    last_s = clock_s()
-
-    def update(what: str, done: int, total: int) -> None:
-        nonlocal last_s
-        if clock_s() - last_s >= QUIET_S:
-            last_s = clock_s()
-            say(f"{what}: {done} of {total}", err=True)
-
-    return update

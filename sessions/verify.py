@@ -28,7 +28,7 @@ from brushloop.sessions.disk import (
 from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
 from brushloop.sessions.events import Begin, Done, Event, StepEvent, StepKind, serial_of, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, DoneTwice, Reading, RunState, read, read_journal
-from brushloop.sessions.mcap_file import McapFile, scan
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
 from brushloop.sessions.recording import Recording, check_path, find_recording, parse_header, remarks_of
 from brushloop.sessions.records import HEADER_FILE, Stroke, Topic
@@ -61,11 +61,8 @@ class Evidence:
 
     @property
     def lost(self) -> int:
-        """Number of damaged or missing lines for which nothing was rebuilt."""
-        last = max((_place(event) for event in self.reading.events), default=-2.0)
-        at_end = sum(_place(event) > last for event in self.rebuilt)
-        between = self.reading.missing - (len(self.rebuilt) - at_end)
-        return max(0, between) + max(0, self.reading.unread_at_end - at_end)
+        """Number of damaged or missing lines, as far as their numbers show it, for which nothing was rebuilt."""
+        return max(0, self.reading.missing - len(self.rebuilt))
 
     def events(self) -> list[Event]:
         """Events of the journal as it must have been, with the rebuilt ones in their places."""
@@ -105,7 +102,7 @@ def gather(folder: Path) -> Evidence:
         unreadable = [error.what]
     reading = read(data)
     recordings = [path for path in sorted(folder.glob("*.mcap")) if not SEGMENT_NAME.fullmatch(path.name)]
-    files = {path.name: scan(path) for path in (*_step_files(folder), *recordings)}
+    files = {path.name: McapFile(path, check=True) for path in (*_step_files(folder), *recordings)}
     named = "" if reading.state.opened is None else reading.state.opened.header.session_id
     session = _session(folder.name, named, Counter(file.session for file in files.values() if file.session))
     if session not in ("", named):
@@ -113,7 +110,7 @@ def gather(folder: Path) -> Evidence:
     reading.faults[:0] = unreadable
     final = folder / f"{session}.mcap"
     files = {name: file for name, file in files.items() if SEGMENT_NAME.fullmatch(name) or name == final.name}
-    foreign = {name: files.pop(name).session for name in list(files) if not files[name].may_be_of(session)}
+    foreign = {name: files.pop(name).session for name in list(files) if files[name].session not in ("", session)}
     evidence = Evidence(folder, final, reading, files, session)
     _rebuild_steps(evidence)
     if reading.state.opened is None:
@@ -160,15 +157,15 @@ def _rebuild_steps(evidence: Evidence) -> None:
     begun = {event.file: event for event in known if isinstance(event, Begin)}
     begins = [step for _name, step in steps if isinstance(step, Begin)]
     ends = [event for event in [*known, *(step for _name, step in steps)] if isinstance(event, Done)]
-    for begin in [*begins, *map(begin_of, ends)]:
-        if begin is not None and begun.setdefault(begin.file, begin) is begin:
+    for begin in [*begins, *(end.begin() for end in ends)]:
+        if begun.setdefault(begin.file, begin) is begin:
             evidence.rebuilt.append(begin)
     latest: dict[str, int] = {}
     for begin in begun.values():
         latest[begin.key] = max(latest.get(begin.key, 0), begin.attempt)
     over = _over(known)
     for name, step in steps:
-        if isinstance(step, Begin) or name.endswith(".part") or step.file not in begun:
+        if isinstance(step, Begin) or name.endswith(".part"):
             continue
         if step.attempt == latest[step.key] and over.isdisjoint((step.file, (step.key, step.attempt))):
             over.add(step.file)
@@ -216,28 +213,6 @@ def parsed_step(data: bytes) -> Begin | Done | None:
         return None
 
 
-def begin_of(done: Done) -> Begin | None:
-    """The begin of a finished step whose own is lost; None where the patches that it used are not known either."""
-    sheet, patches = 0, tuple[int, ...]()
-    if isinstance(done.result, events.PressResult):
-        press = done.result.press
-        if press.sheet is None or press.patch is None:
-            return None
-        sheet, patches = press.sheet, (press.patch,)
-    elif done.kind in MARKING:
-        return None
-    return Begin(
-        t_ns=done.t_ns,
-        key=done.key,
-        kind=done.kind,
-        attempt=done.attempt,
-        sheet=sheet,
-        patches=patches,
-        press=done.press,
-        file=done.file,
-    )
-
-
 def _opened(evidence: Evidence) -> events.Open:
     """The `open` of a session, from its files. Raises `SessionDamaged`."""
     ours = [file for file in evidence.files.values() if file.header is not None]
@@ -249,14 +224,6 @@ def _opened(evidence: Evidence) -> events.Open:
     return events.Open(t_ns=0, header=header, snapshots=texts)
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One difference from what was recorded."""
-
-    file: str
-    what: str
-
-
 @dataclass(slots=True)
 class Verdict:
     """Result of checking a session."""
@@ -264,7 +231,8 @@ class Verdict:
     session: str
     state: str
     """`closed`, `open`, or `recording` for a file or folder without a journal."""
-    findings: list[Finding] = field(default_factory=list[Finding])
+    findings: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    """What is wrong with each file."""
     notes: list[str] = field(default_factory=list[str])
     """Observations that are not damage."""
     files: int = 0
@@ -281,7 +249,8 @@ class Verdict:
 
     def find(self, file: str, *problems: str) -> None:
         """Add what is wrong with a file."""
-        self.findings += [Finding(file, what) for what in problems]
+        if problems:
+            self.findings[file] = [*self.findings.get(file, []), *problems]
 
 
 def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
@@ -295,12 +264,12 @@ def verify_session(path: Path, progress: Progress = unseen) -> Verdict:
     try:
         evidence = gather(path.resolve())
     except SessionDamaged as error:
-        return Verdict(path.resolve().name, "open", [Finding(error.path.name, error.what)])
+        return Verdict(path.resolve().name, "open", {error.path.name: [error.what]})
     return judge(evidence, progress)
 
 
 def _verify_file(path: Path, name: str, progress: Progress) -> Verdict:
-    file = scan(path)
+    file = McapFile(path, check=True)
     verdict = Verdict(name, "recording", files=1, strokes=file.counts[Topic.STROKE], messages=file.counts.total())
     if file.index is not None and HEADER_FILE not in (one.name for one in file.index.attachment_indexes):
         raise InputError(path, f"is an MCAP file, but not a brushloop session: its index lists no {HEADER_FILE}")
@@ -414,8 +383,6 @@ def _content_problems(file: McapFile, progress: Progress) -> list[str]:
         problems.append(f"{error.path} {error.what}")
     except ValidationError as error:
         problems.append(f"a message does not fit its schema ({type(error).__name__})")
-    except OSError as error:
-        problems.append(f"cannot be read: {error.strerror}")
     return problems
 
 

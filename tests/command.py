@@ -1,20 +1,15 @@
-"""`brushloop` as one types it, within the test's own process: what it imports is imported once, not by every test.
-
-How far the work is, which a command that takes longer than two seconds says, depends on the machine and is left out.
-"""
+"""`brushloop` as one types it, within the test's own process: what it imports is imported once, not by every test."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import math
 import subprocess
 import sys
 from pathlib import Path
 from unittest import mock
 
 from brushloop.__main__ import main
-from brushloop.sessions import terminal
 
 
 def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -24,7 +19,6 @@ def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.Complet
     code = 0
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "argv", arguments))
-        stack.enter_context(mock.patch.object(terminal, "QUIET_S", math.inf))
         stack.enter_context(contextlib.redirect_stdout(out))
         stack.enter_context(contextlib.redirect_stderr(err))
         if cwd is not None:

@@ -14,7 +14,6 @@ import numpy as np
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_1
 from brushloop.calibrate.compare.place import KEYS, SIZE_PX, Alignment, Field, Image, Tone
-from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.loop.compare import (
     AGAIN,
     GOAL_POINTS,
@@ -46,7 +45,7 @@ from brushloop.calibrate.report import (
     write_files,
 )
 from brushloop.model.similarity import SSIM_SETTINGS
-from brushloop.sessions.disk import csv_text
+from brushloop.sessions.disk import check_writable, csv_text
 from brushloop.sessions.terminal import Progress, unseen
 
 HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), (Alignment.MM, Tone.GRAY)
@@ -75,7 +74,7 @@ class CompareRequest:
 
 def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
     """Compare presses with those that repeat them, and write the report. Raises `CalibrationError` and OSError."""
-    check_folder(request.out)
+    check_writable(request.out)
     view = Field(mm_per_px=request.mm_per_px)
     loop = compare_sessions(request.original, request.again, request.fit, view, request.command, progress)
     page = write_loop(loop, request.out)

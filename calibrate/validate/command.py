@@ -13,7 +13,6 @@ from brushloop.calibrate.drags.captures import validate_drags
 from brushloop.calibrate.drags.report import DragValidation, predict_session, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.pool import cluster, threads
 from brushloop.calibrate.report import framed, source_label, source_note, write_files
 from brushloop.calibrate.stroke.params import Params
@@ -22,7 +21,7 @@ from brushloop.calibrate.validate.inputs import URL, Extras, FittedSession, find
 from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
 from brushloop.calibrate.validate.report import Report, report_of
 from brushloop.calibrate.validate.run import Options, Outcome, Refused, validate_presses
-from brushloop.sessions.disk import csv_text
+from brushloop.sessions.disk import check_writable, csv_text
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FOLDER = "validation"
@@ -94,7 +93,7 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
         raise CalibrationError("--tune", "needs a --generator to tune")
     curves = [read_curve(text) for text in request.curves]
     folder = _folder(request)
-    check_folder(folder)
+    check_writable(folder)
     existed = folder.exists()
     try:
         sessions = [open_session(p, folder / WORK, request.calibration, request.fit) for p in request.places]

@@ -29,7 +29,6 @@ from brushloop.calibrate.compare.place import SIZE_PX, Image, Tone
 from brushloop.calibrate.drags.captures import read_drags
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import Written
 from brushloop.calibrate.writing.record import (
     FigureRecord,
@@ -53,6 +52,7 @@ from brushloop.model.characters.lead import LATER_SPREADS_MM, covered, drawn, le
 from brushloop.model.characters.plan import Phase, Reach, StrokePath, directions, grid, phase_map, without_tilt
 from brushloop.model.drag import NAMES, Drawings, Footprint, fit_each, fit_footprint
 from brushloop.model.similarity import binary_scores
+from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
@@ -156,7 +156,7 @@ def fit(session: Path, progress: Progress = unseen) -> Written:
 
 def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     """Write the protocol of a practice sheet, each stroke on a patch of its own. Raises `CalibrationError`."""
-    check_folder(request.out)
+    check_writable(request.out)
     try:
         strokes = practice_strokes(request.cell_mm, reach_of(request.by), request.by.length_mm, request.seed)
     except ValueError as error:
@@ -223,7 +223,7 @@ class LearnRequest:
 
 def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     """Make the next plan from what the ink of this one showed. Raises `CalibrationError`."""
-    check_folder(request.out)
+    check_writable(request.out)
     following = learned(compare_written(request.session, load_plan(request.plan), {}, progress), request.gain)
     settled = request.settled_repeats is not None and all(figure.settled for figure in following.figures)
     repeats = (request.settled_repeats if settled else None) or request.repeats

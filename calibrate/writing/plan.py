@@ -13,7 +13,7 @@ import numpy as np
 
 from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import check_folder, read_bounded
+from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import Written, picture_grid, save_picture
 from brushloop.calibrate.writing.learn import FootprintArtefact, reach_of
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, write_plan
@@ -34,6 +34,7 @@ from brushloop.model.characters.plan import Floats, Image, Patch, Phase, Reach, 
 from brushloop.model.drag import Footprint
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import StrokeModel, UnknownModelError, stroke_model
+from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import Progress, unseen
 
 PICTURE = "plan.png"
@@ -124,7 +125,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
 
     Raises `CalibrationError` that names option, or file and field.
     """
-    check_folder(request.out)
+    check_writable(request.out)
     fitted = load_artefact(request.footprint, FootprintArtefact) if request.footprint is not None else None
     by = request.by if fitted is None else request.by.model_copy(update={"footprint": fitted.footprint().values})
     low, high = by.tilt_range_deg

@@ -13,7 +13,6 @@ from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.compare.place import Alignment, Image, Tone
 from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import check_folder
 from brushloop.calibrate.report import (
     Written,
     about,
@@ -46,7 +45,7 @@ from brushloop.calibrate.writing.scores import (
     read_reference,
 )
 from brushloop.model.similarity import SSIM_SETTINGS
-from brushloop.sessions.disk import csv_text
+from brushloop.sessions.disk import check_writable, csv_text
 from brushloop.sessions.terminal import Progress, unseen
 
 PAGE, TABLE = "written.html", "written.csv"
@@ -68,7 +67,7 @@ class CompareRequest:
 
 def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
     """Compare written characters with their simulation and reference; write the report. Raises `CalibrationError`."""
-    check_folder(request.out)
+    check_writable(request.out)
     references: dict[str, tuple[str, Image]] = {}
     for words in request.references:
         name, equals, path = words.partition("=")

@@ -26,7 +26,7 @@ from brushloop.calibrate.stats import Summary, others_of, summarise
 from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, points_digest
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture, Recording
-from brushloop.sessions.records import Header, Source
+from brushloop.sessions.records import Header, Source, Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 FILE, PICTURE = "written.json", "figure-13.png"
@@ -243,7 +243,7 @@ def _writings(
     cut: set[str] = set()
     refused: list[tuple[str, str]] = []
     what = f"{recording.header.session_id}: found"
-    for capture in counted(recording.captures(), what, recording.strokes(), progress):
+    for capture in counted(recording.captures(), what, recording.counts[Topic.STROKE], progress):
         stroke_id = capture.stroke.stroke_id
         name = stroke_id.rsplit("-r", 1)[0]
         if capture.stroke.kind != "drag" or plan.figure(name) is None:

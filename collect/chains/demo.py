@@ -19,10 +19,10 @@ from brushloop.collect.chains.loop import PROTOCOL as REPLAY
 from brushloop.collect.chains.loop import LoopRequest, run_loop
 from brushloop.collect.chains.writing import PAGE as WRITTEN_PAGE
 from brushloop.collect.chains.writing import Writing, WritingRequest
+from brushloop.collect.engine.open_or_resume import open_sessions
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import CollectRequest
 from brushloop.model.generator import SHIPPED_GENERATOR
-from brushloop.sessions.store import open_sessions
 from brushloop.sessions.terminal import say, show_work
 
 CHARACTER = "字"

@@ -22,11 +22,12 @@ from brushloop.collect.rig.config import RigConfig, load_rig, overrides
 from brushloop.collect.rig.devices import Rig
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.samples import Identity
-from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, holds, read_bounded, unwritable
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, check_folder, holds, read_bounded
 from brushloop.sessions.errors import InputError, SessionError
+from brushloop.sessions.events import CaptureResult, PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Header, Source
-from brushloop.sessions.store import SessionStore, Snapshots, next_session_id, open_sessions
+from brushloop.sessions.store import SessionStore
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
 COMPARED = (RIG_EFFECTIVE, PROTOCOL_EFFECTIVE)
@@ -56,7 +57,7 @@ class Opening:
     protocol_path: Path
     rig: RigConfig
     protocol: ProtocolConfig
-    snapshots: Snapshots
+    snapshots: dict[str, str]
     new: bool = False
     """Start a new session although another one is open."""
     sheet: int | None = None
@@ -263,12 +264,6 @@ def _option(old: Path, given: Path) -> str:
     return f"{OPTIONS[old.name]} {old}{beside}"
 
 
-def check_writable(folder: Path) -> None:
-    """Raise `ConfigError` unless `folder` can be written to or created. Called before anything is connected."""
-    if (found := unwritable(folder)) is not None:
-        raise ConfigError(found[0], "", found[1])
-
-
 def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
     """Record which sheet the operator says is in; the same number again changes nothing.
 
@@ -279,15 +274,44 @@ def put_in_sheet(store: SessionStore, sheet: int | None) -> None:
         return
     if sheet != now + 1:
         raise ConfigError("--sheet", "", f"{sheet}: sheet {now} is in use, so only {now} or {now + 1} can be in")
-    waiting = sorted(press.stroke_id for press in store.state.not_photographed())
-    if waiting:
+    pressed, captured = (
+        {(result.press.stroke_id, result.press.take) for result in store.state.results(kind)}
+        for kind in (PressResult, CaptureResult)
+    )
+    if waiting := pressed - captured:
+        names = ", ".join(sorted(stroke_id for stroke_id, _take in waiting))
         raise ConfigError(
             "--sheet",
             "",
-            f"{sheet}: {', '.join(waiting)} is pressed on sheet {now} but not photographed. "
+            f"{sheet}: {names} is pressed on sheet {now} but not photographed. "
             f"Put sheet {now} back and run the same command without --sheet",
         )
     store.fresh_sheet()
+
+
+def next_session_id(root: Path, label: str, today: dt.date) -> str:
+    """Return `2026-11-21-grid-01` with the first number that is free under `root`."""
+    for number in range(1, 1000):
+        session_id = f"{today.isoformat()}-{label}-{number:02d}"
+        if not (root / session_id).exists():
+            return session_id
+    raise InputError(root, f"has 999 sessions of {today.isoformat()}-{label}")
+
+
+def open_sessions(root: Path) -> list[Path]:
+    """Folders under `root` whose journal was opened and has no `closed` event, oldest first.
+
+    A session that is damaged or holds links is left out, so that it stands in no other's way.
+    """
+    found: list[Path] = []
+    for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")):
+        try:
+            check_folder(journal.parent)
+            if replay(journal).is_open:
+                found.append(journal.parent)
+        except SessionError:
+            continue
+    return found
 
 
 def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:
@@ -297,7 +321,7 @@ def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) ->
         session_id = next_session_id(opening.root, opening.protocol.kind, dt.date.today())
         header = header.model_copy(update={"session_id": session_id})
         return SessionStore.create(opening.root / session_id, header, opening.snapshots, clock.now_ns)
-    store = SessionStore(resume, None, clock.now_ns)
+    store = SessionStore(resume, clock.now_ns)
     try:
         # Before anything moves: damage to a step would otherwise show only when everything is collected.
         store.verify()

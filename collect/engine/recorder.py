@@ -6,28 +6,17 @@ import contextlib
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING
 
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
 from brushloop.drivers.clock import Clock
 from brushloop.drivers.samples import ForceSample, Frame, PoseSample, Stamp
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
-from brushloop.sessions.messages import (
-    calibration_message,
-    encode_png,
-    image_message,
-    joints_message,
-    log_message,
-    pose_message,
-    transform_message,
-)
-from brushloop.sessions.records import (
-    Cadence,
-    Event,
-    InkState,
-    Quality,
-    Stroke,
-    Topic,
-    Wrench,
-)
+from brushloop.sessions.messages import encode_png, image_message, pose_message
+from brushloop.sessions.records import Cadence, Event, InkState, Quality, Stroke, Topic, Wrench
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -77,8 +66,11 @@ class Recorder:
         self._poses.arrived(stamp.host_ns)
         self._sample(Topic.TCP, stamp, pose_message(stamp.host_ns, sample.pose.position_mm, sample.pose.quaternion))
         if sample.joints_rad is not None:
-            names = [f"joint{number}" for number in range(1, len(sample.joints_rad) + 1)]
-            self._sample(Topic.JOINTS, stamp, joints_message(stamp.host_ns, names, sample.joints_rad))
+            joints = JointStates()
+            joints.timestamp.FromNanoseconds(stamp.host_ns)
+            for number, position_rad in enumerate(sample.joints_rad, start=1):
+                joints.joints.add(name=f"joint{number}", position=position_rad)
+            self._sample(Topic.JOINTS, stamp, joints)
 
     def force(self, sample: ForceSample) -> None:
         """Record a sample of the force sensor, stamped when the host received it."""
@@ -93,15 +85,32 @@ class Recorder:
         self._now(Topic.INK, InkState(level=level, dosed_ml=dosed_ml, light=light))
 
     def paper(self, origin_mm: tuple[float, float, float], quaternion: tuple[float, float, float, float]) -> None:
-        """Record where the paper's frame lies in the base frame."""
-        now_ns = self._clock.now_ns()
-        message = transform_message(now_ns, "base", "paper", origin_mm, quaternion)
+        """Record where the paper's frame lies in the base frame; metres on disk, and (x, y, z, w)."""
+        message, now_ns = FrameTransforms(), self._clock.now_ns()
+        transform = message.transforms.add(parent_frame_id="base", child_frame_id="paper")
+        transform.timestamp.FromNanoseconds(now_ns)
+        there, turned = transform.translation, transform.rotation
+        there.x, there.y, there.z = (v / 1e3 for v in origin_mm)
+        turned.x, turned.y, turned.z, turned.w = quaternion
         self._put(Topic.TRANSFORMS, now_ns, now_ns, 0, message)
 
     def optics(self, used: Lens) -> None:
-        """Record the lens with which photographs are undistorted before they are judged."""
-        now_ns = self._clock.now_ns()
-        message = calibration_message(now_ns, used.size_px, used.camera.tolist(), used.distortion)
+        """Record the lens with which photographs are undistorted before they are judged.
+
+        The camera is single and not rectified: R is the identity, P is [K | 0].
+        """
+        now_ns, matrix = self._clock.now_ns(), used.camera
+        message = CameraCalibration(
+            frame_id="camera",
+            width=used.size_px[0],
+            height=used.size_px[1],
+            distortion_model="plumb_bob",
+            D=used.distortion,
+            K=matrix.ravel().tolist(),
+            R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            P=[v for row in matrix.tolist() for v in [*row, 0.0]],
+        )
+        message.timestamp.FromNanoseconds(now_ns)
         self._put(Topic.CALIBRATION, now_ns, now_ns, 0, message)
 
     def quality(self, quality: Quality, number: int) -> None:
@@ -128,7 +137,9 @@ class Recorder:
     def log(self, text: str, *, warning: bool = False) -> None:
         """Record a line of the log."""
         now_ns = self._clock.now_ns()
-        self._put(Topic.LOG, now_ns, now_ns, 0, log_message(now_ns, text, warning=warning))
+        message = Log(level=Log.WARNING if warning else Log.INFO, message=text, name="brushloop")
+        message.timestamp.FromNanoseconds(now_ns)
+        self._put(Topic.LOG, now_ns, now_ns, 0, message)
 
     def _now(self, topic: Topic, event: Event, sequence: int = 0) -> None:
         now_ns = self._clock.now_ns()

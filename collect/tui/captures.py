@@ -16,6 +16,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.artefact import FOLDER as FITS
 from brushloop.calibrate.fit.artefact import BrushFit
 from brushloop.calibrate.session import lens_in_use
+from brushloop.calibrate.waits import unlike, waits_of
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.large import LargeCapture, title_of
@@ -24,9 +25,9 @@ from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import CaptureResult, Press, Remark
 from brushloop.sessions.journal import JOURNAL_NAME, replay
-from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.messages import decode_gray, decode_still
-from brushloop.sessions.recording import merged_file, remarks_of, unlike, waits_of
+from brushloop.sessions.recording import merged_file, remarks_of
 from brushloop.sessions.records import Check, Condition, Quality, Stroke, Topic
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ class Review:
         path = path if path.is_file() else merged_file(self.folder)
         image, log_ns, stroke = None, 0, None
         checks: tuple[Check, ...] = ()
-        for _schema, channel, message in open_mcap(path).messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
+        for _schema, channel, message in McapFile(path).sound().messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
             if message.sequence != capture.result.still:
                 continue
             if channel.topic == Topic.STILL:

@@ -156,5 +156,5 @@ def verdict_content(verdict: Verdict) -> Content:
     if verdict.sound:
         return Content.assemble(("✓ sound", "bold $text-success"), f"  {verdict.session} ({verdict.state}): {read}")
     lines = [Content.styled(f"! damaged  {verdict.session}: try `brushloop sessions repair`", "bold $text-error")]
-    lines += [Content(f"{finding.file}: {plain(finding.what)}") for finding in verdict.findings]
+    lines += [Content(f"{file}: {plain('; '.join(problems))}") for file, problems in verdict.findings.items()]
     return Content("\n").join(lines)

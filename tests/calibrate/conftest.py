@@ -20,6 +20,7 @@ from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message
 from brushloop.sessions.records import Header, Source, Stroke, Topic
 from brushloop.sessions.store import SessionStore
+from tests.sessions.conftest import closed, make, out, photos, run, store  # noqa: F401 - fixtures of the exports
 
 T0_NS = 1_700_000_000_000_000_000
 MINUTE_NS = 60_000_000_000
@@ -62,29 +63,29 @@ def _photographed(
         rig["paper"] = {"size_mm": sheet_mm}
     snapshots = {"rig.toml": "", "protocol.toml": "", "rig.effective.json": json.dumps(rig)}
     header = Header(session_id=folder.name, source=Source.LOOPBACK, software="brushloop test")
-    store = SessionStore.create(folder, header, snapshots, functools.partial(next, itertools.count(T0_NS, 1_000_000)))
+    session = SessionStore.create(folder, header, snapshots, functools.partial(next, itertools.count(T0_NS, 1_000_000)))
     for number, image in enumerate(boards):
         height_px, width_px = image.shape
         board = BoardResult(
             still=number, corners=54, mm_per_px=0.05, rms_px=0.1, size_px=(width_px, height_px), sheet_px=()
         )
-        _take(store, number, [_still(T0_NS + number * MINUTE_NS, number, image)], board)
+        _take(session, number, [_still(T0_NS + number * MINUTE_NS, number, image)], board)
     for number, (stroke, image) in enumerate(presses, start=len(boards)):
         t_ns = T0_NS + number * MINUTE_NS
         marked = Outgoing(Topic.STROKE, t_ns, t_ns, number, stroke.model_copy(update={"still": number}))
         condition = Condition(depth_mm=stroke.depth_mm or 0.0, tilt_deg=stroke.tilt_deg or 0.0)
         captured = CaptureResult(press=Press(stroke_id=stroke.stroke_id, condition=condition), still=number)
-        _take(store, number, [_still(t_ns, number, image), marked], captured)
-    store.close()
-    store.release()
+        _take(session, number, [_still(t_ns, number, image), marked], captured)
+    session.close()
+    session.release()
     return folder
 
 
-def _take(store: SessionStore, number: int, messages: list[Outgoing], result: StepResult) -> None:
-    attempt = store.begin(f"{result.kind} {number}", result.kind)
+def _take(session: SessionStore, number: int, messages: list[Outgoing], result: StepResult) -> None:
+    attempt = session.begin(f"{result.kind} {number}", result.kind)
     for message in messages:
         attempt.writer.write(message)
-    store.done(attempt, result)
+    session.done(attempt, result)
 
 
 def _still(t_ns: int, number: int, image: Gray) -> Outgoing:

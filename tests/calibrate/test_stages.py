@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bench.brushes import CELLS, press_session
 from brushloop.calibrate.cli import app
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stages import Trace, trace_scaled
 from brushloop.calibrate.stroke.params import Params
-from brushloop.drivers.sim.brush.brush import BrushSpec
-from brushloop.sessions.recording import Recording
 
 
 def photograph(*strokes: tuple[int, int], glare: tuple[int, int] | None = None, paper: int = 225) -> np.ndarray:
@@ -117,13 +114,3 @@ def test_the_command_still_takes_a_session_as_it_did(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, [str(tmp_path / "nosuch")])
     assert "no such session" in str(ran.exception)
     assert CliRunner().invoke(app, []).exit_code == 2
-
-
-def test_reading_up_to_a_stroke_says_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("brushloop.sessions.terminal.QUIET_S", 0.0)
-    place = press_session(tmp_path / "three", BrushSpec(seed=1), CELLS[:3])
-    last = [stroke.stroke_id for stroke in Recording(place).stroke_records()][-1]
-    arguments = ["preprocess", str(place), "--stroke", last, "--out", str(tmp_path / "stages.png")]
-    ran = CliRunner().invoke(app, arguments)
-    assert ran.exit_code == 0, ran.output
-    assert "strokes read: 2 of 3\n" in ran.output

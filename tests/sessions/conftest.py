@@ -191,7 +191,7 @@ def resume(make: Make) -> Iterator[Callable[[SessionStore | Path], SessionStore]
         if isinstance(session, SessionStore):
             session.release()
             session = session.folder
-        stores.append(SessionStore(session, None, make.clock()))
+        stores.append(SessionStore(session, make.clock()))
         return stores[-1]
 
     yield resume

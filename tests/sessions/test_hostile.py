@@ -13,10 +13,11 @@ from click.testing import CliRunner
 from typer.main import get_command
 
 from brushloop.__main__ import app
-from brushloop.sessions.disk import bare_name
+from brushloop.collect.engine.open_or_resume import open_sessions
 from brushloop.sessions.errors import InputError
+from brushloop.sessions.events import parse_event
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.store import SessionStore, open_sessions
+from brushloop.sessions.store import SessionStore
 from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
 
@@ -185,17 +186,15 @@ def test_a_session_that_is_gone_on_with_holds_no_link(make, place):
     (folder / "rig.toml").unlink()
     (folder / "rig.toml").symlink_to(place / "outside" / "victim.toml")
     with pytest.raises(InputError, match=r"rig\.toml: is a link, which nothing in a session's folder may be") as caught:
-        SessionStore(folder, None, make.clock())
+        SessionStore(folder, make.clock())
     assert caught.value.exit_code == 2
     assert folder not in open_sessions(folder.parent)
 
 
-@pytest.mark.parametrize(
-    "name", ["", ".", "..", "/etc/passwd", "../x", "a/b", "a\\b", "a\0b", "a\nb", "x" * 300, 3, None]
-)
-def test_what_is_no_bare_name(name):
-    with pytest.raises(ValueError, match=r"is not a string|allowed is the name of a file"):
-        bare_name(name)
+@pytest.mark.parametrize("name", ["", "..", "/etc/x", "../x", "a/b", "a\\b", "a\0b", "a\nb", "x" * 300, ".x", "x\n/"])
+def test_a_name_in_a_journal_never_leads_out_of_its_folder(name):
+    with pytest.raises(ValueError, match="'file' of event 'closed' is wrong"):
+        parse_event({"event": "closed", "t_ns": 1, "file": f"{name}.mcap", "sha256": "", "counts": {}})
 
 
 HUGE = 40 * 2**30
@@ -209,7 +208,7 @@ def test_a_journal_of_40_gb_ends_in_one_line_hides_no_other_and_is_made_again(ma
         assert (ran.returncode, "is larger than 268435456 bytes" in ran.stderr) == (6, True)
         assert "Traceback" not in ran.stderr
     assert open_sessions(tmp_path) == [sound]
-    assert repair(huge).lossless
+    assert not repair(huge).lost
     assert (huge / f"{JOURNAL_NAME}.damaged-1").stat().st_size == HUGE
     assert verify_session(huge).sound
 

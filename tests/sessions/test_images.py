@@ -1,12 +1,13 @@
 """Photographs of strangers: whole PNG and JPEG images are read, anything else is refused before it costs anything."""
 
+import io
 import struct
 import zlib
 
 import cv2
 import numpy as np
 import pytest
-from PIL import ImageFile
+from PIL import ExifTags, Image, ImageFile
 
 from brushloop.sessions import messages
 from brushloop.sessions.errors import SessionDamaged
@@ -95,3 +96,14 @@ def test_a_png_cut_at_any_byte_or_with_a_wrong_bit_is_refused_by_us_and_not_by_a
 )
 def test_an_image_is_read_as_gray(data, gray):
     np.testing.assert_array_equal(decode_gray(data, "a still"), np.full((64, 64), gray))
+
+
+def test_a_photograph_is_seen_as_a_viewer_shows_it():
+    """A person measured the dark corner in a viewer, which turns the picture as its orientation says."""
+    image, exif, turned = np.full((60, 40), 230, np.uint8), Image.Exif(), io.BytesIO()
+    image[:8, :8] = 20
+    exif[ExifTags.Base.Orientation] = 6
+    Image.fromarray(image).save(turned, "JPEG", quality=100, exif=exif)
+    gray = decode_gray(turned.getvalue(), "a still")
+    assert (gray.shape, gray[5, 35] < 60) == ((40, 60), False)
+    assert gray[5, 55] < 60

@@ -23,10 +23,8 @@ BEGIN = {
     "file": "0000-k1.mcap",
 }
 DONE = {
+    **BEGIN,
     "event": "done",
-    "key": "k1",
-    "attempt": 1,
-    "file": "0000-k1.mcap",
     "sha256": "00",
     "counts": {"/step": 2},
     "result": {"kind": "press", "press": {"stroke_id": "a", "condition": {"depth_mm": 13.0, "tilt_deg": 5.0}}},
@@ -84,12 +82,12 @@ WRONG = "line 5 does not match its CRC"
 CHANGES = {
     "deleted": (lambda a: [*a[:4], *a[5:]], ["line 5 is numbered 6"]),
     "first": (lambda a: a[1:], ["line 1 is numbered 2"]),
-    "doubled": (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 stands twice"]),
+    "doubled": (lambda a: [*a[:5], a[4], *a[5:]], ["line 6 is numbered 5"]),
     "exchanged": (
         lambda a: [*a[:3], a[9], *a[4:9], a[3], *a[10:]],
-        ["line 4 is numbered 10", "line 5 is numbered 5", "line 10 is numbered 4", "line 11 is numbered 11"],
+        ["line 4 is numbered 10"],
     ),
-    "foreign": (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'"]),
+    "foreign": (lambda a: [*a[:6], FOREIGN, *a[6:]], ["line 7 is of another session, 'other'", "line 8 is numbered 7"]),
     "binary": (lambda a: [*a[:4], b"\xff\xfe\n", *a[5:]], [WRONG]),
     "deep": (lambda a: [*a[:4], b"[" * 100_000 + b"\n", *a[5:]], [WRONG]),
     "bit": (lambda a: [*a[:4], a[4].replace(b"sheet", b"sheer"), *a[5:]], [WRONG]),

@@ -9,8 +9,8 @@ from collections import Counter
 
 import pytest
 
+from brushloop.collect.engine.open_or_resume import open_sessions
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.store import open_sessions
 
 KEYS = [f"step-{number:02d}" for number in range(12)]
 KILLS = 10
@@ -27,7 +27,7 @@ from brushloop.sessions.mcap_writer import Outgoing
 folder, keys = Path(sys.argv[1]), sys.argv[2:]
 header = Header(session_id=folder.name, source="loopback rig", software="test")
 if (folder / "journal.jsonl").exists():
-    store = SessionStore(folder, None, time.time_ns)
+    store = SessionStore(folder, time.time_ns)
 else:
     store = SessionStore.create(folder, header, {"rig.toml": "x = 1"}, time.time_ns)
 print("ready", flush=True)

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from brushloop.sessions.errors import InputError, SessionDamaged
 from brushloop.sessions.events import StepKind
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import HEADER_FILE
+from brushloop.sessions.records import HEADER_FILE, Topic
 from brushloop.sessions.repair import repair_session
 from brushloop.sessions.show import details
 from brushloop.sessions.verify import verify_session
@@ -47,7 +47,7 @@ def test_every_stroke_comes_with_the_still_that_shows_it(make, path):
     assert [capture.stroke.stroke_id for capture in captures] == ["H13-a05-r00", "H13-a05-r01", "beside"]
     assert [capture.still_png for capture in captures] == [make.png(0), make.png(1), make.png(1)]
     assert captures[0].image().shape == (24, 24)
-    assert Recording(path).strokes() == 3
+    assert Recording(path).counts[Topic.STROKE] == 3
 
 
 def test_captures_are_lazy_so_that_a_session_need_not_fit_in_memory(make, path):

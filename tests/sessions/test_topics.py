@@ -3,27 +3,24 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from mcap.reader import make_reader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.decoder import DecoderFactory
 
+from brushloop.collect.engine.recorder import Recorder
+from brushloop.drivers.clock import HostClock
+from brushloop.drivers.geometry import Pose
+from brushloop.drivers.samples import PoseSample, Stamp
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.mcap_writer import Outgoing
-from brushloop.sessions.messages import (
-    calibration_message,
-    image_message,
-    joints_message,
-    log_message,
-    transform_message,
-)
+from brushloop.sessions.messages import image_message
 from brushloop.sessions.records import Cadence, Check, Event, InkState, Quality, Topic, Wrench
-
-JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
-K = [[1500.0, 0.0, 1024.0], [0.0, 1500.0, 768.0], [0.0, 0.0, 1.0]]
 
 
 @pytest.fixture
@@ -32,27 +29,23 @@ def each(make):
     t_ns = make.t0_ns
     jpeg = cv2.imencode(".jpg", np.full((32, 32), 200, np.uint8))[1].tobytes()
     messages = {
-        Topic.JOINTS: joints_message(t_ns, JOINTS, range(6)),
-        Topic.TRANSFORMS: transform_message(t_ns, "base", "paper", (400, -100, 5), (0, 0, 0, 1)),
-        Topic.CALIBRATION: calibration_message(t_ns, (2048, 1536), K, [0.1, 0, 0, 0, 0]),
+        Topic.CALIBRATION: CameraCalibration(frame_id="camera"),
         Topic.PREVIEW: image_message(t_ns, jpeg, "jpeg"),
-        Topic.LOG: log_message(t_ns, "brush is dry", warning=True),
         Topic.WRENCH: Wrench(fx_n=0.0, fy_n=0.1, fz_n=-1.5, mx_nm=0.0, my_nm=0.0, mz_nm=0.01),
         Topic.INK: InkState(level=0.7, dosed_ml=1.25, light=0.5),
         Topic.QUALITY: Quality(
             stroke_id="H13-a05-r00",
             checks=(Check(name="sharp", score=0.2, threshold=0.4, passed=False, reason="out of focus"),),
         ),
-        Topic.CADENCE: Cadence(
-            topic="/robot/tcp",
-            expected_hz=100.0,
-            received=990,
-            missed=10,
-            longest_gap_ms=50.0,
-        ),
+        Topic.CADENCE: Cadence(topic="/robot/tcp", expected_hz=100.0, received=990, missed=10, longest_gap_ms=50.0),
     }
     outgoing = [Outgoing(topic, t_ns, t_ns, n, message) for n, (topic, message) in enumerate(messages.items())]
-    return [*outgoing, make.pose(0), make.still(0), make.stroke(0)]
+    recorder = Recorder(SimpleNamespace(write=outgoing.append), HostClock())
+    recorder.paper((400.0, -100.0, 5.0), (0.0, 0.0, 0.0, 1.0))
+    recorder.log("brush is dry", warning=True)
+    pose = Pose(1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    recorder.pose(PoseSample(Stamp(t_ns, None, 0), pose, joints_rad=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0)))
+    return [*outgoing, make.still(0), make.stroke(0)]
 
 
 def test_the_merged_file_carries_every_topic_under_a_name_that_viewers_know(make, store, each):
@@ -82,12 +75,10 @@ def test_any_viewer_decodes_them_from_the_schemas_in_the_file(make, tmp_path, ea
         decoded = {c.topic: m for _, c, _, m in reader.iter_decoded_messages(topics=protobuf)}
     assert set(decoded) == set(map(str, protobuf))
     joints = decoded["/robot/joints"].joints
-    assert [(joint.name, joint.position) for joint in joints][2] == ("elbow", 2.0)
+    assert [(joint.name, joint.position) for joint in joints][2] == ("joint3", 2.0)
     assert not joints[0].HasField("velocity")
     [transform] = decoded["/tf"].transforms
     assert (transform.parent_frame_id, transform.translation.x, transform.rotation.w) == ("base", 0.4, 1.0)
-    calibration = decoded["/camera/calibration"]
-    assert list(calibration.P) == [1500.0, 0, 1024.0, 0, 0, 1500.0, 768.0, 0, 0, 0, 1.0, 0]
     assert (decoded["/camera/preview"].format, decoded["/camera/still"].format) == ("jpeg", "png")
     assert decoded["/camera/still"].data == make.png(0)
     assert (decoded["/log"].message, decoded["/log"].level) == ("brush is dry", 3)

@@ -15,8 +15,10 @@ from mcap.writer import CompressionType, Writer
 
 from brushloop.sessions import mcap_writer
 from brushloop.sessions.errors import SessionDamaged, SessionError
-from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import CHUNK_BYTES, McapWriter, SegmentWriter
+from brushloop.sessions.records import HEADER_FILE
+from tests.sessions.conftest import Make
 
 
 @pytest.fixture
@@ -71,6 +73,7 @@ def test_a_disk_that_does_not_keep_up_is_heard(make, path, monkeypatch):
     writer.abandon()
 
 
+HEADER = Make.header
 THING, THINGS = Schema(1, b"{}", "jsonschema", "Thing"), Channel(1, "/things", "json", {}, 1)
 BARE = Channel(2, "/bare", "", {}, 0)
 
@@ -83,7 +86,8 @@ def theirs(file):
         enable_data_crcs=True,
         use_summary_offsets=False,
     )
-    writer.start(profile="", library="test")
+    writer.start(profile="", library=HEADER.software)
+    writer.add_attachment(0, 0, HEADER_FILE, "application/json", HEADER.model_dump_json().encode())
 
     def add_channel(schema, channel):
         if schema is not None:
@@ -100,7 +104,7 @@ def theirs(file):
 
 
 def ours(file):
-    writer = McapWriter(file, "test")
+    writer = McapWriter(file, HEADER)
     return writer, writer.add_attachment, writer.add_channel, writer.add_message
 
 
@@ -126,7 +130,10 @@ def written(begin):
 def test_the_mcap_library_finds_by_our_index_what_it_finds_by_its_own(topic):
     def found(file):
         reader = make_reader(file, validate_crcs=True)
-        assert [(a.name, a.data) for a in reader.iter_attachments()] == [("rig.toml", b"x = 1")]
+        assert [(a.name, a.data[:6]) for a in reader.iter_attachments()] == [
+            (HEADER_FILE, b'{"sche'),
+            ("rig.toml", b"x = 1"),
+        ]
         return [asdict(message) for _, _, message in reader.iter_messages([topic])]
 
     assert found(written(ours)) == found(written(theirs))
@@ -134,7 +141,7 @@ def test_the_mcap_library_finds_by_our_index_what_it_finds_by_its_own(topic):
 
 def copied(path, *sources, channels=()):
     with path.open("xb") as file:
-        writer = McapWriter(file, "test")
+        writer = McapWriter(file, HEADER)
         for channel in channels:
             writer.add_channel(None, channel)
         for source in sources:
@@ -148,7 +155,9 @@ def test_the_messages_of_other_files_are_copied_as_they_are(tmp_path):
     copied(copy, source, source)
 
     def messages_of(path):
-        return [(c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in open_mcap(path).messages()]
+        return [
+            (c.topic, m.sequence, m.log_time, m.publish_time, m.data) for _, c, m in McapFile(path).sound().messages()
+        ]
 
     assert messages_of(copy) == 2 * messages_of(source)
     with copy.open("rb") as file:

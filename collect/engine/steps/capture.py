@@ -12,6 +12,7 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.view import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.params import Gray
+from brushloop.calibrate.waits import limit_s, unlike, waits_of
 from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of
 from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.engine.steps.retake import decide
@@ -25,7 +26,6 @@ from brushloop.drivers.samples import Frame
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions import records
 from brushloop.sessions.events import BoardResult, CaptureResult, Press
-from brushloop.sessions.recording import limit_s, unlike, waits_of
 
 MOVED_MM = 1.0
 """Distance by which the sheet may seem to have moved in the picture since the first mark of the session."""

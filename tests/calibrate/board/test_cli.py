@@ -249,16 +249,6 @@ def test_drift_refuses_what_is_no_session_with_boards(photographed: Photographed
     refused(run("drift", photographed(tmp_path / "none", SPEC, [])), "holds no view of the board")
 
 
-def test_long_work_says_how_far_it_is(
-    photographed: Photographed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("brushloop.sessions.terminal.QUIET_S", 0.0)
-    paths = [saved(tmp_path / f"{number}.png", BLANK) for number in range(2)]
-    assert "photographs searched for the board: 1 of 2\n" in run("intrinsics", *paths, *BOARD).output
-    session = photographed(tmp_path / "s", SPEC, [BLANK, BLANK])
-    assert "photographs of the board measured: 1 of 2\n" in run("drift", session).output
-
-
 def test_intrinsics_says_of_every_photograph_why_none_was_of_use(tmp_path: Path) -> None:
     """Also of photographs with one name in several folders, and of one that is given twice."""
     (tmp_path / "left").mkdir()

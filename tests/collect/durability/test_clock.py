@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.errors import CollectAborted
 from brushloop.sessions.journal import JOURNAL_NAME
-from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import the_session
@@ -58,7 +58,7 @@ def test_a_clock_that_is_set_within_a_step_and_between_two_moves_no_stamp(
     lines = list(read_lines(folder / JOURNAL_NAME))
     times_ns = [line["t_ns"] for line in lines]
     assert times_ns == sorted(times_ns)
-    stamps_ns = [message.log_time for _, _, message in open_mcap(folder / f"{folder.name}.mcap").messages()]
+    stamps_ns = [message.log_time for _, _, message in McapFile(folder / f"{folder.name}.mcap").sound().messages()]
     assert max(stamps_ns) - min(stamps_ns) < 60e9
     assert engine.snapshot().elapsed_s < 60.0
     assert verify_session(folder).sound

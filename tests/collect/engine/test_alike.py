@@ -16,7 +16,7 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.drivers.samples import Pose
-from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic
 from tests.collect.sent import noting
@@ -96,7 +96,7 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets
     [capture] = recording.captures()
     assert capture.stroke.dip_to_touch_s == waits[-1]
     assert [seen.press.dip_to_touch_s for seen in Review(folder).captures] == waits
-    *_, (_, _, message) = open_mcap(recording.path).messages([str(Topic.QUALITY)])
+    *_, (_, _, message) = McapFile(recording.path).sound().messages([str(Topic.QUALITY)])
     remark = Quality.model_validate_json(message.data).checks[-1]
     assert (remark.name, remark.score, remark.passed) == ("dip_to_touch", waits[-1], True)
 

@@ -16,7 +16,7 @@ from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.journal import replay
-from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
 from tests.calibrate.given import kept_lens
@@ -50,7 +50,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert engine.snapshot().state is State.DONE, engine.snapshot().messages
 
     [folder] = bent_lab.sessions.iterdir()
-    [(schema, _, message)] = open_mcap(Recording(folder).path).messages([str(Topic.CALIBRATION)])
+    [(schema, _, message)] = McapFile(Recording(folder).path).messages([str(Topic.CALIBRATION)])
     recorded = CameraCalibration.FromString(message.data)
     assert schema is not None
     assert (schema.name, recorded.width, recorded.height) == ("foxglove.CameraCalibration", 1024, 768)

@@ -28,7 +28,7 @@ from brushloop.collect.engine.telemetry import FRAME_PERIOD_S
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import CollectRequest, collect
 from brushloop.drivers.samples import Frame, Stamp
-from brushloop.sessions.mcap_file import open_mcap
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message, pose_message
 from brushloop.sessions.records import Topic, Wrench
@@ -294,7 +294,7 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
     thread.join(timeout=PATIENCE_S)
     [folder] = lab.sessions.iterdir()
     assert verify_session(folder).sound
-    recorded = set(open_mcap(folder / f"{folder.name}.mcap").stated)
+    recorded = set(McapFile(folder / f"{folder.name}.mcap").sound().stated)
     assert Topic.PREVIEW not in recorded
     assert {Topic.PREVIEW, Topic.TCP, Topic.WRENCH, Topic.STEP, Topic.STROKE} <= seen
     assert seen <= {*recorded, Topic.PREVIEW} - {Topic.STILL}

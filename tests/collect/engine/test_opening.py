@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,14 @@ from typing import Any
 
 import pytest
 
-from brushloop.collect.engine.open_or_resume import Difference, Opening, find_resumable, put_in_sheet
+from brushloop.collect.engine.open_or_resume import (
+    Difference,
+    Opening,
+    find_resumable,
+    next_session_id,
+    open_sessions,
+    put_in_sheet,
+)
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.planning.limit_check import distinct_steps
@@ -19,6 +27,7 @@ from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.drivers.clock import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.sessions.errors import InputError
 from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
 from brushloop.sessions.journal import RunState
 from brushloop.sessions.records import Header, Source
@@ -211,9 +220,35 @@ def test_a_sheet_stays_in_until_each_stroke_on_it_is_photographed() -> None:
     press = Press(stroke_id="first", condition=Condition(depth_mm=13.0, tilt_deg=5.0))
     state = RunState()
     store: Any = SimpleNamespace(state=state, fresh_sheet=lambda: None)
-    done: dict[str, Any] = {"t_ns": 1, "attempt": 1, "sha256": "", "counts": {}}
-    state.apply(Done(key="a", file="0000-press-a.mcap", result=PressResult(press=press), **done))
+    done: dict[str, Any] = {"t_ns": 1, "attempt": 1, "sheet": 0, "sha256": "", "counts": {}}
+    state.apply(Done(key="a", kind=StepKind.PRESS, file="0000-press-a.mcap", result=PressResult(press=press), **done))
     with pytest.raises(ConfigError, match="first is pressed on sheet 1 but not photographed"):
         put_in_sheet(store, 2)
-    state.apply(Done(key="b", file="0001-capture-b.mcap", result=CaptureResult(press=press, still=1), **done))
+    state.apply(
+        Done(
+            key="b",
+            kind=StepKind.CAPTURE,
+            file="0001-capture-b.mcap",
+            result=CaptureResult(press=press, still=1),
+            **done,
+        )
+    )
     put_in_sheet(store, 2)
+
+
+def test_open_sessions_are_listed_oldest_first_without_the_closed(lab: Path) -> None:
+    for name in ("grid-00", "grid-02"):
+        begin(name)
+    store = SessionStore(lab / "sessions" / "grid-01", HostClock().now_ns)
+    store.close()
+    store.release()
+    assert [folder.name for folder in open_sessions(lab / "sessions")] == ["grid-00", "grid-02"]
+
+
+def test_session_ids_count_up_until_the_day_is_full(tmp_path: Path) -> None:
+    today = dt.date(2026, 11, 21)
+    assert next_session_id(tmp_path, "grid", today) == "2026-11-21-grid-01"
+    for number in range(1, 1000):
+        (tmp_path / f"2026-11-21-grid-{number:02d}").touch()
+    with pytest.raises(InputError, match="999 sessions"):
+        next_session_id(tmp_path, "grid", today)

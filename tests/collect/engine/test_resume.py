@@ -65,7 +65,7 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
         refuse(engine, None if leaves else number)
         assert (lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()) == before
 
-    SessionStore(folder, None, lambda: 1).release()  # as a process that is killed
+    SessionStore(folder, lambda: 1).release()  # as a process that is killed
     engine = lab.engine(watched=True)
     number, question = asked(engine)
     assert "cut off" in question

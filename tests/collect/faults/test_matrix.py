@@ -321,7 +321,7 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
         assert bool(line["patches"]) is (line["kind"] == "press")
         assert {(line["sheet"], patch) for patch in line["patches"]} <= state.used_patches, "burnt"
         assert (folder / f"{line['file']}.part").is_file(), "its evidence is kept"
-    store = SessionStore(folder, None, time.time_ns)
+    store = SessionStore(folder, time.time_ns)
     store.verify()
     store.release()
 

@@ -24,7 +24,7 @@ from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.collect.tui.text import plot, plot_title, scale_n, spark
 from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.terminal import Progress
-from brushloop.sessions.verify import Finding, Verdict
+from brushloop.sessions.verify import Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.screen_text import has_picture, look, shown
@@ -228,7 +228,7 @@ async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monke
         text = await ready(app, pilot)
         assert ran == [("calibrate", tmp_path)]
         assert "line 29" in text
-    assert "! damaged" in verdict_content(Verdict("s", "closed", findings=[Finding("a.mcap", "is cut")])).plain
+    assert "! damaged" in verdict_content(Verdict("s", "closed", findings={"a.mcap": ["is cut"]})).plain
 
 
 def test_a_session_that_cannot_be_calibrated_fitted_or_validated_says_why_and_the_screen_stays(tmp_path: Path) -> None:

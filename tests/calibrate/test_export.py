@@ -10,13 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
+from brushloop.calibrate.export import export
+from brushloop.calibrate.waits import unlike, waits_of
 from brushloop.sessions.disk import as_cell, as_text, csv_text, number
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
-from brushloop.sessions.export import export
 from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
-from brushloop.sessions.recording import Recording, unlike, waits_of
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Check, Quality, Topic, Wrench
 
 

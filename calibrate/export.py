@@ -27,17 +27,20 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
-from brushloop.sessions.disk import check_room, csv_text, staged_folder, write_durably
+from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.waits import unlike
+from brushloop.sessions.disk import check_room, csv_text, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
 from brushloop.sessions.events import Begin, StepEvent, StepKind
-from brushloop.sessions.messages import PNG_START
-from brushloop.sessions.recording import Capture, Recording, unlike
+from brushloop.sessions.messages import PNG_START, encode_png
+from brushloop.sessions.recording import Capture, Recording
 from brushloop.sessions.records import Quality, Stroke, Topic, Wrench
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
 
 TEXTS = ("stroke_id", "file", "session_id", "source", "kind", "quality", "marked_bad", "licence", "mask_file", "flags")
 """Columns of text."""
@@ -78,33 +81,20 @@ FORCES = Series("force", Topic.WRENCH, tuple(Wrench.model_fields), _wrench)
 """In the sensor's own frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class Crop:
-    """The surroundings of a stroke as seen straight from above, at the same scale for every stroke."""
-
-    image_png: bytes
-    """Gray, not corrected for the light."""
-    mask_png: bytes
-    """255 where the stroke's ink is, else 0; as large as the image."""
-    px_per_mm: float
-    anchor_px: tuple[float, float] | None
-    """Zero-touch point on the crop; pixel j covers [j, j + 1)."""
-    flags: str
-    """Defects of the capture, separated by `; `."""
-
-
-Cropper = Callable[[Capture], Crop | str]
-"""Crops a capture, or says why it cannot be cropped."""
+Cropped = tuple[Row, dict[str, bytes]]
+"""What a crop adds to the row of its stroke, and its pictures by name, as PNG."""
 
 
 class Export:
     """The rows from which every format is written: strokes with their pictures, poses, and forces."""
 
-    def __init__(self, recording: Recording, progress: Progress = unseen, cropper: Cropper | None = None) -> None:
-        """Raises `SessionDamaged` where a stroke appears twice."""
+    def __init__(self, recording: Recording, crop: Callable[[Capture], Cropped] | None = None) -> None:
+        """`crop` makes the pictures of a capture, the photographs are taken without one.
+
+        Raises `SessionDamaged` where a stroke appears twice.
+        """
         self.recording = recording
-        self._progress = progress
-        self.cropper = cropper
+        self._crop = crop
         self.strokes: dict[str, Stroke] = {}
         for stroke in recording.stroke_records():
             if self.strokes.setdefault(stroke.stroke_id, stroke) is not stroke:
@@ -115,27 +105,22 @@ class Export:
         """`passed`, or `failed: ...`, by the name of each stroke that was judged."""
         self.left_out: list[tuple[str, str]] = []
         """(stroke, reason) of those that could not be cropped; filled while the captures are read."""
-        self.pictures = ("image",) if cropper is None else ("image", "mask")
-        """Names of the pictures that each stroke has."""
         self.series = (POSES, FORCES) if recording.counts.get(Topic.WRENCH, 0) else (POSES,)
 
-    def captures(self) -> Iterator[tuple[Row, dict[str, bytes]]]:
-        """Strokes as rows of plain values, None where a value is not recorded, with their encoded pictures by name."""
-        captures = counted(self.recording.captures(), "strokes exported", len(self.strokes), self._progress)
+    def captures(self, progress: Progress = unseen) -> Iterator[tuple[Row, dict[str, bytes]]]:
+        """Strokes as rows of plain values, None where a value is not recorded, with their pictures by file name."""
+        captures = counted(self.recording.captures(), "strokes exported", len(self.strokes), progress)
         for index, capture in enumerate(captures):
-            row = self.row(index, capture.stroke) | {"marked_bad": capture.bad}
-            pictures = {"image": capture.still_png}
-            if self.cropper is not None:
-                crop = self.cropper(capture)
-                if isinstance(crop, str):
-                    self.left_out.append((capture.stroke.stroke_id, crop))
-                    continue
-                scale = (crop.px_per_mm, crop.px_per_mm)
-                row |= {**_pair("anchor", "px", crop.anchor_px), **_pair("px_per_mm", "", scale), "flags": crop.flags}
-                pictures = {"image": crop.image_png, "mask": crop.mask_png}
-            for name, data in pictures.items():
-                row[file_column(name)] = _file_name(index, capture.stroke.stroke_id, name, data)
-            yield row, pictures
+            stroke = capture.stroke
+            try:
+                values, pictures = ({}, {"image": capture.still_png}) if self._crop is None else self._crop(capture)
+            except (CaptureRefused, SessionDamaged) as error:
+                self.left_out.append((stroke.stroke_id, error.what))
+                continue
+            files = {name: _file_name(index, stroke.stroke_id, name, data) for name, data in pictures.items()}
+            columns = {"file" if name == "image" else f"{name}_file": file for name, file in files.items()}
+            row = self.row(index, stroke) | {"marked_bad": capture.bad} | values | columns
+            yield row, {files[name]: data for name, data in pictures.items()}
 
     def row(self, index: int, stroke: Stroke) -> Row:
         """Every value of a stroke that does not need its photograph."""
@@ -153,9 +138,9 @@ class Export:
             "dip_to_touch_s": wait,
             "dip_to_touch_unlike": None if wait is None else float(stroke.stroke_id in self._odd),
             "heading_deg": stroke.heading_deg,
-            **_pair("anchor", "mm", stroke.anchor_mm),
-            **_pair("anchor", "px", stroke.anchor_px),
-            **_pair("px_per_mm", "", stroke.px_per_mm),
+            **pair("anchor_{}_mm", stroke.anchor_mm),
+            **pair("anchor_{}_px", stroke.anchor_px),
+            **pair("px_per_mm_{}", stroke.px_per_mm),
             **dict(zip(PATCH_COLUMNS, stroke.cell_mm or (None,) * len(PATCH_COLUMNS), strict=True)),
             "quality": self.quality.get(stroke.stroke_id, ""),
             "marked_bad": "",
@@ -196,15 +181,9 @@ class Export:
         return dict(zip((*SAMPLE_COLUMNS, *series.columns), columns, strict=True))
 
 
-def _pair(stem: str, unit: str, values: tuple[float, float] | None) -> Row:
-    first, second = values or (None, None)
-    end = f"_{unit}" if unit else ""
-    return {f"{stem}_x{end}": first, f"{stem}_y{end}": second}
-
-
-def file_column(picture: str) -> str:
-    """Name of the column that names a picture's file."""
-    return "file" if picture == "image" else f"{picture}_file"
+def pair(column: str, values: tuple[float, float] | None) -> Row:
+    """Two columns, `{}` in whose name stands for x and y."""
+    return dict(zip((column.format("x"), column.format("y")), values or (None, None), strict=True))
 
 
 def _file_name(index: int, stroke_id: str, picture: str, data: bytes) -> str:
@@ -218,32 +197,37 @@ def export(
     out: Path,
     kind: str,
     progress: Progress = unseen,
-    make_cropper: Callable[[Recording], Cropper] | None = None,
+    *,
+    crops: bool = False,
+    calibration: Path | None = None,
 ) -> list[tuple[str, str]]:
     """Export a session into the new or empty folder `out` as `csv`, `npz` or `parquet`.
 
-    With `make_cropper`, every photograph is replaced by a crop and its mask. Returns (stroke, reason) of the strokes
-    that could not be cropped. Raises `InputError` for an unknown format, a folder that is not empty, or a session of
-    which no stroke can be cropped, `SessionDamaged` for a recording that cannot be read; nothing is left behind then.
+    With `crops`, every photograph is replaced by a crop and its mask, by this calibration or the one in use. Returns
+    (stroke, reason) of the strokes that could not be cropped. Raises `InputError` for an unknown format, a folder that
+    is not empty, or a session of which no stroke can be cropped, `SessionDamaged` for a recording that cannot be read;
+    nothing is left behind then.
     """
     if (write := WRITERS.get(kind)) is None:
         raise InputError("--format", f"{kind!r}, allowed: {', '.join(WRITERS)}")
+    if calibration is not None and not crops:
+        raise InputError("--calibration", "needs --crops")
     recording = Recording(source)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(out, "exists and is not an empty folder; nothing is ever overwritten")
-    if recording.strokes() == 0:
+    if recording.counts[Topic.STROKE] == 0:
         raise InputError(recording.path, "holds no strokes to export")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         check_room(out.parent, recording.path.stat().st_size)
-        exported = Export(recording, progress, None if make_cropper is None else make_cropper(recording))
+        exported = Export(recording, cropper_of(recording, calibration) if crops else None)
         with staged_folder(out) as stage:
-            _write_strokes(exported, stage, write)
+            _write_strokes(exported, stage, write, progress)
             for series in exported.series:
                 write(stage / f"{series.name}s", exported.sample_columns(series))
             origin = {"file": recording.path.name, "sha256": recording.sha256}
             header = recording.header.model_dump(mode="json") | {"exported_from": origin}
-            write_durably(stage / "header.json", (json.dumps(header, indent=2, ensure_ascii=False) + "\n").encode())
+            (stage / "header.json").write_text(json.dumps(header, indent=2, ensure_ascii=False) + "\n", "utf-8")
             if len(exported.left_out) == len(exported.strokes):
                 stroke_id, reason = exported.left_out[0]
                 raise InputError(recording.path, f"holds no stroke that can be cropped: {stroke_id} {reason}")
@@ -252,14 +236,35 @@ def export(
     return exported.left_out
 
 
-def _write_strokes(export: Export, folder: Path, write: TableWriter) -> None:
+def cropper_of(recording: Recording, path: Path | None) -> Callable[[Capture], Cropped]:
+    """Make what crops a recording's captures, by the calibration given, else by the one in use.
+
+    A crop is rectified, at 20 px/mm, with its mask. Raises `CalibrationError` where a session was not calibrated; an
+    import needs no calibration.
+    """
+    # Photographs are exported without the libraries that crops need.
+    from brushloop.calibrate.presses import crop
+    from brushloop.calibrate.session import calibration_of
+    from brushloop.calibrate.stroke.params import PX_PER_MM
+
+    calibration = calibration_of(recording, next(recording.stroke_records()), recording.sha256, path)
+
+    def cropped(capture: Capture) -> Cropped:
+        raster, ink, prepared = crop(capture, calibration)
+        values = {"flags": "; ".join(prepared.flags), **pair("px_per_mm_{}", (PX_PER_MM, PX_PER_MM))}
+        pictures = {"image": encode_png(raster), "mask": encode_png(ink.astype("uint8") * 255)}
+        return values | pair("anchor_{}_px", prepared.anchor_px), pictures
+
+    return cropped
+
+
+def _write_strokes(export: Export, folder: Path, write: TableWriter, progress: Progress) -> None:
     """Write the pictures, and the table of strokes."""
-    for name in export.pictures:
-        (folder / f"{name}s").mkdir()
     rows: list[Row] = []
-    for row, pictures in export.captures():
+    for row, pictures in export.captures(progress):
         for name, data in pictures.items():
-            write_durably(folder / str(row[file_column(name)]), data)
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(data)
         rows.append(row)
     columns = dict.fromkeys(name for row in rows for name in row)
     write(folder / "strokes", {name: [row.get(name) for row in rows] for name in columns})
@@ -267,7 +272,7 @@ def _write_strokes(export: Export, folder: Path, write: TableWriter) -> None:
 
 def _write_csv(path: Path, table: Table) -> None:
     text = csv_text(list(table), zip(*table.values(), strict=True), "\r\n")
-    write_durably(path.with_suffix(".csv"), text.encode())
+    path.with_suffix(".csv").write_bytes(text.encode())
 
 
 def _write_npz(path: Path, table: Table) -> None:
