@@ -6,14 +6,12 @@ its zero touch is found. Its leash and the terms that grow with depth are adapte
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from rich.table import Table
 
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
 from brushloop.calibrate.drags.captures import COMMANDS, Drawn
@@ -32,7 +30,6 @@ from brushloop.calibrate.drags.fit import (
     threshold,
 )
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.report import source_label, source_note
 from brushloop.calibrate.spread import farthest_first
 from brushloop.model.drag import DragModel, Floats, Indices, ink
 from brushloop.model.similarity import binary_scores
@@ -55,18 +52,12 @@ GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "dr
 STROKE_MM2 = 0.14
 """Weight of a square millimetre of wrong ink in such a fit. One stroke then determines the place to about 1 mm, as far
 as strokes of one session scatter."""
-PIECE = 32
-"""Images predicted at a time, so that memory stays bounded."""
 Masks = NDArray[np.bool_]
 FOLDER = "dragfit"
 FOLDS = 5
 LEAST = 3
 """Least number of images: fewer do not distinguish lag from drift."""
 PREDICTED, LAGGING, STAMPS = "bristle lag, corrected", "bristle lag", "circle stamps"
-ENDS_UNKNOWN = (
-    "The table gives no depth at the ends (depth_ends_mm, or z_frac_ends beside z_frac_mid): the depth is taken as "
-    "constant."
-)
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
@@ -81,30 +72,21 @@ class Predictor:
     share: float = 1.0
     """Share of the correction that is used: 1 in the session that it was learned in, `BETWEEN_SESSIONS` in others."""
 
-    def ink(self, drawn: Drawn, images: Indices) -> Masks:
-        """The ink that these images should show, (n, len(y_mm), len(x_mm))."""
-        return self.ink_both_ways(drawn, images)[0]
-
-    def ink_both_ways(self, drawn: Drawn, images: Indices) -> tuple[Masks, Masks]:
+    def ink(self, drawn: Drawn, images: Indices) -> tuple[Masks, Masks]:
         """The ink that these images should show, and the same without the correction, (n, len(y_mm), len(x_mm))."""
-        parts = [self._ink(drawn, images[k : k + PIECE]) for k in range(0, max(len(images), 1), PIECE)]
-        seen, alone = (np.concatenate(masks) for masks in zip(*parts, strict=True))
-        return seen, alone
+        away = marks_mm(self.model, drawn.drawings.only(images))
+        alone, added = self.is_ink(away), self.added_mm(drawn, images)
+        return (alone if added is None else self.is_ink(clipped(away) + added)), alone
 
     def added_mm(self, drawn: Drawn, images: Indices) -> Floats | None:
         """What the correction adds to signed distances once they are clipped; None without one, or for figures."""
         if self.correction is None or drawn.commands is None:
             return None
-        return self.share * self.correction.added_mm(drawn.commands[images], drawn.drawings.only(images))
+        return self.share * self.correction.added_mm(drawn.commands[images], drawn.drawings.x_mm, drawn.drawings.y_mm)
 
     def is_ink(self, away_mm: NDArray[np.floating]) -> Masks:
         """Whether a pixel at this signed distance counts as ink."""
         return ink(np.asarray(away_mm, np.float64), self.spread_mm) > self.above
-
-    def _ink(self, drawn: Drawn, images: Indices) -> tuple[Masks, Masks]:
-        away = marks_mm(self.model, drawn.drawings.only(images))
-        alone, added = self.is_ink(away), self.added_mm(drawn, images)
-        return (alone if added is None else self.is_ink(clipped(away) + added)), alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +148,7 @@ def session_change(known: Predictor) -> dict[str, float]:
 
     Terms that grow with depth are free only if the depths of the strokes that the brush was fitted to are known.
     """
-    deepest = 0.0 if known.correction is None else known.correction.ridge.commands[:, COMMANDS.index("depth_mm")].max()
+    deepest = 0.0 if known.correction is None else known.correction.commands[:, COMMANDS.index("depth_mm")].max()
     growth = {"leash_mm": LEASH_MM} | {name: mm / deepest for name, mm in GROWTH_MM.items()} if deepest > 0.0 else {}
     changes = SESSION_MM | growth
     return {name: changes[name] for name in DragModel.names() if name in changes}
@@ -193,24 +175,6 @@ class DragScore(Frozen):
     images: int
 
 
-class Stamps(Frozen):
-    """Circle stamps fitted to the same strokes: what a report shows beside the lag."""
-
-    parameters: Annotated[list[float], Field(min_length=14, max_length=14)]
-    spread_mm: Annotated[float, Field(gt=0.0, le=50.0)]
-    ink_above: Probability
-
-    @staticmethod
-    def of(predictor: Predictor) -> Stamps:
-        """Circle stamps as they go into an artefact."""
-        parameters = predictor.model.vector().tolist()
-        return Stamps(parameters=parameters, spread_mm=predictor.spread_mm, ink_above=predictor.above)
-
-    def predictor(self) -> Predictor:
-        """Circle stamps as they predict."""
-        return Predictor(DragModel.of(np.array(self.parameters)), self.spread_mm, self.ink_above)
-
-
 class DragArtefact(SessionFit):
     """The fitted drag model on disk. Equal inputs give an equal file."""
 
@@ -222,7 +186,9 @@ class DragArtefact(SessionFit):
     """Scores by model; empty with too few images to leave any out."""
     ink_above: Probability = INK_ABOVE
     """A pixel counts as ink above this probability: chosen on the training strokes."""
-    stamps: Stamps
+    stamps: Annotated[list[float], Field(min_length=14, max_length=14)]
+    """Circle stamps fitted to the same strokes: what a report shows beside the lag."""
+    stamps_above: Probability
     kept: Kept | None = None
     """Training strokes, from which the correction of the lag is computed; None for figures."""
     fitted_strokes: tuple[str, ...] = ()
@@ -236,6 +202,10 @@ class DragArtefact(SessionFit):
     def model(self) -> DragModel:
         """The fitted drag model."""
         return DragModel(**{name: value.value for name, value in self.parameters.items()})
+
+    def stamp_predictor(self) -> Predictor:
+        """Circle stamps as they predict."""
+        return Predictor(DragModel.of(np.array(self.stamps)), STAMP_SPREAD_MM, self.stamps_above)
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -254,54 +224,7 @@ class DragArtefact(SessionFit):
         return Predictor(self.model(), above=self.ink_above, correction=correction, share=share)
 
 
-@dataclass(frozen=True, slots=True)
-class FittedDrags:
-    """A fit of a session, and all that is printed about it."""
-
-    drawn: Drawn
-    artefact: DragArtefact
-
-    def lines(self) -> Iterator[object]:
-        """What the command prints: lines and tables."""
-        drawn, artefact = self.drawn, self.artefact
-        label = source_label(drawn.header.source, [drawn.header.brush])
-        yield (
-            f"{source_note(drawn.header.source, drawn.header.brush)}; "
-            f"{artefact.strokes} dragged strokes in {artefact.images} images"
-        )
-        yield from (f"left out: {name}: {why}" for name, why in drawn.refused)
-        each = zip(drawn.stroke_ids, drawn.flags, strict=True)
-        yield from (f"counts less: {name}: {'; '.join(flags)}" for name, flags in each if flags)
-        if drawn.commands is not None:
-            yield ends_sentence(drawn.ends)
-        if artefact.prior:
-            adapted = ", ".join(artefact.refitted)
-            yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these adapted: {adapted}."
-        table = Table("parameter", "fitted", "95 %", title=f"drag model, mm ({label})")
-        for name, found in artefact.parameters.items():
-            interval = "not determined" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
-            if artefact.prior and name not in artefact.refitted:
-                interval = "as before"
-            table.add_row(name, f"{found.value:.3f}", interval)
-        yield table
-        if artefact.kept is not None:
-            yield f"A pixel is ink above a probability of {artefact.ink_above:g}, chosen by the training strokes."
-        if artefact.held_out:
-            title = f"a fifth left out in turn, where the command put it, percent ({label})"
-            table = Table("model", "n", "CSIM", "IoU", title=title)
-            for name, score in artefact.held_out.items():
-                table.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
-            yield table
-        elif not artefact.prior:
-            yield "Fewer than five images: too few to leave some out."
-
-
-def ends_sentence(ends: str) -> str:
-    """Where the depth at both ends of a stroke comes from."""
-    return f"The depth at both ends is that of the column {ends}." if ends else ENDS_UNKNOWN
-
-
-def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
+def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> DragArtefact:
     """Fit all images, leave out each fifth of their conditions in turn, and make the artefact.
 
     Raises `CalibrationError` for fewer than three images.
@@ -311,16 +234,19 @@ def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> FittedDrags:
         what = f"{count} images of dragged strokes, at least {LEAST} are needed"
         raise CalibrationError(drawn.header.session_id, what)
     learned = learn(drawn, np.arange(count))
-    artefact = _artefact(drawn, np.arange(count), learned.fit.values(), Stamps.of(learned.stamps))
-    found = {
-        "ink_above": learned.predictor.above,
-        "kept": learned.kept,
-        "held_out": _held_out(drawn, progress),
-    }
-    return FittedDrags(drawn, artefact.model_copy(update=found))
+    held_out = _held_out(drawn, progress)
+    return _artefact(
+        drawn,
+        np.arange(count),
+        learned.fit.values(),
+        learned.stamps,
+        ink_above=learned.predictor.above,
+        kept=learned.kept,
+        held_out=held_out,
+    )
 
 
-def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> FittedDrags:
+def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> DragArtefact:
     """Adapt a known brush to `strokes` images of a session, as different as possible (`session_change`).
 
     Raises `CalibrationError` if the session has fewer images, or if its scale is not that of `prior`.
@@ -332,21 +258,24 @@ def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> 
         raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drawn.mm_per_px:g}")
     images = np.sort(different(drawn, np.arange(count), strokes))
     fit = adapt(drawn, images, prior.predictor(where, drawn.recording_sha256))
-    stamps = prior.stamps.predictor()
-    moved = replace(stamps, model=adapt(drawn, images, stamps).model)
+    stamps = prior.stamp_predictor()
     adapted = {name: value for name, value in fit.values().items() if name in fit.freedom}
-    artefact = _artefact(drawn, images, prior.parameters | adapted, Stamps.of(moved))
-    update = {
-        "ink_above": prior.ink_above,
-        "kept": prior.kept,
-        "prior": prior.digest,
-        "prior_session": f"{prior.session_id}, {prior.source}",
-        "refitted": tuple(fit.freedom),
-    }
-    return FittedDrags(drawn, artefact.model_copy(update=update))
+    return _artefact(
+        drawn,
+        images,
+        prior.parameters | adapted,
+        replace(stamps, model=adapt(drawn, images, stamps).model),
+        ink_above=prior.ink_above,
+        kept=prior.kept,
+        prior=prior.digest,
+        prior_session=f"{prior.session_id}, {prior.source}",
+        refitted=tuple(fit.freedom),
+    )
 
 
-def _artefact(drawn: Drawn, images: Indices, values: dict[str, FittedValue], stamps: Stamps) -> DragArtefact:
+def _artefact(
+    drawn: Drawn, images: Indices, values: dict[str, FittedValue], stamps: Predictor, **more: Any
+) -> DragArtefact:
     return DragArtefact(
         session_id=drawn.header.session_id,
         source=drawn.header.source,
@@ -357,8 +286,10 @@ def _artefact(drawn: Drawn, images: Indices, values: dict[str, FittedValue], sta
         strokes=len(drawn.drawings.only(images).paths),
         mm_per_px=round(drawn.mm_per_px, 9),
         parameters=values,
-        stamps=stamps,
+        stamps=stamps.model.vector().tolist(),
+        stamps_above=stamps.above,
         fitted_strokes=tuple(drawn.stroke_ids[int(k)] for k in images),
+        **more,
     )
 
 
@@ -371,11 +302,11 @@ def _held_out(drawn: Drawn, progress: Progress) -> dict[str, DragScore]:
         is_left = np.isin(conditions, order[k::FOLDS])
         left, others = np.flatnonzero(is_left), np.flatnonzero(~is_left)
         learned, truth = learn(drawn, others), drawn.drawings.ink[left] > 0.5
-        seen, alone = learned.predictor.ink_both_ways(drawn, left)
+        seen, alone = learned.predictor.ink(drawn, left)
         if learned.kept is not None:
             found.setdefault(PREDICTED, []).append(binary_scores(seen, truth))
         found.setdefault(LAGGING, []).append(binary_scores(alone, truth))
-        found.setdefault(STAMPS, []).append(binary_scores(learned.stamps.ink(drawn, left), truth))
+        found.setdefault(STAMPS, []).append(binary_scores(learned.stamps.ink(drawn, left)[0], truth))
     means = {name: (100.0 * np.concatenate(each).mean(axis=0)).tolist() for name, each in found.items()}
     images = len(drawn.stroke_ids)
     return {name: DragScore(csim_percent=csim, iou_percent=iou, images=images) for name, (csim, iou) in means.items()}

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import prepare_cell
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import Line, fit_line
 from brushloop.calibrate.stroke.measure import Measured, measure, outline
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params
@@ -34,7 +34,7 @@ from brushloop.calibrate.stroke.preprocess import Prepared, components, fill_hol
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.model.drag import Drawings, Floats
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Header, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -54,6 +54,7 @@ HOLLOW_SHARE = 0.75
 FLAGGED_WEIGHT = 0.3
 """Weight in a fit of a stroke with any of these defects: its shape says less about the brush."""
 THUMB_PX = 160
+OUTLINE_GRAY = 128
 LEVEL_DEG = 20.0
 """Bent strokes along x have a rectangle that is a little tilted: only strokes of another direction are turned."""
 
@@ -96,13 +97,10 @@ class Drawn:
 def read_drags(
     session: Path, mm_per_px: float, calibration_path: Path | None = None, progress: Progress = unseen
 ) -> Drawn:
-    """Read every usable drag or drawn figure. Raises `CalibrationError` if a session holds none."""
-    recording = Recording(session)
-    digest, strokes = recording.sha256, list(recording.stroke_records())
+    """Read every usable drag or drawn figure. Raises `CalibrationError` if a session holds none, or presses."""
+    opened = open_session(session, calibration_path, "drag")
+    recording, strokes, calibration = opened.recording, opened.strokes, opened.calibration
     where = str(recording.path)
-    if not strokes or {stroke.kind for stroke in strokes} != {"drag"}:
-        raise CalibrationError(where, "holds no drags: fit its presses without --drags")
-    calibration = calibration_of(recording, strokes[0], digest, calibration_path)
     figures = figures_of(recording.header) if calibration is not None else {}
     ends, travel_mm = _ends(strokes)
     x_mm, y_mm = (
@@ -131,10 +129,10 @@ def read_drags(
         names.append(capture.stroke.stroke_id)
     if not images:
         raise CalibrationError(where, f"holds no usable stroke: {refused[0][0]}: {refused[0][1]}")
-    weights = np.array([FLAGGED_WEIGHT if found else 1.0 for found in flags])
+    weights = np.array([_weight(found) for found in flags])
     drawings = Drawings(paths, np.array(groups), np.array(images), x_mm, y_mm, weights)
     known = np.array(commands) if commands else None
-    return Drawn(recording.header, digest, calibration, drawings, names, refused, known, flags, ends)
+    return Drawn(recording.header, opened.sha256, calibration, drawings, names, refused, known, flags, ends)
 
 
 def figures_of(header: Header) -> dict[str, list[Floats]]:
@@ -183,7 +181,7 @@ def depth_of(stroke: Stroke) -> float | None:
     return next((commanded[name] for name in DEPTH_NAMES if name in commanded), None)
 
 
-def _ends(strokes: list[Stroke]) -> tuple[str, float | None]:
+def _ends(strokes: Sequence[Stroke]) -> tuple[str, float | None]:
     """The column that gives the depth at the ends, and the travel in mm of which it is a share."""
     if any(ENDS in dict(stroke.commanded) for stroke in strokes):
         return ENDS, None
@@ -256,7 +254,7 @@ def defects(mask: Mask) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _patch_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
+def _patch_grid(strokes: Sequence[Stroke], mm_per_px: float, where: str) -> tuple[Floats, Floats]:
     sizes = {stroke.cell_mm[2:] for stroke in strokes if stroke.cell_mm is not None}
     if len(sizes) != 1:
         raise CalibrationError(where, "its figures have no cells, or cells of several sizes")
@@ -266,7 +264,7 @@ def _patch_grid(strokes: list[Stroke], mm_per_px: float, where: str) -> tuple[Fl
     return x_mm, size_y_mm - (np.arange(rows) + 0.5) * size_y_mm / rows
 
 
-def _grid(strokes: list[Stroke], mm_per_px: float, travel_mm: float | None, where: str) -> tuple[Floats, Floats]:
+def _grid(strokes: Sequence[Stroke], mm_per_px: float, travel_mm: float | None, where: str) -> tuple[Floats, Floats]:
     paths: list[Floats] = []
     for stroke in strokes:
         with contextlib.suppress(CaptureRefused):
@@ -287,55 +285,55 @@ class Drag:
 
     stroke_id: str
     commanded: dict[str, float]
+    depth_mm: float | None
+    """The commanded depth, under whichever name the source gives it."""
     measured: Measured
     cut: bool
     """True where the photograph cuts the stroke."""
     flags: tuple[str, ...]
     """Defects, as `defects` words them."""
-    thumbnail: NDArray[np.uint8]
+    thumbnail: Gray
     """(160, 160) gray photograph with the stroke's outline drawn in."""
 
-    @property
-    def weight(self) -> float:
-        """Weight in a fit: a stroke with a defect counts less."""
-        return FLAGGED_WEIGHT if self.flags else 1.0
 
-    @property
-    def depth_mm(self) -> float | None:
-        """The commanded depth, under whichever name the source gives it."""
-        return next((self.commanded[name] for name in DEPTH_NAMES if name in self.commanded), None)
-
-
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class DragResults:
-    """Everything that the report of an imported session needs."""
+    """The measured drags of a session, and (stroke, why) of those that cannot be measured."""
 
-    strokes: list[Drag] = field(default_factory=list[Drag])
-    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    width_on_depth: Line | None = None
-    length_on_commanded: Line | None = None
+    strokes: list[Drag]
+    refused: list[tuple[str, str]]
+
+    @property
+    def width_on_depth(self) -> Line | None:
+        """Width at the middle on commanded depth."""
+        return self._line([(drag, drag.depth_mm, drag.measured.mid_width_mm) for drag in self.strokes])
+
+    @property
+    def length_on_commanded(self) -> Line | None:
+        """Measured length on commanded length."""
+        return self._line([(drag, drag.commanded.get(LENGTH_NAME), drag.measured.length_mm) for drag in self.strokes])
+
+    @staticmethod
+    def _line(points: list[tuple[Drag, float | None, float]]) -> Line | None:
+        """A line through the strokes that are not cut; those with a defect count less, as in a fit."""
+        whole = [
+            (x, y, FLAGGED_WEIGHT if drag.flags else 1.0) for drag, x, y in points if x is not None and not drag.cut
+        ]
+        return fit_line(*(list(column) for column in zip(*whole, strict=True))) if whole else None
 
 
-def validate_drags(captures: Iterator[Capture], params: Params) -> DragResults:
-    """Measure every stroke, then fit width on depth and length on commanded length over those that are not cut.
+def _weight(flags: tuple[str, ...]) -> float:
+    return FLAGGED_WEIGHT if flags else 1.0
 
-    Strokes with a defect count less, as in a fit.
-    """
-    results = DragResults()
+
+def measure_drags(captures: Iterable[Capture], params: Params) -> DragResults:
+    """Measure every stroke."""
+    results = DragResults([], [])
     for capture in captures:
         try:
             results.strokes.append(_measure(capture, params))
         except (CaptureRefused, SessionDamaged) as error:
             results.refused.append((capture.stroke.stroke_id, error.what))
-    whole = [drag for drag in results.strokes if not drag.cut]
-    deep = [(drag.depth_mm, drag.measured.mid_width_mm, drag.weight) for drag in whole if drag.depth_mm is not None]
-    results.width_on_depth = fit_line([d for d, _, _ in deep], [w for _, w, _ in deep], [w for _, _, w in deep])
-    long = [drag for drag in whole if LENGTH_NAME in drag.commanded]
-    results.length_on_commanded = fit_line(
-        [drag.commanded[LENGTH_NAME] for drag in long],
-        [drag.measured.length_mm for drag in long],
-        [drag.weight for drag in long],
-    )
     return results
 
 
@@ -346,14 +344,12 @@ def _measure(capture: Capture, params: Params) -> Drag:
     raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
     prepared, _, flags = prepare_drag(raster, anchor, capture.where, params)
-    commanded = dict(stroke.commanded)
-    if stroke.depth_mm is not None:
-        commanded["depth_mm"] = stroke.depth_mm
-    if stroke.tilt_deg is not None:
-        commanded["tilt_deg"] = stroke.tilt_deg
+    named = {"depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
+    commanded = dict(stroke.commanded) | {name: value for name, value in named.items() if value is not None}
     # A start in the table means a commanded path, which runs along x. Scanned strokes have neither.
     size = measure(along_axis(prepared.mask) if anchor is None else prepared.mask)
-    return Drag(stroke.stroke_id, commanded, size, prepared.cut, flags, _thumbnail(raster, prepared.mask))
+    thumbnail = _thumbnail(raster, prepared.mask)
+    return Drag(stroke.stroke_id, commanded, depth_of(stroke), size, prepared.cut, flags, thumbnail)
 
 
 def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -374,17 +370,15 @@ def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(turned > 127, np.bool_)
 
 
-def _thumbnail(raster: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    side = round(1.15 * max(rows[-1] - rows[0], columns[-1] - columns[0])) + 8
-    centre = ((rows[0] + rows[-1]) // 2, (columns[0] + columns[-1]) // 2)
+def _thumbnail(raster: Gray, mask: Mask) -> Gray:
+    """A square around the stroke, with its outline drawn in."""
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    side = round(1.15 * max(width, height)) + 8
     # Padded by `side`, so that a square of that size around the stroke always fits.
-    rows_shown, columns_shown = (slice(c + side // 2, c + side // 2 + side) for c in centre)
-    crop = np.pad(raster, side, mode="edge")[rows_shown, columns_shown]
-    inside = np.pad(mask.astype(np.uint8), side)[rows_shown, columns_shown]
-    small = cv2.resize(crop, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
-    shape = cv2.resize(inside, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
-    outline = cv2.morphologyEx((shape > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
-    small[outline & (small > 90)] = 150
-    small[outline & (small <= 90)] = 230
-    return small.astype(np.uint8)
+    rows, columns = (slice(start, start + side) for start in (y + (height + side) // 2, x + (width + side) // 2))
+    small, inside = (
+        cv2.resize(padded[rows, columns], (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+        for padded in (np.pad(raster, side, mode="edge"), np.pad(mask.astype(np.uint8), side))
+    )
+    outlines, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(small, outlines, -1, OUTLINE_GRAY), np.uint8)

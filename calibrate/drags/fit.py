@@ -55,10 +55,9 @@ UNDETERMINED = 0.5
 """A parameter keeps no interval if the strokes reduce the variance of its weak prior by less than this share."""
 REACH_MM = 6.0
 """Distance at which signed distances level off, because far from the edge they carry no information."""
-SPREADS = 2.2
-"""Width of the kernel in standard deviations of each column of the training commands."""
-TILT_SPREADS = 5.0
-"""The same for the last column, the tilt, which matters little on real ink within 5 deg."""
+SPREADS = (2.2, 2.2, 2.2, 2.2, 5.0)
+"""Width of the kernel in standard deviations of each of `COMMANDS` of the training strokes; the tilt matters little on
+real ink within 5 deg."""
 RIDGE = 1.0
 LEAST_ABOVE, MOST_ABOVE = 0.3, 0.46
 LEAST = 8
@@ -83,10 +82,6 @@ class DragFit:
     gradients: Floats
     """(images, P)."""
 
-    def distance(self, drawings: Drawings) -> Floats:
-        """Signed distances of the marks of these paths, (B, len(y_mm), len(x_mm)) mm, positive in ink."""
-        return marks_mm(self.model, drawings)
-
     def values(self) -> dict[str, FittedValue]:
         """All parameters, with intervals from a bootstrap over images; a draw is one Gauss-Newton step from the fit.
 
@@ -94,8 +89,7 @@ class DragFit:
         images the intervals are too short.
         """
         count, unit = len(self.squares), np.eye(len(self.scaled))
-        share = np.full(count, 1.0 / count)
-        weights = np.random.default_rng(0).multinomial(count, share, DRAWS).astype(np.float64)
+        weights = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), DRAWS).astype(np.float64)
         square = np.tensordot(weights, self.squares, 1) + unit
         steps = np.linalg.solve(square, -(weights @ self.gradients + self.scaled)[..., None])[..., 0]
         drawn = np.quantile(steps, [0.025, 0.975], axis=0)
@@ -144,20 +138,48 @@ def fit_drags(
     scaled = fit_to_ink(trails_at, np.zeros(len(at)), drawings, spread_mm, added_mm).vector
     nodes, starts, groups = trails_at(scaled)
     slopes = derivatives(lambda values: trails_at(values)[0], scaled)
-    each = [
-        ink_equations(
-            nodes,
-            starts,
-            groups[k : k + 2],
-            slopes,
-            drawings.only(np.array([k])),
-            spread_mm,
-            None if added_mm is None else added_mm[k : k + 1],
-        )
-        for k in range(len(drawings.ink))
-    ]
-    squares, gradients = np.array([one.square for one in each]), np.array([one.gradient for one in each])
-    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, squares, gradients)
+    squares, gradients = list[Floats](), list[Floats]()
+    for k in range(len(drawings.ink)):
+        image, added = drawings.only(np.array([k])), None if added_mm is None else added_mm[k : k + 1]
+        equations = ink_equations(nodes, starts, groups[k : k + 2], slopes, image, spread_mm, added)
+        squares.append(equations.square)
+        gradients.append(equations.gradient)
+    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, np.array(squares), np.array(gradients))
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What a drag model misses: a kernel ridge over commands, on the grid of the strokes that it was learned from."""
+
+    commands: Floats
+    """(B, 5) of the strokes that it was learned from."""
+    weights: NDArray[np.float32]
+    """(B, len(y_mm) * len(x_mm))."""
+    x_mm: Floats
+    y_mm: Floats
+
+    @staticmethod
+    def fit(commands: Floats, drawings: Drawings, model: DragModel) -> Correction:
+        """Learn what the model misses of these strokes."""
+        missed = _flat(captured_distance(drawings.ink > 0.5, _mm_per_px(drawings.x_mm)))
+        missed -= _flat(marks_mm(model, drawings))
+        weights = np.linalg.solve(_gram(commands), missed).astype(np.float32)
+        return Correction(commands, weights, drawings.x_mm, drawings.y_mm)
+
+    def added_mm(self, commands: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
+        """What it adds to clipped signed distances of (B, 5) commands on a grid of the same scale; 0 outside its own.
+
+        Returns (B, len(y_mm), len(x_mm)).
+        """
+        change = _kernel(commands, self.commands, self.commands) @ self.weights
+        change = change.reshape(len(change), len(self.y_mm), len(self.x_mm))
+        left = round((float(x_mm[0]) - float(self.x_mm[0])) / _mm_per_px(self.x_mm))
+        top = round((float(self.y_mm[0]) - float(y_mm[0])) / _mm_per_px(self.x_mm))
+        out = np.zeros((len(change), len(y_mm), len(x_mm)))
+        rows = np.arange(max(0, -top), min(len(y_mm), len(self.y_mm) - top))
+        columns = np.arange(max(0, -left), min(len(x_mm), len(self.x_mm) - left))
+        out[:, rows[:, None], columns] = change[:, rows[:, None] + top, columns + left]
+        return out
 
 
 class Kept(Frozen):
@@ -191,7 +213,7 @@ class Kept(Frozen):
                 return Kept(
                     commands=np.round(commands[::step], 6).tolist(),
                     parameters=model.vector().tolist(),
-                    mm_per_px=round(float(drawings.x_mm[1] - drawings.x_mm[0]), 9),
+                    mm_per_px=round(_mm_per_px(drawings.x_mm), 9),
                     left_mm=round(float(drawings.x_mm[0]), 6),
                     top_mm=round(float(drawings.y_mm[0]), 6),
                     ink=data.decode(),
@@ -216,62 +238,6 @@ class Kept(Frozen):
         return Correction.fit(np.array(self.commands), drawings, DragModel.of(np.array(self.parameters)))
 
 
-@dataclass(frozen=True, slots=True)
-class Correction:
-    """What a drag model misses: a ridge over commands, on the grid of the strokes that it was learned from."""
-
-    model: DragModel
-    ridge: Ridge
-    drawings: Drawings
-
-    @staticmethod
-    def fit(commands: Floats, drawings: Drawings, model: DragModel) -> Correction:
-        """Learn what the model misses of these strokes."""
-        captured = captured_distance(drawings.ink > 0.5, float(drawings.x_mm[1] - drawings.x_mm[0]))
-        return Correction(model, Ridge.fit(commands, marks_mm(model, drawings), captured), drawings)
-
-    def added_mm(self, commands: Floats, drawings: Drawings) -> Floats:
-        """What it adds to clipped signed distances on a grid of the same scale, (B, rows, columns); 0 outside its own.
-
-        The strokes of `drawings` have these commands, (B, 5).
-        """
-        x_mm, y_mm = self.drawings.x_mm, self.drawings.y_mm
-        nodes, starts = trails(drawings.paths, self.model.vector())
-        base = distances(nodes, starts, x_mm, y_mm)
-        change = self.ridge.add(commands, base) - clipped(base)
-        mm_per_px = float(x_mm[1] - x_mm[0])
-        left = round((float(drawings.x_mm[0]) - float(x_mm[0])) / mm_per_px)
-        top = round((float(y_mm[0]) - float(drawings.y_mm[0])) / mm_per_px)
-        out = np.zeros((len(change), len(drawings.y_mm), len(drawings.x_mm)))
-        rows = np.arange(max(0, -top), min(len(drawings.y_mm), len(y_mm) - top))
-        columns = np.arange(max(0, -left), min(len(drawings.x_mm), len(x_mm) - left))
-        out[:, rows[:, None], columns] = change[:, rows[:, None] + top, columns + left]
-        return out
-
-
-@dataclass(frozen=True, slots=True)
-class Ridge:
-    """A kernel ridge over (B, d) commands of images on one grid."""
-
-    commands: Floats
-    scales: Floats
-    weights: NDArray[np.float32]
-    """(B, h * w)."""
-
-    @staticmethod
-    def fit(commands: Floats, base_mm: Floats, captured_mm: Floats, ridge: float = RIDGE) -> Ridge:
-        """Fit the captured signed distances minus the model's, both (B, h, w), as a function of (B, d) commands."""
-        scales = scales_of(commands)
-        missed = _flat(captured_mm) - _flat(base_mm)
-        gram = _kernel(commands, commands, scales) + ridge * np.eye(len(commands))
-        return Ridge(commands, scales, np.asarray(np.linalg.solve(gram, missed), np.float32))
-
-    def add(self, commands: Floats, base_mm: Floats) -> Floats:
-        """The model's signed distances (B, h, w), corrected."""
-        found = _flat(base_mm) + _kernel(commands, self.commands, self.scales) @ self.weights
-        return np.asarray(found, np.float64).reshape(base_mm.shape)
-
-
 def threshold(commands: Floats, base_mm: Floats, captured_mm: Floats, stride: int = 2) -> float:
     """The probability above which a pixel is ink: half the mean CSIM of training strokes, each predicted from the
     strokes of other commands.
@@ -281,29 +247,15 @@ def threshold(commands: Floats, base_mm: Floats, captured_mm: Floats, stride: in
     if len(commands) < LEAST:
         return INK_ABOVE
     base, captured = (_flat(each[:, ::stride, ::stride]) for each in (base_mm, captured_mm))
-    gram = _kernel(commands, commands, scales_of(commands)) + RIDGE * np.eye(len(commands))
     # The error of each row of a ridge that is fitted to the rows of other commands, in closed form.
-    inverse = np.asarray(np.linalg.inv(gram), np.float64)
+    inverse = np.asarray(np.linalg.inv(_gram(commands)), np.float64)
     errors = np.asarray(inverse @ (captured - base), np.float32)
-    for rows in _repeats(commands):
+    command_of = np.unique(commands, axis=0, return_inverse=True)[1].ravel()
+    for rows in (np.flatnonzero(command_of == k) for k in range(command_of.max() + 1)):
         errors[rows] = np.linalg.solve(inverse[np.ix_(rows, rows)], errors[rows])
     predicted = ink((captured - errors).astype(np.float64), SPREAD_MM) > INK_ABOVE
     half = 0.5 * float(binary_scores(predicted, captured > 0.0)[:, 0].mean())
     return min(max(round(half, 3), LEAST_ABOVE), MOST_ABOVE)
-
-
-def _repeats(commands: Floats) -> list[NDArray[np.int64]]:
-    """The rows of each command."""
-    number = np.unique(commands, axis=0, return_inverse=True)[1].ravel()
-    return [np.flatnonzero(number == k) for k in range(int(number.max()) + 1)]
-
-
-def scales_of(commands: Floats) -> Floats:
-    """(d,) lengths of the kernel; a command that never changes has no influence."""
-    spread = commands.std(axis=0)
-    factors = np.full(commands.shape[1], SPREADS)
-    factors[-1] = TILT_SPREADS
-    return np.where(spread > 1e-9, factors * spread, 1e9)
 
 
 def clipped(distance_mm: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -313,18 +265,27 @@ def clipped(distance_mm: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def captured_distance(masks: NDArray[np.bool_], mm_per_px: float) -> Floats:
     """Signed distance to the edge of captured ink (n, rows, columns), positive inside, mm."""
-    out: list[Floats] = []
-    for k in range(len(masks)):
-        mask: NDArray[np.bool_] = masks[k]
-        inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) - 0.5
-        outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) - 0.5
-        out.append(np.where(mask, inside, -outside) * mm_per_px)
-    return np.array(out, np.float64)
+
+    def to_other(inked: NDArray[np.bool_]) -> list[cv2.typing.MatLike]:
+        return [cv2.distanceTransform(each, cv2.DIST_L2, 5) - 0.5 for each in inked.astype(np.uint8)]
+
+    return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * mm_per_px
 
 
 def _flat(distance_mm: Floats) -> NDArray[np.float32]:
     return clipped(distance_mm).reshape(len(distance_mm), -1)
 
 
-def _kernel(a: Floats, b: Floats, scales: Floats) -> Floats:
+def _mm_per_px(x_mm: Floats) -> float:
+    return float(x_mm[1] - x_mm[0])
+
+
+def _gram(commands: Floats) -> Floats:
+    return _kernel(commands, commands, commands) + RIDGE * np.eye(len(commands))
+
+
+def _kernel(a: Floats, b: Floats, training: Floats) -> Floats:
+    """The Gaussian kernel of (n, 5) and (m, 5) commands; one that never changes in training has no influence."""
+    spread = training.std(axis=0)
+    scales = np.where(spread > 1e-9, np.array(SPREADS) * spread, 1e9)
     return np.exp(-0.5 * (((a[:, None] - b[None]) / scales) ** 2).sum(axis=-1))

@@ -8,27 +8,28 @@ from __future__ import annotations
 
 import json
 import math
-import platform
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Column, Table
+from rich.table import Table
 
 from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.drags.brush import STAMPS, DragArtefact, correction_helps, ends_sentence
-from brushloop.calibrate.drags.captures import DEPTH_NAMES, LENGTH_NAME, DragResults, Drawn, read_drags
+from brushloop.calibrate.drags.brush import STAMPS, DragArtefact, correction_helps
+from brushloop.calibrate.drags.captures import LENGTH_NAME, DragResults, Drawn, read_drags
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
+    dress,
     image_uri,
     overlay_uri,
     plot,
     plot_uri,
+    provenance,
     render,
+    source_label,
     source_note,
     write_files,
 )
@@ -39,9 +40,14 @@ from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
+MEASURED = "measured.csv"
 MAX_THUMBNAILS = 60
 MAX_WORST = 12
 OURS, LAG = "predicted", "bristle lag alone"
+ENDS_UNKNOWN = (
+    "The table gives no depth at the ends (depth_ends_mm, or z_frac_ends beside z_frac_mid): the depth is taken as "
+    "constant."
+)
 LIMITS = (
     "These strokes travel along the paper, and the radius and bundle length of their brush are not known. CCD-BSM "
     "describes one vertical press, so its length, outline, CSIM and SSIM cannot be compared with these strokes and "
@@ -92,24 +98,7 @@ class Predictions:
     def to_json(self) -> str:
         """All scores as JSON, with where ink and fit come from."""
         header, fit, drawn = self.drawn.header, self.artefact, self.drawn
-        table = {
-            name: {"csim": round(csim, 6), "iou": round(iou, 6), "csim_sd": round(sd, 6), "strokes": n}
-            for name, (csim, iou, sd, n) in self.means().items()
-        }
-        rows: list[dict[str, object]] = [
-            {
-                "stroke_id": name,
-                "in_sample": bool(self.fitted[k]),
-                "flags": list(drawn.flags[k]),
-                "scores": {
-                    row: {"csim": round(float(scores[k, 0]), 6), "iou": round(float(scores[k, 1]), 6)}
-                    for row, scores in self.scores.items()
-                    if np.isfinite(scores[k, 0])
-                },
-            }
-            for k, name in enumerate(drawn.stroke_ids)
-        ]
-        contents: dict[str, object] = {
+        contents = {
             "session_id": header.session_id,
             "source": str(header.source),
             "recording_sha256": drawn.recording_sha256,
@@ -120,9 +109,24 @@ class Predictions:
             "mm_per_px": fit.mm_per_px,
             "depth_at_the_ends": drawn.ends,
             "in_sample": bool(self.fitted.all()),
-            "over_all": table,
+            "over_all": {
+                name: {"csim": round(csim, 6), "iou": round(iou, 6), "csim_sd": round(sd, 6), "strokes": n}
+                for name, (csim, iou, sd, n) in self.means().items()
+            },
             "left_out": [{"stroke_id": name, "why": why} for name, why in drawn.refused],
-            "strokes": rows,
+            "strokes": [
+                {
+                    "stroke_id": name,
+                    "in_sample": bool(self.fitted[k]),
+                    "flags": list(drawn.flags[k]),
+                    "scores": {
+                        row: {"csim": round(float(scores[k, 0]), 6), "iou": round(float(scores[k, 1]), 6)}
+                        for row, scores in self.scores.items()
+                        if np.isfinite(scores[k, 0])
+                    },
+                }
+                for k, name in enumerate(drawn.stroke_ids)
+            ],
         }
         return json.dumps(contents, indent=1, ensure_ascii=False) + "\n"
 
@@ -137,13 +141,13 @@ def predict_session(
     truth = drawn.drawings.ink > 0.5
     own = artefact.recording_sha256 == drawn.recording_sha256
     fitted = np.array([own and name in artefact.fitted_strokes for name in drawn.stroke_ids])
-    corrected, alone = predictor.ink_both_ways(drawn, every)
+    corrected, alone = predictor.ink(drawn, every)
     helps = not artefact.prior or correction_helps(corrected[fitted], alone[fitted], truth[fitted])
     seen = corrected if helps else alone
     scores = {OURS: binary_scores(seen, truth)}
     if predictor.correction is not None and drawn.commands is not None:
         scores[LAG] = binary_scores(alone, truth)
-    scores[STAMPS] = binary_scores(artefact.stamps.predictor().ink(drawn, every), truth)
+    scores[STAMPS] = binary_scores(artefact.stamp_predictor().ink(drawn, every)[0], truth)
     if drawn.commands is not None:
         scores[CEILING] = _ceiling(drawn.conditions, truth)
     return Predictions(artefact, drawn, scores, seen, fitted, helps)
@@ -180,7 +184,9 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         header=validation.header,
         note=source_note(validation.header.source, validation.header.brush),
         refused=results.refused,
-        provenance=_provenance(validation, command),
+        provenance=provenance(
+            validation.header, validation.recording, validation.recording_sha256, ("command", command)
+        ),
         strokes=len(results.strokes),
         limits=LIMITS,
         sentences=list(fit_sentences(results)),
@@ -194,7 +200,7 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         predicted_by=list(prediction_sentences(validation.predictions)) if validation.predictions else [],
         worst=list(_worst(validation.predictions)) if validation.predictions else [],
     )
-    files = {"measured.csv": drags_csv(results, validation.header.source), "report.html": page}
+    files = {MEASURED: drags_csv(results, validation.header.source), "report.html": page}
     if validation.predictions is not None:
         files["report.json"] = validation.predictions.to_json()
     write_files(folder, files)
@@ -278,53 +284,28 @@ def fit_sentences(results: DragResults) -> Iterator[str]:
 def _plot(results: DragResults, source: str) -> str:
     """Width against depth and length against commanded length, with the fitted lines."""
     figure, axes = plot(1, 2, (10.0, 3.4))
-    whole = [drag for drag in results.strokes if not drag.cut]
-    pairs = (
-        ([(d.depth_mm, d.measured.mid_width_mm) for d in whole if d.depth_mm is not None], results.width_on_depth),
-        (
-            [(d.commanded["length_mm"], d.measured.length_mm) for d in whole if "length_mm" in d.commanded],
-            results.length_on_commanded,
-        ),
-    )
     figure.suptitle(source)
-    titles = (
-        ("commanded depth, mm", "measured width at the middle, mm"),
-        ("commanded length, mm", "measured length, mm"),
-    )
-    for axis, (points, line), (x_title, y_title) in zip(axes, pairs, titles, strict=True):
-        axis.plot([x for x, _ in points], [y for _, y in points], ".", ms=5, alpha=0.6, color=BLUE)
+    whole = [drag for drag in results.strokes if not drag.cut]
+    widths = [(drag.depth_mm, drag.measured.mid_width_mm) for drag in whole]
+    lengths = [(drag.commanded.get(LENGTH_NAME), drag.measured.length_mm) for drag in whole]
+    for axis, points, line, x_title, y_title in (
+        (axes[0], widths, results.width_on_depth, "commanded depth, mm", "measured width at the middle, mm"),
+        (axes[1], lengths, results.length_on_commanded, "commanded length, mm", "measured length, mm"),
+    ):
+        known = [(x, y) for x, y in points if x is not None]
+        axis.plot([x for x, _ in known], [y for _, y in known], ".", ms=5, alpha=0.6, color=BLUE)
         if line is not None:
-            ends = np.array([min(x for x, _ in points), max(x for x, _ in points)])
+            ends = np.array([min(known)[0], max(known)[0]])
             axis.plot(ends, line.slope * ends + line.intercept, color=ORANGE, lw=1.5)
-        axis.set_xlabel(x_title)
-        axis.set_ylabel(y_title)
-        axis.grid(alpha=0.3)
+        dress(axis, "", x_title, y_title)
     return plot_uri(figure)
 
 
-def _provenance(validation: DragValidation, command: str) -> list[tuple[str, str]]:
-    header = validation.header
-    rows = [
-        ("source", str(header.source)),
-        ("session", header.session_id),
-        ("recording", f"{validation.recording.name}, sha256 {validation.recording_sha256}"),
-        ("recorded with", header.software),
-        ("brush", header.brush or "not known"),
-        ("ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)),
-        ("protocol", header.protocol),
-        ("origin", header.origin),
-        ("licence", header.licence),
-        ("validated with", f"brushloop {version('brushloop')}, Python {platform.python_version()}"),
-        ("command", command),
-    ]
-    return [(name, text) for name, text in rows if text]
-
-
 def summary(validation: DragValidation) -> Iterator[Table | str]:
-    """Renderables for the terminal."""
+    """What is printed about a session: lines and tables."""
     results = validation.results
     yield f"{validation.header.session_id}: {source_note(validation.header.source)}"
-    yield _drags(results)
+    yield f"{len(results.strokes)} strokes measured: {MEASURED} has length, width and area beside what was commanded"
     yield from fit_sentences(results)
     if validation.predictions is not None:
         yield from prediction_sentences(validation.predictions)
@@ -348,26 +329,40 @@ def _predicted(predictions: Predictions) -> Iterator[Table]:
     yield out
 
 
-def _drags(results: DragResults) -> Table:
-    names = sorted({name for drag in results.strokes for name in drag.commanded})
-    # The rest of what was commanded is in the CSV and the report: a terminal is 80 columns wide.
-    shown = [n for n in (LENGTH_NAME, *DEPTH_NAMES, "tilt_deg") if n in names]
-    heads = [*(f"cmd. {_short(n)}" for n in shown), "length mm", "width mm", "at middle", "area mm²", "whole"]
-    # As wide as the longest word of its head: a narrow terminal breaks heads between words, never within one.
-    columns = [Column(head, min_width=max(len(word) for word in head.split())) for head in heads]
-    out = Table(
-        Column("stroke", overflow="fold"), *columns, title="commanded (cmd.) beside measured", padding=(0, 0, 0, 1)
+def fit_lines(drawn: Drawn, artefact: DragArtefact) -> Iterator[object]:
+    """What is printed about a fit: lines and tables."""
+    label = source_label(drawn.header.source, [drawn.header.brush])
+    yield (
+        f"{source_note(drawn.header.source, drawn.header.brush)}; "
+        f"{artefact.strokes} dragged strokes in {artefact.images} images"
     )
-    for drag in results.strokes:
-        m = drag.measured
-        sizes = (f"{m.length_mm:.2f}", f"{m.width_mm:.2f}", f"{m.mid_width_mm:.2f}", f"{m.area_mm2:.1f}")
-        values = (f"{drag.commanded[n]:.2f}" if n in drag.commanded else "" for n in shown)
-        whole = "cut" if drag.cut else "torn" if any(flag.startswith("torn") for flag in drag.flags) else "yes"
-        out.add_row(drag.stroke_id, *values, *sizes, whole)
-    return out
+    yield from (f"left out: {name}: {why}" for name, why in drawn.refused)
+    each = zip(drawn.stroke_ids, drawn.flags, strict=True)
+    yield from (f"counts less: {name}: {'; '.join(flags)}" for name, flags in each if flags)
+    if drawn.commands is not None:
+        yield ends_sentence(drawn.ends)
+    if artefact.prior:
+        adapted = ", ".join(artefact.refitted)
+        yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these adapted: {adapted}."
+    table = Table("parameter", "fitted", "95 %", title=f"drag model, mm ({label})")
+    for name, found in artefact.parameters.items():
+        interval = "not determined" if found.low is None else f"{found.low:.3f} to {found.high:.3f}"
+        if artefact.prior and name not in artefact.refitted:
+            interval = "as before"
+        table.add_row(name, f"{found.value:.3f}", interval)
+    yield table
+    if artefact.kept is not None:
+        yield f"A pixel is ink above a probability of {artefact.ink_above:g}, chosen by the training strokes."
+    if artefact.held_out:
+        title = f"a fifth left out in turn, where the command put it, percent ({label})"
+        table = Table("model", "n", "CSIM", "IoU", title=title)
+        for name, score in artefact.held_out.items():
+            table.add_row(name, str(score.images), f"{score.csim_percent:.2f}", f"{score.iou_percent:.2f}")
+        yield table
+    elif not artefact.prior:
+        yield "Fewer than five images: too few to leave some out."
 
 
-def _short(name: str) -> str:
-    """`depth_mid_mm_nominal` as `depth mm`: what a narrow column has room for."""
-    quantity = name.split("_")[0]
-    return f"{quantity} {'deg' if name.endswith('_deg') else 'mm'}"
+def ends_sentence(ends: str) -> str:
+    """Where the depth at both ends of a stroke comes from."""
+    return f"The depth at both ends is that of the column {ends}." if ends else ENDS_UNKNOWN

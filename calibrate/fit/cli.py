@@ -59,6 +59,7 @@ def _fit_drags(
     from brushloop.calibrate.artefact import load_artefact, put_to_use
     from brushloop.calibrate.drags.brush import FOLDER, DragArtefact, fit_drawn, refit_drawn
     from brushloop.calibrate.drags.captures import read_drags
+    from brushloop.calibrate.drags.report import fit_lines
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
 
@@ -67,7 +68,7 @@ def _fit_drags(
     with shown() as progress:
         drawn = read_drags(session, scale, calibration, progress)
         if before is not None:
-            fitted = refit_drawn(drawn, before, str(prior), strokes or len(drawn.stroke_ids))
+            artefact = refit_drawn(drawn, before, str(prior), strokes or len(drawn.stroke_ids))
         else:
-            fitted = fit_drawn(drawn, progress)
-    say(*fitted.lines(), f"Fit: {put_to_use(fitted.artefact, Recording(session).path.parent, FOLDER)}")
+            artefact = fit_drawn(drawn, progress)
+    say(*fit_lines(drawn, artefact), f"Fit: {put_to_use(artefact, Recording(session).path.parent, FOLDER)}")

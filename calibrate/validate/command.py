@@ -9,7 +9,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from brushloop.calibrate.drags.captures import validate_drags
+from brushloop.calibrate.drags.captures import measure_drags
 from brushloop.calibrate.drags.report import DragValidation, predict_session, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
@@ -198,7 +198,7 @@ def _drags(request: Request, sessions: Sequence[FittedSession], folder: Path, pr
     for session in sessions:
         what = f"{session.header.session_id}: measured"
         captures = counted(session.recording.captures(), what, len(session.strokes), progress)
-        results = validate_drags(captures, Params.of(session.calibration))
+        results = measure_drags(captures, Params.of(session.calibration))
         predictions = None
         if request.fit is not None:
             predictions = predict_session(session.recording.path, request.fit, request.calibration, progress)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from rich.console import Console  # noqa: TID251
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
@@ -22,8 +20,8 @@ from brushloop.calibrate.drags.captures import (
     commanded_path,
     defects,
     figures_of,
+    measure_drags,
     read_drags,
-    validate_drags,
 )
 from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
 from brushloop.calibrate.errors import CalibrationError
@@ -202,7 +200,7 @@ def test_flagged_strokes_count_less_and_a_cut_one_not_at_all(flawed: Path) -> No
 
 def test_the_report_lists_defects_and_says_everywhere_what_is_simulated(flawed: Path, tmp_path: Path) -> None:
     recording = Recording(flawed)
-    results = validate_drags(recording.captures(), Params())
+    results = measure_drags(recording.captures(), Params())
     header = recording.header.model_copy(update={"source": Source.IMPORT_SIMULATED})
     validation = DragValidation(header, recording.path, "", results)
     html = write_drags(validation, tmp_path, "test").read_text()
@@ -216,12 +214,6 @@ def test_the_report_lists_defects_and_says_everywhere_what_is_simulated(flawed: 
         rows = {row["stroke_id"]: row for row in csv.DictReader(file)}
     assert [name for name, row in rows.items() if row["cut"] == "1"] == ["cut"]
     assert rows["whole"]["source"] == "imported simulation"
-    assert {drag.stroke_id: drag.weight for drag in results.strokes}["torn"] == FLAGGED_WEIGHT
-    with io.StringIO() as narrow:
-        Console(file=narrow, width=80).print(*summary(validation))
-        heads = narrow.getvalue().split("┡")[0]
-    for word in ("stroke", "cmd.", "length", "depth", "width", "middle", "area", "whole"):
-        assert word in heads, f"the head {word} is broken"
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 45.0, 90.0, -60.0])
