@@ -8,7 +8,6 @@ import hashlib
 import html
 import io
 import json
-import platform
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from brushloop.calibrate.artefact import Frozen, made_by
+from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
@@ -82,25 +81,6 @@ def about(header: Header) -> dict[str, str]:
         "label": source_label(header.source, [header.brush]),
         "note": source_note(header.source, header.brush),
     }
-
-
-def provenance(header: Header, recording: Path, sha256: str, *more: tuple[str, str]) -> list[tuple[str, str]]:
-    """Name and text of what a page says of its recording and its making; what is not known is left out."""
-    rows = [
-        ("source", str(header.source)),
-        ("session", header.session_id),
-        ("recording", f"{recording.name}, sha256 {sha256}"),
-        ("recorded with", header.software),
-        ("robot", f"{header.robot} {header.robot_firmware}".strip()),
-        ("camera", f"{header.camera} {header.lens}".strip()),
-        ("brush", header.brush),
-        ("ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)),
-        ("origin", header.origin),
-        ("licence", header.licence),
-        *more,
-        ("made with", f"{made_by()}, Python {platform.python_version()}"),
-    ]
-    return [(name, text) for name, text in rows if text]
 
 
 @functools.cache

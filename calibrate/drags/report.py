@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from brushloop.calibrate.artefact import load_artefact
+from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.drags.brush import STAMPS, DragArtefact, correction_helps
 from brushloop.calibrate.drags.captures import LENGTH_NAME, DragResults, Drawn, read_drags
 from brushloop.calibrate.report import (
@@ -27,7 +27,7 @@ from brushloop.calibrate.report import (
     overlay_uri,
     plot,
     plot_uri,
-    provenance,
+    recording_facts,
     render,
     source_label,
     source_note,
@@ -178,15 +178,14 @@ class DragValidation:
 def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
     """Write `report.html` and `measured.csv` into `folder`; returns the report's path. Raises OSError."""
     results = validation.results
+    recording, made = validation.recording, [("validated with", made_by()), ("command", command)]
     step = max(1, -(-len(results.strokes) // MAX_THUMBNAILS))
     page = render(
         "drags.html.j2",
         header=validation.header,
         note=source_note(validation.header.source, validation.header.brush),
         refused=results.refused,
-        provenance=provenance(
-            validation.header, validation.recording, validation.recording_sha256, ("command", command)
-        ),
+        provenance=[*recording_facts(validation.header, recording.name, validation.recording_sha256, None), *made],
         strokes=len(results.strokes),
         limits=LIMITS,
         sentences=list(fit_sentences(results)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import platform
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from brushloop.calibrate.report import (
     overlay_uri,
     picture_grid,
     png_uri,
+    recording_facts,
     render,
     save_picture,
     show_picture,
@@ -98,7 +98,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         cut=[stroke_id for one in written.characters for stroke_id in one.cut],
         ssim_settings=SSIM_SETTINGS,
         picture=png_uri(picture),
-        provenance=list(_provenance(written, command)),
+        provenance=[*_facts(written), ("compared with", made_by()), ("command", command)],
     )
     csv = written_csv(written.scores, str(written.header.source))
     record = record_of(written, command, picture)
@@ -206,16 +206,13 @@ def _characters(written: WritingComparison) -> Iterator[dict[str, Any]]:
         }
 
 
-def _provenance(written: WritingComparison, command: str) -> Iterator[tuple[str, str]]:
-    header, calibration = written.header, written.calibration
-    yield "source", str(header.source)
-    yield "recording", f"{written.recording.name}, sha256 {written.recording_sha256}"
-    yield "calibration", f"{calibration.named}, pix2len {calibration.mm_per_px:.5f} mm/px"
+def _facts(written: WritingComparison) -> Iterator[tuple[str, str]]:
+    yield from recording_facts(
+        written.header.model_copy(update={"protocol": ""}),  # the plan, point by point
+        written.recording.name,
+        written.recording_sha256,
+        written.calibration,
+    )
     for one in written.characters:
         yield f"reference of {one.name}", one.reference_name
     yield "planned and simulated by", written.plan.model
-    yield "robot", f"{header.robot} {header.robot_firmware}".strip()
-    yield "camera", f"{header.camera} {header.lens}".strip()
-    yield "brush, ink, paper", ", ".join(part for part in (header.brush, header.ink, header.paper) if part)
-    yield "compared with", f"{made_by()}, Python {platform.python_version()}"
-    yield "command", command

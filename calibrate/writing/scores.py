@@ -21,7 +21,7 @@ from brushloop.calibrate.compare.score import Polarity, similarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.report import Sealed, load_sealed
-from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import Summary, others_of, summarise
 from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, points_digest
 from brushloop.sessions.errors import SessionDamaged
@@ -202,9 +202,13 @@ class WritingComparison:
     plan: PlanRecord
     characters: list[Character]
     scores: list[WrittenScore]
-    table: list[Table3Row]
     refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     """(stroke, why), never dropped in silence."""
+
+    @property
+    def table(self) -> list[Table3Row]:
+        """Table 3."""
+        return table_3(self.scores, {one.name: one.reference_name for one in self.characters})
 
 
 def compare_written(
@@ -214,11 +218,9 @@ def compare_written(
 
     Raises `CalibrationError` if the two do not belong together or nothing can be compared.
     """
-    recording = Recording(session)
-    digest = recording.sha256
-    first = next(recording.stroke_records(), None)
-    calibration = None if first is None else calibration_of(recording, first, digest, None)
-    if first is None or calibration is None:
+    opened = open_session(session)
+    recording, calibration = opened.recording, opened.calibration
+    if calibration is None:
         raise CalibrationError(str(recording.path), "holds no characters that the arm wrote")
     _check_points(recording, plan)
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
@@ -230,9 +232,9 @@ def compare_written(
         raise CalibrationError(str(recording.path), f"no character can be compared{why}")
     counting = counted(characters, "characters compared", len(characters), progress)
     scores = [score for one in counting for score in score_character(one)]
-    header = recording.header
-    table = table_3(scores, {one.name: one.reference_name for one in characters})
-    return WritingComparison(header, recording.path, digest, calibration, plan, characters, scores, table, refused)
+    return WritingComparison(
+        recording.header, recording.path, opened.sha256, calibration, plan, characters, scores, refused
+    )
 
 
 def _writings(

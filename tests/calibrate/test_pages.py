@@ -26,7 +26,7 @@ from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.calibrate.writing.report import write_written
-from brushloop.calibrate.writing.scores import Character, WritingComparison, score_character, table_3
+from brushloop.calibrate.writing.scores import Character, WritingComparison, score_character
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
@@ -145,7 +145,6 @@ def _written(folder: Path) -> str:
         plan=PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,)),
         characters=[one],
         scores=scores,
-        table=table_3(scores, {"字": "a font"}),
     )
     return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
 

@@ -59,7 +59,7 @@ def session(plan: PlanRecord, name: str = "bar", ink: np.ndarray | None = None) 
     seen = came_out(plan) if ink is None else ink
     one = Character(name, "test", as_ink(WANTED), as_ink(seen), {f"{name}-r01": as_ink(seen)})
     header = Header(session_id="s", source=Source.LOOPBACK, software="test")
-    return WritingComparison(header, Path("s.mcap"), "", Calibration.model_construct(), plan, [one], [], [])
+    return WritingComparison(header, Path("s.mcap"), "", Calibration.model_construct(), plan, [one], [])
 
 
 @pytest.fixture(scope="module")
