@@ -15,7 +15,7 @@ from brushloop.calibrate.board.register import RegistrationFile
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.brush import BrushFit
 
 KINDS: dict[str, type[Artefact]] = {
     "image_to_paper": Calibration,

@@ -23,7 +23,7 @@ from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import Field, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
-from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import student_95

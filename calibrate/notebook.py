@@ -28,9 +28,8 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
-from brushloop.calibrate.fit.artefact import FOLDER as FITS
-from brushloop.calibrate.fit.artefact import BrushFit
-from brushloop.calibrate.fit.command import FitRequest, FitResult, fit_presses
+from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.fit.brush import BrushFit, FitRequest, FitResult, fit_presses
 from brushloop.calibrate.presses import Refused, crop, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate.command import Request, ValidationOutput, check

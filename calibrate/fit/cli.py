@@ -44,7 +44,7 @@ def fit(
         _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
 
-    from brushloop.calibrate.fit.command import FitRequest, fit_presses
+    from brushloop.calibrate.fit.brush import FitRequest, fit_presses
     from brushloop.sessions.terminal import shown
 
     request = FitRequest(session, mm_per_px or MM_PER_PX, calibration, reference)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, by_cell
-from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, predictor
-from brushloop.calibrate.fit.run import Fitted
-from brushloop.calibrate.fit.sizes import measure, middle
+from brushloop.calibrate.artefact import made_by
+from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, Size, by_cell, measure, middle
+from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, HeldOut, predictor
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
@@ -37,7 +36,9 @@ COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Of Okabe and Ito, one for each tilt in turn."""
 
 
-def write_fit_page(captures: Captures, fitted: Fitted, path: Path) -> Path:
+def write_fit_page(
+    captures: Captures, press: FittedPress, sizes: Sequence[Size], held_out: Sequence[HeldOut], path: Path
+) -> Path:
     """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
     header = captures.header
     frame = about(header)
@@ -49,17 +50,17 @@ def write_fit_page(captures: Captures, fitted: Fitted, path: Path) -> Path:
         "fit.html.j2",
         **frame,
         session=header.session_id,
-        window=_window(captures, (fitted.press, published)),
-        cells=[_cell(cell, cells[cell], fitted.press, published, captures.grid) for cell in list(cells)[::step]],
+        window=_window(captures, (press, published)),
+        cells=[_cell(cell, cells[cell], press, published, captures.grid) for cell in list(cells)[::step]],
         left_out=len(cells) - len(range(0, len(cells), step)),
-        verdict=list(_verdict(captures, fitted, len(cells))),
-        trust=[source_point(header.source), *_trust(captures, fitted)],
-        sizes=_sizes(captures, fitted.press, frame["label"]),
-        measured=fitted.sizes,
+        verdict=list(_verdict(captures, held_out)),
+        trust=[source_point(header.source), *_trust(captures, held_out)],
+        sizes=_sizes(captures, press, frame["label"]),
+        measured=sizes,
         middle="{:g} mm, {:g}°".format(*middle(captures.strokes)),
-        held_out=fitted.held_out,
+        held_out=held_out,
         refused=captures.refused,
-        facts=[(name, text) for name, text in _facts(captures, fitted, path) if text],
+        facts=[(name, text) for name, text in _facts(captures, path) if text],
     )
 
 
@@ -155,10 +156,11 @@ def _fitted_sizes(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Fl
     return float(sizes.tip + sizes.heel), float(width)
 
 
-def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
+def _verdict(captures: Captures, held_out: Sequence[HeldOut]) -> Iterator[str]:
     brush = captures.header.brush or "a brush without a name"
-    yield f"The stroke model was fitted to {len(captures.strokes)} presses at {cells} combinations of H and α: {brush}."
-    scores = {row.model: row.csim for row in fitted.held_out}
+    presses, cells = len(captures.strokes), len(by_cell(captures.strokes))
+    yield f"The stroke model was fitted to {presses} presses at {cells} combinations of H and α: {brush}."
+    scores = {row.model: row.csim for row in held_out}
     if FITTED not in scores:
         yield "Only one combination was pressed, so how well it predicts others is not known."
         return
@@ -169,8 +171,8 @@ def _verdict(captures: Captures, fitted: Fitted, cells: int) -> Iterator[str]:
     )
 
 
-def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
-    below = {row.model: row.below for row in fitted.held_out}
+def _trust(captures: Captures, held_out: Sequence[HeldOut]) -> Iterator[Point]:
+    below = {row.model: row.below for row in held_out}
     if not below:
         yield Point(False, "One combination of H and α does not show how the mark changes with depth or tilt.")
     elif (off := below.get(FITTED)) is not None:
@@ -186,14 +188,14 @@ def _trust(captures: Captures, fitted: Fitted) -> Iterator[Point]:
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")
 
 
-def _facts(captures: Captures, fitted: Fitted, path: Path) -> Iterator[tuple[str, str]]:
-    header, artefact = captures.header, fitted.artefact
+def _facts(captures: Captures, path: Path) -> Iterator[tuple[str, str]]:
+    header = captures.header
     yield "session", header.session_id
     yield "source", str(header.source)
     yield "recording", f"sha256 {captures.recording_sha256}"
     yield "brush", f"{header.brush or 'not named'}, R {captures.radius_mm:g} mm, L {captures.length_mm:g} mm"
     yield "ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)
     yield "calibration", captures.calibration.named if captures.calibration else "the import's own scale"
-    yield "images", f"{artefact.mm_per_px:g} mm per pixel"
-    yield "fitted with", artefact.software
+    yield "images", f"{captures.grid.px_mm:g} mm per pixel"
+    yield "fitted with", made_by()
     yield "artefact", path.name

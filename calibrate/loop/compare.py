@@ -17,7 +17,7 @@ import numpy as np
 from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Image, Key, Tone, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
 from brushloop.calibrate.report import Sealed, load_sealed
 from brushloop.calibrate.scores import MEASURES, Row, Scores, Stat, find_stat, similarities, statistics

@@ -22,8 +22,8 @@ from typing import Any
 from brushloop.calibrate.artefact import FOLDER, MAX_POINTER_BYTES, POINTER, current, load_artefact, pointed
 from brushloop.calibrate.errors import CalibrationError, one_line
 from brushloop.calibrate.files import read_bounded, replacing
-from brushloop.calibrate.fit.artefact import FOLDER as FITS
-from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.loop.compare import FILE as LOOP_FILE
 from brushloop.calibrate.loop.compare import LoopRecord, read_loop
 from brushloop.calibrate.report import png_uri

@@ -17,7 +17,7 @@ from brushloop.calibrate.compare.paper import TABLE_3
 from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.fit.artefact import FOLDER as FITS
+from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,

@@ -74,7 +74,7 @@ def calibrated(say: Say, session: Path) -> None:
 
 def fitted(say: Say, session: Path) -> None:
     """Fit the brush of a session that has no fit yet. Raises `CalibrationError`, `SessionError`."""
-    from brushloop.calibrate.fit.command import FOLDER, FitRequest, fit_presses  # slow to import
+    from brushloop.calibrate.fit.brush import FOLDER, FitRequest, fit_presses  # slow to import
 
     if not artefacts(session, FOLDER):
         say(f"fit {session}")

@@ -13,8 +13,8 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.board.view import board_of, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.artefact import FOLDER as FITS
-from brushloop.calibrate.fit.artefact import BrushFit
+from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.session import lens_in_use
 from brushloop.calibrate.waits import unlike, waits_of
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of

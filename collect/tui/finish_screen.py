@@ -142,7 +142,7 @@ def _result(name: str, folder: Path, progress: Progress) -> Printable:
 
         return calibrate_session(CalibrateRequest(folder), progress)
     if name == "fit":
-        from brushloop.calibrate.fit.command import FitRequest, fit_presses
+        from brushloop.calibrate.fit.brush import FitRequest, fit_presses
 
         return fit_presses(FitRequest(folder), progress)
     from brushloop.calibrate.validate.command import Request, validate

@@ -3,12 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brushloop.calibrate.fit.captures import Grid, Pressed
+from brushloop.calibrate.fit.brush import touch_estimates
+from brushloop.calibrate.fit.captures import FEWEST_CELLS, Grid, Pressed, sizes_of
 from brushloop.calibrate.fit.fit import draw, fit_presses, zero_touches
 from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
 from brushloop.calibrate.fit.prior import learned, spreads
-from brushloop.calibrate.fit.run import touch_estimates
-from brushloop.calibrate.fit.sizes import FEWEST_CELLS, sizes_of
 from brushloop.calibrate.stats import CEILING
 from brushloop.model.fitted import NAMES, PARAMETERS, FittedPress, published
 

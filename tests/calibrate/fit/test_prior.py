@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brushloop.calibrate.fit.fit import regress
 from brushloop.calibrate.fit.prior import KnownBrush, about, learned, of_brushes
-from brushloop.calibrate.fit.residual import regress
 from brushloop.model.fitted import NAMES, TERMS, FittedPress, command_terms, published
 
 CELLS = [(h, a) for h in (11.0, 15.0, 20.0) for a in (0.0, 5.0, 10.0)]

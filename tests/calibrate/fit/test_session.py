@@ -11,9 +11,8 @@ from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.artefact import FOLDER, BrushFit
+from brushloop.calibrate.fit.brush import FOLDER, BrushFit, correction, fit_session
 from brushloop.calibrate.fit.captures import read_presses
-from brushloop.calibrate.fit.run import correction, fit_session
 from brushloop.calibrate.validate.report import load_report
 from brushloop.model.fitted import NAME, NAMES
 from tests.photographed import imported_presses
@@ -83,4 +82,4 @@ def test_a_reference_of_few_cells_gives_no_correction(session: Path) -> None:
     assert fitted.held_out == []
     assert fitted.sizes == []
     with pytest.raises(CalibrationError, match="5 are needed"):
-        correction(captures, fitted.artefact)
+        correction(captures, fitted.fit)
