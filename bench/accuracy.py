@@ -37,7 +37,7 @@ from bench.prior import BRISTLE
 from brushloop.calibrate.compare.paper import TABLE_2
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
-from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, Scores, image_of, leave_cell_out, refit
+from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.scores import HEADLINE, REFERENCE, SIMULATED, read_written
@@ -90,10 +90,10 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
                 chosen = [cells[cell][rng.integers(len(cells[cell]))] for cell in DESIGN[:size]]
                 job = Refit.of(chosen, captures.grid, captures.radius_mm, captures.length_mm, prior)
                 press = FittedPress(job.radius_mm, job.length_mm, **refit(job))
-                scores = Scores()
-                for cell in DESIGN[size:]:
-                    scores.add(cells[cell], {FITTED: image_of(press.outline(*cell), captures.grid)})
-                csim = {row.model: row.csim for row in scores.rows((CEILING, FITTED))}
+                left_out = DESIGN[size:]
+                images = [{FITTED: image_of(press.outline(*cell), captures.grid)} for cell in left_out]
+                predicted = [(cells[cell], drawn) for cell, drawn in zip(left_out, images, strict=True)]
+                csim = {row.model: row.csim for row in held_out_scores(predicted, (FITTED,))}
                 gaps.append(csim[CEILING] - csim[FITTED])
             where = f"simulated; worst draw {max(gaps):.2f}; {machine()}"
             results.append(at_most(f"few.gap.{size}.{name}", statistics.fmean(gaps), POINTS, goal, draws, seed, where))

@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -15,8 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
-from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Scores, image_of, refit_bezier
-from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.drivers.sim.config import SoundHead
 from brushloop.sessions.terminal import Progress, unseen
@@ -180,18 +179,18 @@ def fit_twin(
     spec, offset = _brush(found, target), offset_at(found.point)
     if spread is not None:
         spread = fit_spread(spec, offset, repeats, grid, pool.map, spread.point)
-    scores, points = Scores(), list[Vector]()
+    predicted, points = list[Predicted](), list[Vector]()
     for number, part in enumerate(parts, 1):
         name, others = f"part {number} left out", target.only([k for k in range(len(cells)) if k not in part])
         there = searches.fine(name, others, searches.coarse(name, others))
         points.append(there.point)
-        _score_part(scores, cells, [target.cells[k] for k in part], there, target)
+        predicted += _predicted(cells, [target.cells[k] for k in part], there, target)
     errors = WIDER * np.sqrt(variance + of_parts(points))
     estimates = [Estimate.of(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
     if spread is not None:
         spec = with_values(spec, SPREAD, spread.point)
         estimates += [Estimate.of(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
-    held_out = tuple(scores.rows((CEILING, TWIN, BEZIER)))
+    held_out = tuple(held_out_scores(predicted, (TWIN, BEZIER)))
     return Twin(spec, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
 
 
@@ -227,10 +226,8 @@ def _brush(found: Found, target: Target) -> BrushSpec:
     return brush_at(found.point, replace(target.base, seed=found.seed))
 
 
-def _score_part(
-    scores: Scores, cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target
-) -> None:
-    """Score the cells `held` by the twin found without them, and by a Bezier refitted to the others."""
+def _predicted(cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target) -> Iterator[Predicted]:
+    """Yield the cells `held` as predicted by the twin found without them, and by a Bezier refitted to the others."""
     drawn = draw(_brush(there, target), offset_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
     others = [press for cell, group in cells.items() if cell not in held for press in group]
     bezier = None
@@ -240,7 +237,7 @@ def _score_part(
         images: dict[str, Images] = {TWIN: image}
         if bezier is not None:
             images[BEZIER] = image_of(bezier.outline(*cell), target.grid)
-        scores.add(cells[cell], images)
+        yield cells[cell], images
 
 
 def parts_of(cells: Sequence[Cell]) -> list[list[int]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.place import SIZE_PX, Alignment, draw_loop, to_pixels
 from brushloop.calibrate.compare.score import similarity
-from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Floats, Grid, Pressed, by_cell, inked_rows
+from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell, inked_rows
 from brushloop.calibrate.fit.fit import fit_presses, zero_touches
 from brushloop.calibrate.fit.prior import Prior
 from brushloop.calibrate.pool import Scheduler, finished, threads
@@ -30,13 +30,14 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
-Predict = Callable[[float, float], Images]
+Draw = Callable[[float, float], Outline]
+"""The mark of a press by depth and tilt."""
 MAX_FOLDS = 15
 """Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
 PER_CELL = 3
 """Presses of each other cell that a fit uses; more did not change it."""
 MAX_STROKES = 60
-One = TypeVar("One")
+T = TypeVar("T")
 C = TypeVar("C", Cell, Condition)
 
 
@@ -52,21 +53,19 @@ class HeldOut:
     """Points of CSIM below the ceiling; None for the ceiling itself, and where no cell was pressed twice."""
 
 
-def predictor(press: FittedPress, grid: Grid) -> Predict:
-    """A function that draws the presses of a fitted brush, without torch."""
-    return lambda height, tilt: press.chance(height, tilt, grid.x_mm, grid.y_mm, SPREAD_MM)
+Predicted = tuple[Sequence[Pressed], Mapping[str, Images]]
+"""The presses of one cell, and what each model predicts there without them."""
 
 
-def folds(cells: Sequence[C], most: int = MAX_FOLDS) -> list[list[C]]:
-    """Groups of cells that are left out together; none if there is only one cell."""
-    ordered = sorted(set(cells))
-    count = min(len(ordered), most)
-    return [ordered[k::count] for k in range(count)] if len(ordered) > 1 else []
+def leave_out(cells: Mapping[C, Sequence[T]], most: int = MAX_FOLDS) -> list[tuple[list[C], list[T]]]:
+    """Cells that are left out together, and the presses of all others that a fit uses; none if no press is left."""
+    ordered = sorted(cells)
+    folds = [ordered[k::most] for k in range(min(len(ordered), most))]
+    return [(fold, others) for fold in folds if (others := _without(cells, fold))]
 
 
-def without(cells: Mapping[C, Sequence[One]], fold: Sequence[C]) -> list[One]:
-    """The strokes of all other cells that a fit uses."""
-    others = [one for cell, group in cells.items() if cell not in fold for one in group[:PER_CELL]]
+def _without(cells: Mapping[C, Sequence[T]], fold: Sequence[C]) -> list[T]:
+    others = [press for cell, group in cells.items() if cell not in fold for press in group[:PER_CELL]]
     return others[:: max(1, -(-len(others) // MAX_STROKES))]
 
 
@@ -133,62 +132,48 @@ def leave_cell_out(
     """
     cells = by_cell(strokes)
     published = FittedPress(radius_mm, length_mm)
-    scores, errors, left = Scores(), [np.empty((0, 2))], folds(list(cells))
-    jobs = [Refit.of(without(cells, fold), grid, radius_mm, length_mm, prior) for fold in left]
+    left_out = leave_out(cells)
+    jobs = [Refit.of(others, grid, radius_mm, length_mm, prior) for _, others in left_out]
     with threads() as scheduler:
         presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
-    for fold, job, press in zip(left, jobs, presses, strict=True):
-        models: dict[str, Callable[[float, float], Outline]] = {FITTED: press.outline, UNCALIBRATED: published.outline}
+    predicted, errors = list[Predicted](), [np.empty((0, 2))]
+    for (fold, _), job, press in zip(left_out, jobs, presses, strict=True):
+        outlines: dict[str, Draw] = {FITTED: press.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-            models[BEZIER] = refit_bezier(job.strokes, job.grid).outline
+            outlines[BEZIER] = refit_bezier(job.strokes, job.grid).outline
         for cell in fold:
-            scores.add(cells[cell], dict(_images(models, cell, grid)))
+            images: dict[str, Images] = {}
+            for name, outline in outlines.items():
+                with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
+                    images[name] = image_of(outline(*cell), grid)
+            predicted.append((cells[cell], images))
             errors.append(zero_touches(press, cells[cell], grid))
-    return scores.rows((CEILING, FITTED, BEZIER, UNCALIBRATED)), np.concatenate(errors)
+    return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED)), np.concatenate(errors)
 
 
-def _images(
-    models: Mapping[str, Callable[[float, float], Outline]], cell: Cell, grid: Grid
-) -> Iterator[tuple[str, Images]]:
-    for name, outline in models.items():
-        with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
-            yield name, image_of(outline(*cell), grid)
-
-
-class Scores:
-    """Collects scores of held-out strokes by model, and of the pairs of strokes in their cell."""
-
-    def __init__(self) -> None:
-        self._found: dict[str, list[NDArray[np.float64]]] = {}
-        self._cells: list[int] = []
-
-    def add(self, held: Sequence[Pressed], images: Mapping[str, Images]) -> None:
-        """Score the strokes of one cell by what each model predicts there, and in pairs."""
-        inks = [_levels(stroke.ink) for stroke in held]
-        nothing = np.full((len(inks), 2), np.nan)
-        before = sum(map(len, self._found.get(CEILING, [])))
-        pairs = pair_means(len(inks), lambda k, others: _scores(inks[k], [inks[j] for j in others]))
-        for name in {*self._found, *images} - {CEILING}:
-            found = nothing
-            if name in images:
-                found = np.concatenate([_scores(ink, [_levels(images[name])]) for ink in inks])
-            self._found.setdefault(name, [np.full((before, 2), np.nan)]).append(found)
-        self._found.setdefault(CEILING, []).append(pairs)
-        self._cells += [1 + max(self._cells, default=-1)] * len(inks)
-
-    def rows(self, order: Sequence[str]) -> list[HeldOut]:
-        """Means in percent in this order; a model without a score is left out."""
-        cells, rows = np.array(self._cells), list[HeldOut]()
-        values = {name: 100.0 * np.concatenate(found) for name, found in self._found.items()}
-        if CEILING in values:
-            values[CEILING] = np.stack([ceiling_values(pairs, cells) for pairs in values[CEILING].T], axis=1)
-        for name in order:
-            known = np.isfinite(values[name][:, 0]) if name in values else np.zeros(0, np.bool_)
-            if known.any():
-                below = average(values[CEILING][:, 0] - values[name][:, 0], cells) if name != CEILING else None
-                csim, ssim = values[name][known].mean(axis=0).tolist()
-                rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
-        return rows
+def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> list[HeldOut]:
+    """The ceiling, then these models in this order; one without a score is left out."""
+    values: dict[str, list[Floats]] = {name: [] for name in (CEILING, *models)}
+    for presses, images in predicted:
+        inks = [_binary(press.ink) for press in presses]
+        pairs = pair_means(len(inks), lambda k, others, inks=inks: np.array([_score(inks[k], inks[j]) for j in others]))
+        values[CEILING].append(pairs)
+        for name in models:
+            drawn = _binary(images[name]) if name in images else np.zeros_like(inks[0])
+            values[name].append(np.array([_score(ink, drawn) for ink in inks]))
+    if not predicted:
+        return []
+    cells = np.repeat(np.arange(len(predicted)), [len(presses) for presses, _ in predicted])
+    percent = {name: 100.0 * np.concatenate(scores) for name, scores in values.items()}
+    ceiling = np.stack([ceiling_values(pairs, cells) for pairs in percent[CEILING].T], axis=1)
+    rows: list[HeldOut] = []
+    for name, scores in (percent | {CEILING: ceiling}).items():
+        known = np.isfinite(scores[:, 0])
+        if known.any():
+            below = average(ceiling[:, 0] - scores[:, 0], cells) if name != CEILING else None
+            csim, ssim = scores[known].mean(axis=0).tolist()
+            rows.append(HeldOut(name, csim, ssim, int(known.sum()), below))
+    return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,16 +214,12 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
     return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
 
 
-def _levels(image: Images) -> NDArray[np.uint8]:
-    """Ink or paper as 255 or 0, with blank rows up to the height of the field, which SSIM is averaged over."""
+def _binary(image: Images) -> Floats:
+    """Ink or paper as 1 or 0, with blank rows up to the height of the field, which SSIM is averaged over."""
     blank = max(0, SIZE_PX - len(image))
-    return np.pad(np.where(image > 0.5, 255, 0).astype(np.uint8), ((blank // 2, blank - blank // 2), (0, 0)))
+    return np.pad(np.where(image > 0.5, 1.0, 0.0), ((blank // 2, blank - blank // 2), (0, 0)))
 
 
-def _scores(captured: NDArray[np.uint8], predicted: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-    """(n, 2) CSIM and SSIM; NaN where an image is blank."""
-    nothing = (np.nan, np.nan)
-    known = captured.any()
-    return np.array(
-        [similarity(captured / 255.0, p / 255.0, Alignment.MM) if known and p.any() else nothing for p in predicted]
-    )
+def _score(captured: Floats, other: Floats) -> tuple[float, float]:
+    """CSIM and SSIM; NaN where an image is blank."""
+    return similarity(captured, other, Alignment.MM) if captured.any() and other.any() else (np.nan, np.nan)

@@ -9,8 +9,19 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.artefact import made_by
-from brushloop.calibrate.fit.captures import Captures, Cell, Floats, Grid, Pressed, Size, by_cell, measure, middle
-from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, HeldOut, predictor
+from brushloop.calibrate.fit.captures import (
+    SPREAD_MM,
+    Captures,
+    Cell,
+    Floats,
+    Grid,
+    Pressed,
+    Size,
+    by_cell,
+    measure,
+    middle,
+)
+from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, HeldOut
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
@@ -98,7 +109,7 @@ def _cell(cell: Cell, strokes: list[Pressed], press: FittedPress, published: Fit
 def _csim(press: FittedPress, cell: Cell, strokes: list[Pressed], grid: Grid) -> str:
     """Average CSIM of the fit and the presses that it was fitted to, percent; empty where it draws no mark."""
     try:
-        drawn = np.asarray(predictor(press, grid)(*cell) > 0.5, np.float32)
+        drawn = np.asarray(press.chance(*cell, grid.x_mm, grid.y_mm, SPREAD_MM) > 0.5, np.float32)
     except DomainError:
         return ""
     if not drawn.any():

@@ -17,7 +17,7 @@ from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Pixels, To
 from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.captures import Pressed, grid_of
-from brushloop.calibrate.fit.heldout import MAX_FOLDS, Refit, RefittedBezier, folds, refit_bezier, refits, without
+from brushloop.calibrate.fit.heldout import MAX_FOLDS, Refit, RefittedBezier, leave_out, refit_bezier, refits
 from brushloop.calibrate.pool import Scheduler, finished
 from brushloop.calibrate.presses import read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Row, Scores, similarities
@@ -181,7 +181,7 @@ def _left_out(rows: Sequence[Row], most: int) -> LeftOut:
     for row in rows:
         if not row.cut:
             cells[row.condition].append(_pressed(row))
-    return [(fold, others) for fold in folds(list(cells), most) if (others := without(cells, fold))]
+    return leave_out(cells, most)
 
 
 def _refitted(
