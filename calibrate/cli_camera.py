@@ -56,9 +56,8 @@ def intrinsics(
     """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
     import hashlib
 
-    from brushloop.calibrate.artefact import made_by
     from brushloop.calibrate.board.detect import BoardView, find_board
-    from brushloop.calibrate.board.intrinsics import fit_lens, lens_file, named
+    from brushloop.calibrate.board.intrinsics import fit_lens, named
     from brushloop.calibrate.board.spec import describe
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
@@ -79,7 +78,7 @@ def intrinsics(
                 seen.append(find_board(image, made, name))
             except CalibrationError as error:
                 unusable[name] = error.what
-    file = lens_file(fit_lens(seen, limit_px, unusable), describe(made), digests, limit_px, made_by())
+    file = fit_lens(seen, describe(made), digests, unusable, limit_px)
     for name, residual in file.residuals_px.items():
         say(f"{name}: {residual:.3f} px, slanted by {file.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
@@ -183,9 +182,8 @@ def register(
     """Locate the paper in the robot's base frame from touched or pressed marks; prints the lines for rig.toml."""
     import hashlib
 
-    from brushloop.calibrate.artefact import made_by
     from brushloop.calibrate.board.intrinsics import read_lens
-    from brushloop.calibrate.board.register import PaperLines, RegistrationFile, read_points, read_rig
+    from brushloop.calibrate.board.register import read_points, read_rig, toml_lines
     from brushloop.calibrate.board.register import register as fit
     from brushloop.calibrate.board.spec import BoardSpec
     from brushloop.calibrate.board.view import calibration_plane
@@ -208,28 +206,23 @@ def register(
     lens = lens or (rig.lens_file if rig else None)
     known = read_lens(lens) if lens else None
     plane = calibration_plane(read_gray(photograph), spec, known, str(photograph))
-    fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px))
+    seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+    through = known.source if known else "no lens"
+    source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
+    fitted = fit(points.names, points.robot_mm, plane.to_paper(points.image_px), source, spec.origin_mm)
     for name, (dx, dy) in fitted.residuals_mm.items():
         say(f"{name}: {dx:+.3f}, {dy:+.3f} mm")
     for name, (dx, dy) in fitted.dropped.items():
         say(f"{name}: {dx:+.3f}, {dy:+.3f} mm, dropped: it does not fit the others")
-    seen = hashlib.sha256(read_bounded(photograph, MAX_PHOTOGRAPH_BYTES)).hexdigest()
-    through = known.source if known else "no lens"
-    source = f"{table.name}, sha256 {points.sha256}; {photograph.name}, sha256 {seen}; {through}"
-    about = {"board_origin_mm": spec.origin_mm, "source": source, "software": made_by()}
-    file = RegistrationFile.model_validate(dict(fitted) | about)
     for flag in plane.flags:
         say(f"warning: {flag}")
-    say(
-        f"residual {file.rms_mm:.3f} mm, {file.left_out_rms_mm:.3f} mm for a point that was left out",
-        str(file.save(out)),
-    )
-    lines = PaperLines(fitted.origin_mm, fitted.yaw_deg)
+    residual = f"residual {fitted.rms_mm:.3f} mm, {fitted.left_out_rms_mm:.3f} mm for a point that was left out"
+    say(residual, str(fitted.save(out)))
     if target is not None:
-        say(f"{target.path}: written; the old file is kept as {target.write(lines)}")
+        say(f"{target.path}: written; the old file is kept as {target.write(fitted.paper)}")
     else:
         say("for [paper] of rig.toml:")
-    say(*lines.toml.splitlines())
+    say(*toml_lines(fitted.paper))
 
 
 def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:

@@ -11,7 +11,7 @@ import numpy as np
 
 from brushloop.calibrate.artefact import Artefact, current, load_artefact
 from brushloop.calibrate.board.intrinsics import LensFile
-from brushloop.calibrate.board.register import RegistrationFile
+from brushloop.calibrate.board.register import Registration
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
@@ -20,7 +20,7 @@ from brushloop.calibrate.fit.brush import BrushFit
 KINDS: dict[str, type[Artefact]] = {
     "image_to_paper": Calibration,
     "focal_se_px": LensFile,
-    "robot_to_paper": RegistrationFile,
+    "robot_to_paper": Registration,
     "edges_mm": BrushFit,
 }
 """Each kind of artefact by a field that no other kind has."""

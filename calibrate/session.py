@@ -17,9 +17,8 @@ from brushloop.calibrate.board.view import (
     board_stills,
     calibration_plane,
     known_lens,
-    lens_of_session,
     paper_mm,
-    sheet_of,
+    rig_of,
 )
 from brushloop.calibrate.calibration import Calibration, Foreign
 from brushloop.calibrate.errors import CalibrationError
@@ -98,7 +97,7 @@ def calibrate_session(session: Path, lens: Path | None = None, progress: Progres
     if not stills:
         raise CalibrationError(where, NO_BOARD)
     image, given = decode_gray(stills[-1], where), known
-    plane = calibration_plane(image, spec, given, where, sheet_of(recording))
+    plane = calibration_plane(image, spec, given, where, rig_of(recording).sheet_mm)
     progress(STEPS, 2, 3)
     low, high = plane.interval_mm_per_px
     calibration = Calibration(
@@ -170,7 +169,7 @@ def lens_in_use(folder: Path) -> Lens | None:
     """
     path = current(folder)
     lens = None if path is None else load_artefact(path, Calibration).lens
-    return lens if lens is not None else lens_of_session(folder)
+    return lens if lens is not None else rig_of(folder).lens
 
 
 def _labelled(given: Calibration, recording: Recording) -> Calibration:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.artefact import Artefact, Frozen, load_artefact
+from brushloop.calibrate.artefact import Artefact, load_artefact, made_by
 from brushloop.calibrate.board.detect import BoardView
 from brushloop.calibrate.board.lens import Floats, Lens, unknown_lens
 from brushloop.calibrate.board.pix2len import homography
@@ -47,21 +47,14 @@ DISTINCT_DEG = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """A lens, and the pose of each board in front of it."""
+    """A lens, and how each board was held in front of it."""
 
     lens: Lens
     rms_px: float
     residuals_px: Floats
     """(views,) root mean square of each."""
-    turns: tuple[Floats, ...]
-    shifts_mm: tuple[Floats, ...]
-    """Rotation vector and translation of each board."""
-
-    @property
-    def normals(self) -> Floats:
-        """(views, 3) unit normals of the boards, toward the camera."""
-        found = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in self.turns])
-        return np.asarray(np.where(found[:, 2:] < 0.0, -found, found), np.float64)
+    normals: Floats
+    """(views, 3) unit normals of the boards, toward the camera."""
 
 
 def solve(views: Sequence[BoardView], where: str) -> Solved:
@@ -70,18 +63,14 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
     objects = [_flat(view).astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
     try:
-        rms, matrix, distortion, turns, shifts, _, _, per_view = cv2.calibrateCameraExtended(
+        rms, matrix, distortion, turns, _, _, _, per_view = cv2.calibrateCameraExtended(
             objects, pixels, size, np.zeros((3, 3)), np.zeros(5)
         )
     except cv2.error as error:
         raise CalibrationError(where, f"no lens explains these views: {error.err}") from None
-    return Solved(
-        Lens.of_opencv(matrix, distortion, size),
-        float(rms),
-        np.asarray(per_view, np.float64).ravel(),
-        tuple(np.asarray(turn, np.float64) for turn in turns),
-        tuple(np.asarray(shift, np.float64) for shift in shifts),
-    )
+    normals = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in turns])
+    normals = np.asarray(np.where(normals[:, 2:] < 0.0, -normals, normals), np.float64)
+    return Solved(Lens.of_opencv(matrix, distortion, size), float(rms), np.ravel(per_view).astype(np.float64), normals)
 
 
 def _flat(view: BoardView) -> Floats:
@@ -98,8 +87,8 @@ def residuals(lens: Lens, view: BoardView) -> Floats:
     return view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)
 
 
-class LensFit(Frozen):
-    """A lens, its uncertainty, and how well it explains each photograph."""
+class LensFile(Artefact):
+    """A lens, its uncertainty, how well it explains each photograph, and where these come from."""
 
     lens: Lens
     focal_se_px: tuple[float, float] | None
@@ -120,6 +109,13 @@ class LensFit(Frozen):
     """What else to photograph; empty where the coverage is good."""
     warnings: tuple[str, ...]
     """What a pre-flight check must show."""
+    schema_version: Literal[3] = 3
+    software: str
+    photographs: dict[str, str]
+    """Name of every photograph that was given, and the sha256 of its bytes."""
+    board: str
+    """Description: kind, size in squares or corners, mm."""
+    rms_limit_px: float
 
     @property
     def focal_reach_px(self) -> tuple[float, float] | None:
@@ -130,24 +126,6 @@ class LensFit(Frozen):
         return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
 
 
-class LensFile(LensFit, Artefact):
-    """Intrinsics on disk, with everything that is needed to judge them."""
-
-    schema_version: Literal[3] = 3
-    software: str
-    photographs: dict[str, str]
-    """Name of every photograph that was given, and the sha256 of its bytes."""
-    board: str
-    """Description: kind, size in squares or corners, mm."""
-    rms_limit_px: float
-
-
-def lens_file(fitted: LensFit, board: str, photographs: dict[str, str], rms_limit_px: float, software: str) -> LensFile:
-    """The artefact of a fitted lens."""
-    about = {"software": software, "photographs": photographs, "board": board, "rms_limit_px": rms_limit_px}
-    return LensFile.model_validate(dict(fitted) | about)
-
-
 def read_lens(path: Path) -> Lens:
     """Read a lens file written by `camera intrinsics`. Raises `CalibrationError`."""
     file = load_artefact(path, LensFile)
@@ -156,16 +134,19 @@ def read_lens(path: Path) -> Lens:
 
 def fit_lens(
     views: Sequence[BoardView],
+    board: str,
+    photographs: Mapping[str, str],
+    unusable: Mapping[str, str],
     rms_limit_px: float = RMS_LIMIT_PX,
-    unusable: Mapping[str, str] | None = None,
-) -> LensFit:
+) -> LensFile:
     """Fit a lens by Zhang's method to the views that fit together; `unusable` says why other photographs have no view.
 
-    Raises `CalibrationError` for fewer than `LEAST_VIEWS` views that differ, and for photographs of several sizes.
+    `board` describes the board, `photographs` are names and sha256 of all that were given. Raises `CalibrationError`
+    for fewer than `LEAST_VIEWS` views that differ, and for photographs of several sizes.
     """
     seen, left_out = distinct_views(views)
-    left_out = {**(unusable or {}), **left_out}
-    where = f"{len(views) + len(unusable or {})} photographs"
+    left_out = {**unusable, **left_out}
+    where = f"{len(views) + len(unusable)} photographs"
     _one_size(seen, where)
     kept, dropped = list(seen), dict[str, float]()
     while True:
@@ -192,7 +173,7 @@ def fit_lens(
     if solved.rms_px > rms_limit_px:
         exceeds = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px"
         warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
-    return LensFit(
+    return LensFile(
         lens=solved.lens,
         focal_se_px=_focal(kept, ways, where),
         ways=int(ways.max()) + 1,
@@ -203,6 +184,10 @@ def fit_lens(
         slants_deg=slants,
         guidance=guidance(kept, list(slants.values()), int(ways.max()) + 1),
         warnings=tuple(warnings),
+        software=made_by(),
+        photographs=dict(photographs),
+        board=board,
+        rms_limit_px=rms_limit_px,
     )
 
 

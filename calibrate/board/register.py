@@ -14,23 +14,25 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 import tomlkit
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from brushloop.calibrate.artefact import Artefact, Frozen
+from brushloop.calibrate.artefact import Artefact, made_by
 from brushloop.calibrate.board.lens import Floats, rms
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.board.view import rig_view
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded, write_whole
 from brushloop.sessions.disk import number
 
 COLUMNS = ("name", "robot_x_mm", "robot_y_mm", "image_x_px", "image_y_px")
 LEAST_POINTS = 3
 WORST_RMS_MM = 5.0
+Paper = dict[str, list[float] | float]
+"""Fields of `[paper]` in rig.toml and their values."""
 TRIALS = 500
 OUTLIER_MEDIANS = 5.0
 LEAST_OUTLIER_MM = 0.3
@@ -39,8 +41,8 @@ MIXED_UP_MM, EXPLAINED = 3.0, 0.2
 """A misfit is taken for mixed names only above this, and if they explain all but this share of it."""
 
 
-class Registration(Frozen):
-    """The place and turn of the paper frame in the robot's base frame, both in mm."""
+class Registration(Artefact):
+    """The place and turn of the paper frame in the robot's base frame, both in mm, and what it was made from."""
 
     robot_to_paper: tuple[float, float, float, float, float, float]
     """(2, 3) row by row: mm in the base frame to mm in the paper frame."""
@@ -54,16 +56,6 @@ class Registration(Frozen):
     residuals_mm: dict[str, tuple[float, float]]
     """Seen minus predicted, of each kept point."""
     dropped: dict[str, tuple[float, float]]
-
-    @property
-    def matrix(self) -> Floats:
-        """`robot_to_paper` as (2, 3)."""
-        return np.array(self.robot_to_paper).reshape(2, 3)
-
-
-class RegistrationFile(Registration, Artefact):
-    """A registration on disk, and what it was made from."""
-
     schema_version: Literal[4] = 4
     software: str
     source: str
@@ -71,12 +63,31 @@ class RegistrationFile(Registration, Artefact):
     board_origin_mm: tuple[float, float]
     """Lower left corner of the board in the paper frame, as it was assumed."""
 
+    @property
+    def matrix(self) -> Floats:
+        """`robot_to_paper` as (2, 3)."""
+        return np.array(self.robot_to_paper).reshape(2, 3)
 
-def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> Registration:
+    @property
+    def paper(self) -> Paper:
+        """The two values of `[paper]` in rig.toml, rounded to 0.001 mm and 0.0001 deg."""
+        # Adding 0 turns -0.0 into 0.0.
+        return {"origin_mm": [round(v, 3) + 0.0 for v in self.origin_mm], "yaw_deg": round(self.yaw_deg, 4) + 0.0}
+
+
+def toml_lines(paper: Paper) -> list[str]:
+    """The lines to paste into rig.toml."""
+    return [f"{name} = {value}" for name, value in paper.items()]
+
+
+def register(
+    names: Sequence[str], robot_mm: Floats, seen_mm: Floats, source: str, board_origin_mm: tuple[float, float]
+) -> Registration:
     """Fit by least squares to (n, 2) points of both frames, with outliers dropped and named (Umeyama 1991, eq. 40-43).
 
-    Outliers are found by the two points that explain the others best. Raises `CalibrationError` for fewer than three
-    points, for points that are all in one place, and if most do not fit together.
+    `source` and `board_origin_mm` are kept with the result. Outliers are found by the two points that best explain the
+    others. Raises `CalibrationError` for fewer than three points, for points that are all in one place, and if most do
+    not fit together.
     """
     where = f"{len(names)} points"
     if not len(names) == len(robot_mm) == len(seen_mm):
@@ -113,6 +124,9 @@ def register(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> Registr
         left_out_rms_mm=rms(np.array(left_out)),
         residuals_mm={name: each[name] for name, keep in zip(names, kept, strict=True) if keep},
         dropped={name: each[name] for name, keep in zip(names, kept, strict=True) if not keep},
+        software=made_by(),
+        source=source,
+        board_origin_mm=board_origin_mm,
     )
 
 
@@ -218,27 +232,6 @@ def _number(table: Path, line: int, name: str, text: str | None) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class PaperLines:
-    """Where the sheet lies, as two lines of `[paper]`."""
-
-    origin_mm: tuple[float, float]
-    """Lower left corner of the sheet in the base frame."""
-    yaw_deg: float
-    """From base x to paper x, counter-clockwise."""
-
-    @property
-    def values(self) -> dict[str, list[float] | float]:
-        """Each field and its value, rounded to 0.001 mm and 0.0001 deg."""
-        # Adding 0 turns -0.0 into 0.0.
-        return {"origin_mm": [round(v, 3) + 0.0 for v in self.origin_mm], "yaw_deg": round(self.yaw_deg, 4) + 0.0}
-
-    @property
-    def toml(self) -> str:
-        """The lines to paste into rig.toml."""
-        return "\n".join(f"{name} = {value}" for name, value in self.values.items())
-
-
-@dataclass(frozen=True, slots=True)
 class RigFile:
     """A rig's configuration as text, with the board and the lens file that it names."""
 
@@ -247,23 +240,18 @@ class RigFile:
     board: BoardSpec
     lens_file: Path | None
 
-    def with_paper(self, lines: PaperLines) -> str:
-        """The text with these two values. Raises `CalibrationError` where there is no table `paper` to hold them."""
+    def write(self, paper: Paper) -> Path:
+        """Write these two values; returns the path of the old file. Raises `CalibrationError` and OSError."""
         document: Any = tomlkit.parse(self.text)
         if not isinstance(document.get("paper"), dict):
-            what = "paper: is not a table; nothing is written. Enter by hand: " + ", ".join(lines.toml.splitlines())
+            what = "paper: is not a table; nothing is written. Enter by hand: " + ", ".join(toml_lines(paper))
             raise CalibrationError(str(self.path), what)
-        for name, value in lines.values.items():
+        for name, value in paper.items():
             document["paper"][name] = value
-        return tomlkit.dumps(document)
-
-    def write(self, lines: PaperLines) -> Path:
-        """Write these two values; returns the path of the old file. Raises `CalibrationError` and OSError."""
-        made = self.with_paper(lines)
         kept = free_name(self.path)
         with kept.open("xb") as file:
             file.write(self.text.encode())
-        write_whole(self.path.resolve(), made)
+        write_whole(self.path.resolve(), tomlkit.dumps(document))
         return kept
 
 
@@ -277,15 +265,11 @@ def read_rig(path: Path) -> RigFile:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
         raise CalibrationError(str(path), f"is not TOML: {error}") from None
-    try:
-        board = BoardSpec.model_validate(tables.get("board"))
-    except ValidationError as error:
-        if "board" not in tables:
-            raise CalibrationError(str(path), "[board] is missing") from None
-        raise invalid(str(path), error, "board") from None
-    camera = tables.get("camera")
-    lens = cast("dict[str, Any]", camera).get("lens_file") if isinstance(camera, dict) else None
-    return RigFile(path, text, board, path.parent / lens if isinstance(lens, str) else None)
+    rig = rig_view({name: tables[name] for name in ("board", "camera") if name in tables}, str(path))
+    if rig.board is None:
+        raise CalibrationError(str(path), "[board] is missing")
+    lens_file = rig.camera.lens_file if rig.camera is not None else None
+    return RigFile(path, text, rig.board, path.parent / lens_file if lens_file is not None else None)
 
 
 def free_name(path: Path) -> Path:

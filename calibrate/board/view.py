@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -50,7 +50,6 @@ NO_BOARD = "holds no view of the board (a `board` step)"
 
 SessionSource = Recording | Path
 """A recording, or the folder of a session that may still be open."""
-M = TypeVar("M", bound=BaseModel)
 MOVED_PX = 1.0
 """Movement of the board's middle between two views above which the camera or the board must have been touched."""
 CHANGED = 5e-4
@@ -163,63 +162,72 @@ def _find(
 
 
 class _Paper(BaseModel):
-    size_mm: tuple[float, float]
+    size_mm: tuple[float, float] | None = None
+
+
+class _Camera(BaseModel):
+    optics: Lens | None = None
+    lens_file: str | None = None
+
+
+class RigView(BaseModel):
+    """What a rig's configuration says of the board, the sheet that lies on it, and the lens; None if nothing."""
+
+    board: BoardSpec | None = None
+    paper: _Paper | None = None
+    camera: _Camera | None = None
+
+    @property
+    def sheet_mm(self) -> tuple[float, float] | None:
+        """Width and height of the sheet."""
+        return None if self.paper is None else self.paper.size_mm
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens that a session was collected with."""
+        return None if self.camera is None else self.camera.optics
+
+
+def rig_of(session: SessionSource) -> RigView:
+    """The rig that a session was collected with. Raises `CalibrationError`."""
+    inside = isinstance(session, Recording)
+    where = f"{session.path} {EFFECTIVE}" if inside else str(session / EFFECTIVE)
+    data = session.attachment(EFFECTIVE) if inside else read_bounded(session / EFFECTIVE)
+    try:
+        tables: object = json.loads(data)
+    except (ValueError, RecursionError):
+        tables = None
+    if not isinstance(tables, dict):
+        raise CalibrationError(where, "holds no board")
+    return rig_view(cast("dict[str, Any]", tables), where)
+
+
+def rig_view(tables: dict[str, Any], where: str) -> RigView:
+    """The view of a configuration's tables. Raises `CalibrationError` that names the file and the field."""
+    try:
+        return RigView.model_validate(tables)
+    except ValidationError as error:
+        raise invalid(where, error) from None
 
 
 def board_of(session: SessionSource) -> BoardSpec:
     """The board of a session's rig. Raises `CalibrationError` where the session names none."""
-    try:
-        board = _rig(session)["board"]
-    except KeyError:
-        raise CalibrationError(_where(session), "holds no board") from None
-    return _parsed(session, "board", BoardSpec, board)
-
-
-def sheet_of(recording: Recording) -> tuple[float, float] | None:
-    """Width and height in mm of the sheet that lies on the board; None where the rig's configuration has none."""
-    paper = _rig(recording).get("paper")
-    size = cast("dict[str, Any]", paper).get("size_mm") if isinstance(paper, dict) else None
-    return None if size is None else _parsed(recording, "paper", _Paper, {"size_mm": size}).size_mm
-
-
-def lens_of_session(session: SessionSource) -> Lens | None:
-    """The lens that the session was collected with; None where its rig named none. Raises `CalibrationError`."""
-    camera = _rig(session).get("camera")
-    optics = cast("dict[str, Any]", camera).get("optics") if isinstance(camera, dict) else None
-    return None if optics is None else _parsed(session, "camera.optics", Lens, optics)
+    board = rig_of(session).board
+    if board is None:
+        where = session.path if isinstance(session, Recording) else session
+        raise CalibrationError(f"{where} {EFFECTIVE}", "holds no board")
+    return board
 
 
 def known_lens(recording: Recording, given: Path | None) -> Lens | None:
     """The lens file that was given, else the session's own. Raises `CalibrationError`."""
-    return read_lens(given) if given is not None else lens_of_session(recording)
+    return read_lens(given) if given is not None else rig_of(recording).lens
 
 
 def board_stills(recording: Recording) -> Iterator[tuple[int, Gray]]:
     """(t_ns, gray photograph) of every `board` step in order. Raises `SessionDamaged` for one that cannot be read."""
     for t_ns, still in recording.stills_of("board"):
         yield t_ns, decode_gray(still, str(recording.path))
-
-
-def _rig(session: SessionSource) -> dict[str, Any]:
-    data = read_bounded(session / EFFECTIVE) if isinstance(session, Path) else session.attachment(EFFECTIVE)
-    try:
-        rig: Any = json.loads(data)
-    except (ValueError, RecursionError):
-        rig = None
-    if not isinstance(rig, dict):
-        raise CalibrationError(_where(session), "holds no board")
-    return cast("dict[str, Any]", rig)
-
-
-def _parsed(session: SessionSource, name: str, kind: type[M], values: object) -> M:
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        raise invalid(_where(session), error, name) from None
-
-
-def _where(session: SessionSource) -> str:
-    return str(session / EFFECTIVE) if isinstance(session, Path) else f"{session.path} {EFFECTIVE}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +268,7 @@ def board_over_session(
     if not stills:
         raise CalibrationError(str(recording.path), NO_BOARD)
     looked_at = counted(stills, "photographs of the board measured", len(stills), progress)
-    return drift(looked_at, spec, lens, sheet_of(recording))
+    return drift(looked_at, spec, lens, rig_of(recording).sheet_mm)
 
 
 def drift(

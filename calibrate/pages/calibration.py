@@ -16,7 +16,7 @@ from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX
 from brushloop.calibrate.board.lens import Floats, Gray, rms
 from brushloop.calibrate.board.pix2len import local_scale
 from brushloop.calibrate.board.spec import describe
-from brushloop.calibrate.board.view import LEAST_PX_PER_MM, NO_BOARD, WORST_INTERVAL, paper_mm, sheet_of
+from brushloop.calibrate.board.view import LEAST_PX_PER_MM, NO_BOARD, WORST_INTERVAL, paper_mm, rig_of
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import (
@@ -55,7 +55,7 @@ def write_calibration_page(recording: Recording, path: Path) -> Path:
     size = np.linalg.norm(off, axis=1)
     dropped = np.zeros(len(size), np.bool_)
     dropped[np.argsort(-size)[: made.corners_dropped]] = True
-    sheet_mm = sheet_of(recording)
+    sheet_mm = rig_of(recording).sheet_mm
     frame = about(recording.header)
     label = frame["label"]
     return write_page(

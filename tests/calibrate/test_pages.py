@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.board.detect import BoardView
-from brushloop.calibrate.board.intrinsics import fit_lens, lens_file
+from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import Gray, Lens
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
@@ -88,8 +88,8 @@ def _lens(folder: Path) -> str:
         seen, _ = cv2.projectPoints(flat, np.array(turn, np.float64), place, true.camera, true.coefficients)
         noise = np.random.default_rng(number).normal(0.0, 0.1, (54, 2))
         views.append(BoardView(f"{number}<u>.png", (640, 480), seen.reshape(-1, 2) + noise, board_mm, ids))
-    fitted = fit_lens(views, unusable={"7.png": "is blank"})
-    file = lens_file(fitted, "a board", {f"{n}<u>.png": "ab" for n in range(6)} | {"7.png": "cd"}, 0.5, "test")
+    photographs = {f"{n}<u>.png": "ab" for n in range(6)} | {"7.png": "cd"}
+    file = fit_lens(views, "a board", photographs, {"7.png": "is blank"})
     small = {"0<u>.png": thumbnail(board()), "7.png": thumbnail(board())}
     return write_lens_page(file.save(folder), file, views, small).read_text(encoding="utf-8")
 

@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import itertools
 from collections.abc import Awaitable, Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -16,13 +15,11 @@ from brushloop.calibrate.board.detect import BoardView, find_board
 from brushloop.calibrate.board.intrinsics import (
     GOOD_VIEWS,
     GRID,
-    RMS_LIMIT_PX,
-    LensFit,
+    LensFile,
     distinct_views,
     fit_lens,
     guidance,
     held,
-    lens_file,
     nominal_normals,
 )
 from brushloop.calibrate.board.spec import BoardSpec, describe
@@ -96,7 +93,7 @@ class CameraStep(Step):
             folder = self._folder(day)
             fitted = await self._lens(day, folder, lambda: still(camera, day.clock))
         if fitted is not None:
-            await self._keep_lens(day, folder, fitted)
+            await self._keep_lens(day, fitted)
 
     def _folder(self, day: Day) -> Path:
         """Where the photographs of the lens are, so that a resumed session does not take them again."""
@@ -201,7 +198,7 @@ class CameraStep(Step):
     def _forget_print(self, day: Day) -> None:
         day.save(day.notebook.without("board."))
 
-    async def _lens(self, day: Day, folder: Path, take: Take) -> LensFit | None:
+    async def _lens(self, day: Day, folder: Path, take: Take) -> LensFile | None:
         """Have the board held before the camera until the lens is known and its picture covered.
 
         None if the person skips it from the start: a lens without distortion needs no file.
@@ -222,10 +219,11 @@ class CameraStep(Step):
             if views and (todo := still_missing(views)):
                 await day.say(*todo, picture=coverage_picture(views))
         await day.working("computing the lens")
-        fitted = await asyncio.to_thread(fit_lens, views)
-        for warning in (*fitted.warnings, *fitted.guidance):
+        digests = {name: digest(folder / name) for name in taken(day.notebook, folder)}
+        file = await asyncio.to_thread(fit_lens, views, describe(spec), digests, {})
+        for warning in (*file.warnings, *file.guidance):
             await day.say(warning, tone="warning")
-        return fitted
+        return file
 
     async def _held(self, day: Day, path: Path, where: str, take: Take, views: list[BoardView]) -> bool:
         """Take one photograph of the held board; False where the person skips it."""
@@ -247,21 +245,18 @@ class CameraStep(Step):
         views.append(view)
         return True
 
-    async def _keep_lens(self, day: Day, folder: Path, fitted: LensFit) -> None:
-        digests = {name: digest(folder / name) for name in taken(day.notebook, folder)}
-        software = f"brushloop {version('brushloop')}"
-        file = lens_file(fitted, describe(board_of(day.notebook)), digests, RMS_LIMIT_PX, software)
+    async def _keep_lens(self, day: Day, file: LensFile) -> None:
         path = file.save(day.rig_path.parent)
-        reach = fitted.focal_reach_px
+        reach = file.focal_reach_px
         day.keep(
             "camera",
             "camera.lens_file",
             str(path.relative_to(day.rig_path.parent)),
-            f"fitted to {len(fitted.residuals_px)} photographs of the board held in {fitted.ways} ways",
-            known=f"residual {fitted.rms_px:.2f} px"
+            f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways",
+            known=f"residual {file.rms_px:.2f} px"
             + ("" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"),
         )
-        await day.say(f"Lens: residual {fitted.rms_px:.2f} px over {len(fitted.residuals_px)} photographs.")
+        await day.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
 
     def forget(self, notebook: Notebook) -> Notebook:
         """Without source, settings, print and lens; the photographs of the lens are taken again."""

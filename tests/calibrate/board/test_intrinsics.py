@@ -12,7 +12,8 @@ import pytest
 
 from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.board.detect import BoardView, find_board
-from brushloop.calibrate.board.intrinsics import LensFile, fit_lens, guidance, lens_file
+from brushloop.calibrate.board.intrinsics import LensFile, guidance
+from brushloop.calibrate.board.intrinsics import fit_lens as fit
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.spec import BoardSpec, Checkerboard, charuco_board
 from brushloop.calibrate.errors import CalibrationError
@@ -52,6 +53,10 @@ def views(count: int, noise_px: float = 0.1, seed: int = 0, lens: Lens = TRUE) -
             noisy = pixels + rng.normal(0, noise_px, pixels.shape)
             made.append(BoardView(f"{len(made)}.png", TRUE.size_px, noisy, board, ids))
     return made
+
+
+def fit_lens(seen: Sequence[BoardView]) -> LensFile:
+    return fit(seen, "a board", {"0.png": "ab"}, {})
 
 
 def renamed(seen: Sequence[BoardView], stem: str) -> list[BoardView]:
@@ -226,7 +231,7 @@ def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
 
 
 def test_a_lens_file_cannot_be_edited(tmp_path: Path) -> None:
-    path = lens_file(fit_lens(views(8)), "a board", {"0.png": "ab"}, 0.5, "test").save(tmp_path)
+    path = fit_lens(views(8)).save(tmp_path)
     assert load_artefact(path, LensFile).lens.matrix[0] == pytest.approx(800.0, rel=0.01)
     path.write_text(path.read_text().replace('"a board"', '"another"'))
     with pytest.raises(CalibrationError, match="was edited"):

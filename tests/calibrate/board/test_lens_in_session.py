@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.intrinsics import fit_lens, lens_file, read_lens
+from brushloop.calibrate.board.intrinsics import fit_lens, read_lens
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.view import see_board
 from brushloop.calibrate.calibration import Calibration
@@ -233,6 +233,6 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
 @pytest.mark.parametrize("rig", [1, 2, 3, 4])
 def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed, tmp_path: Path, rig: int) -> None:
     views = [find_board(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
-    lens = lens_file(fit_lens(views), "a board", {}, 0.5, "test").save(tmp_path)
+    lens = fit_lens(views, "a board", {}, {}).save(tmp_path)
     seen = sheet(rig, 15)
     holds(load_artefact(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), Calibration), seen)

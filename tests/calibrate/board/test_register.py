@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.register import RegistrationFile, read_points, register
+from brushloop.calibrate.board.register import Registration, read_points
+from brushloop.calibrate.board.register import register as fit
 from brushloop.calibrate.errors import CalibrationError
 
 ROBOT = np.array([[460.0, -110.0], [460.0, 100.0], [310.0, 100.0], [310.0, -110.0], [380.0, 0.0], [420.0, 50.0]])
@@ -18,6 +19,10 @@ def seen(turn_deg: float = -90.0, scale: float = 1.0, noise_mm: float = 0.05) ->
     turn = np.radians(turn_deg)
     matrix = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     return ROBOT @ matrix.T + [110.0, 460.0] + np.random.default_rng(2).normal(0, noise_mm, ROBOT.shape)
+
+
+def register(names: list[str], robot_mm: np.ndarray, seen_mm: np.ndarray) -> Registration:
+    return fit(names, robot_mm, seen_mm, "points.csv", (-34.0, -34.0))
 
 
 def test_turn_and_place_are_found_and_every_point_shows_its_residual() -> None:
@@ -68,7 +73,6 @@ def test_the_table_of_points_is_read_and_its_faults_are_named(tmp_path: Path) ->
 
 
 def test_a_registration_becomes_a_file_named_after_its_contents(tmp_path: Path) -> None:
-    about = {"board_origin_mm": (-34.0, -34.0), "source": "points.csv", "software": "test"}
-    file = RegistrationFile(**dict(register(NAMES, ROBOT, seen())), **about)
+    file = register(NAMES, ROBOT, seen())
     assert file.save(tmp_path).stem == file.digest
     assert file.robot_to_paper[2] == pytest.approx(110.0, abs=0.5)

@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from brushloop.__main__ import app
-from brushloop.calibrate.board.register import PaperLines, read_rig
+from brushloop.calibrate.board.register import read_rig
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PaperConfig, RigConfig, load_rig
 from brushloop.collect.rig.paper import to_base
@@ -112,7 +112,7 @@ def rest(rig: RigConfig) -> object:
 
 BOARD = "[board]\nsquares = [9, 7]\nsquare_mm = 20.0\nmarker_mm = 15.0\norigin_mm = [-3.0, -4.0]\n"
 SOUND = f"{BOARD}[paper]\norigin_mm = [1, 2] # here\nyaw_deg = 0\n"
-LINES = PaperLines((460.12345, -0.00001), 90.00001)
+LINES = {"origin_mm": [460.123, 0.0], "yaw_deg": 90.0}
 
 
 @pytest.mark.parametrize(

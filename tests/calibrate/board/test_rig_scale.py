@@ -52,7 +52,8 @@ def test_its_interval_holds_the_truth_as_often_as_it_says(seed: int) -> None:
 @pytest.mark.parametrize("rig", range(len(CAMERAS)))
 def test_slanted_boards_give_back_the_lens(rig: int) -> None:
     view = CAMERAS[rig]
-    fitted = fit_lens([find_board(image, BOARD, f"{k}") for k, image in enumerate(lens_views(rig, 12))])
+    seen = [find_board(image, BOARD, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
+    fitted = fit_lens(seen, "a board", {}, {})
     assert fitted.rms_px < 0.2
     assert fitted.lens.matrix[0] == pytest.approx(view.width_px, rel=1e-3)
     # Where it matters: pixels of the corners of the image, straightened.
