@@ -161,7 +161,7 @@ def sim(
     Ctrl-C ends it; SIGUSR1 puts a fresh sheet in. An unknown lab has a loopback address of its own and no rig.toml,
     which `brushloop rig new` has to find out.
     """
-    from brushloop.drivers.sim.brush_file import load_brush
+    from brushloop.drivers.sim.brush.spec import load_brush
     from brushloop.drivers.sim.config import SimConfig, View
     from brushloop.drivers.sim.serve import LabRefused, serve, serve_unknown
 
@@ -204,7 +204,7 @@ def fault(
     """Break a device of a running loopback rig, list its faults, or act as the person at its pendant."""
     from json import dumps
 
-    from brushloop.drivers.sim.fault_client import ask, request_of
+    from brushloop.drivers.loopback import ask, request_of
 
     options = {"after_s": after_s, "on": on, "nth": nth, "phase": phase, "press": press, "count": count}
     request = request_of(what, kind, options | {"for_s": for_s, "late_s": late_s, "id": ident})
@@ -220,7 +220,7 @@ def hand(
     corner: Annotated[str | None, typer.Option(help="Such as 'lower left' or 'upper right'.")] = None,
 ) -> None:
     """Act as the person in an unknown lab: guide the arm by hand, hold the printed board, correct mistakes."""
-    from brushloop.drivers.sim.fault_client import ask
+    from brushloop.drivers.loopback import ask
 
     wanted = {"act": act, "to": to, "index": index or None, "corner": corner}
     say(ask(control, {"do": "hand", **{name: value for name, value in wanted.items() if value is not None}})["says"])

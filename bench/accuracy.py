@@ -41,7 +41,7 @@ from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scor
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.scores import HEADLINE, REFERENCE, SIMULATED, read_written
-from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.model.fitted import FittedPress
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.twin.run import TWIN, fit_twin, workers

@@ -43,8 +43,8 @@ from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.collect.tui.teach_app import TeachApp
 from brushloop.collect.tui.teach_guide import Question, ScreenGuide
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.host import HostClock
+from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.lab.lab import UnknownLab
 from brushloop.drivers.sim.rig import LoopbackRig

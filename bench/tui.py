@@ -24,7 +24,7 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import CellCount, Picture, Snapshot
 from brushloop.collect.engine.telemetry import Telemetry
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.drivers.samples import ForceSample, Stamp
+from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.sessions.records import Condition
 
 SIZE = (120, 40)

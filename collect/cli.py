@@ -160,7 +160,7 @@ def doctor(
 
     from brushloop.collect.rig.config import load_rig
     from brushloop.collect.rig.doctor import examine
-    from brushloop.drivers.clock import HostClock
+    from brushloop.drivers.host import HostClock
 
     if report is not None:
         from brushloop.collect.rig.report import check_report

@@ -53,7 +53,7 @@ def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
 
     from brushloop.collect.errors import ConfigError
     from brushloop.collect.tui.teach_app import run_teaching
-    from brushloop.drivers.clock import HostClock
+    from brushloop.drivers.host import HostClock
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")

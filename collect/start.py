@@ -17,7 +17,7 @@ from brushloop.collect.engine.live import LiveView
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.headless import RunnableEngine, run_headless
 from brushloop.collect.planning.limit_check import check_protocol
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import plain
 

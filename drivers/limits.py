@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.geometry import distance, lean, steepest_deg
-from brushloop.drivers.samples import Pose
 
 TILT_SLACK_DEG = 1e-6
 """Tolerance for rounding in Euler angles: a tilt equal to the limit must not be refused."""

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.drivers.sim.brush_file import load_brush
+from brushloop.drivers.sim.brush.spec import load_brush
 from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of
 
 TUTORIAL = ROOT / "docs" / "tutorial.md"

@@ -22,15 +22,13 @@ from brushloop.collect.quality.measure import Mark
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Ink, Stamp
 from brushloop.drivers.errors import LimitExceeded
-from brushloop.drivers.protocols import Ink
-from brushloop.drivers.samples import Stamp
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.camera import mjpeg_server
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.faults.kinds import ALWAYS, KINDS, Device, Fault
-from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
+from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
 from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at

@@ -16,8 +16,7 @@ import numpy as np
 
 from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
-from brushloop.drivers.sim.brush.spec import BrushSpec
-from brushloop.drivers.sim.config import SoundHead
+from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.sessions.terminal import Progress, unseen
 from brushloop.twin.brush import (
     SHAPE,

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
-from brushloop.drivers.loopback import LoopbackRig, start
-from brushloop.drivers.sim.fault_client import ask
+from brushloop.drivers.loopback import LoopbackRig, ask, start
 
 IDLE_EXIT_S = 180.0
 """Longer than the evaluation between two collections takes on a busy computer."""

@@ -41,8 +41,8 @@ from brushloop.collect.planning.walk import layout_of, sheet_of, steps_on
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
-from brushloop.drivers.clock import Clock
 from brushloop.drivers.errors import DeviceError, NotConnected, Stale
+from brushloop.drivers.host import Clock
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.store import SessionStore

@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 from brushloop.collect.errors import ForceTooHigh, describe
 from brushloop.collect.rig.devices import Rig
+from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.errors import DeviceError, MotionFailed
-from brushloop.drivers.samples import ForceSample
 
 CHECK_S = 0.02
 """Time between checks for a silent sensor: silence must not be mistaken for zero force."""

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from brushloop.collect.engine.telemetry import FRAME_PERIOD_S, each_frame
 from brushloop.collect.errors import ConfigError
-from brushloop.drivers.protocols import Camera
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Camera, Frame
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
 from brushloop.sessions.messages import decode_gray, image_message

@@ -20,8 +20,8 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig, overrides
 from brushloop.collect.rig.devices import Rig
-from brushloop.drivers.clock import Clock
-from brushloop.drivers.samples import Identity
+from brushloop.drivers.devices import Identity
+from brushloop.drivers.host import Clock
 from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, check_folder, holds, read_bounded
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, PressResult

@@ -17,7 +17,7 @@ from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.plan import Planned, with_review
 from brushloop.collect.protocols.steps import CaptureStep, DipStep, DrawStep, PressStep, Step
 from brushloop.collect.rig.paper import Layout
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.host import Clock
 from brushloop.sessions.events import (
     CaptureResult,
     Condition,

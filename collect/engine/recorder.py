@@ -11,8 +11,8 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from brushloop.drivers.clock import Clock
-from brushloop.drivers.samples import ForceSample, Frame, PoseSample, Stamp
+from brushloop.drivers.devices import ForceSample, Frame, PoseSample, Stamp
+from brushloop.drivers.host import Clock
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.mcap_writer import Outgoing, SegmentWriter
 from brushloop.sessions.messages import encode_png, image_message, pose_message

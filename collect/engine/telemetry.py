@@ -18,9 +18,8 @@ from brushloop.calibrate.stroke.params import Gray
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.quality.measure import blur_px
 from brushloop.collect.rig.optics import gray
+from brushloop.drivers.devices import Camera, ForceSample, Frame, Pose, QueuedLine, Robot, Stamp
 from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.protocols import Camera, Robot
-from brushloop.drivers.samples import ForceSample, Frame, Pose, QueuedLine, Stamp
 
 SLOT_NS = 100_000_000
 """Time that one value of the trace covers. The value is the peak force, so that a short peak is seen."""

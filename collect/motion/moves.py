@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from brushloop.collect.protocols.steps import TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig, WashConfig
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, interpolate, lean
-from brushloop.drivers.samples import Pose
 from brushloop.sessions.records import Condition
 
 CLEARANCE_MM = 8.0

@@ -22,8 +22,8 @@ from brushloop.collect.protocols.steps import Drawn
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, to_paper
+from brushloop.drivers.devices import Frame, QueuedLine
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import Frame, QueuedLine
 from brushloop.sessions.records import Condition
 
 DEPTH_TOLERANCE_MM = 0.1

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from brushloop.collect.photograph.delay import FrameChange
 from brushloop.collect.rig.optics import gray
-from brushloop.drivers.protocols import Camera
-from brushloop.drivers.samples import Frame, Stamp
+from brushloop.drivers.devices import Camera, Frame, Stamp
 
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160

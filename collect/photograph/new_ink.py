@@ -21,7 +21,7 @@ from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.optics import Gray, undistorted
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Frame
 
 DARK_SHARE = 0.5
 """Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""

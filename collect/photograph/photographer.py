@@ -17,10 +17,9 @@ from brushloop.collect.errors import ArmInPicture, CameraLate
 from brushloop.collect.photograph.delay import ArmPlace, CameraDelay, Look, look
 from brushloop.collect.photograph.frames import ARM_SHARE, Frames, Thumbnail, View, watching
 from brushloop.collect.rig.config_devices import CameraConfig
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.devices import Camera, Frame, Robot
 from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.protocols import Camera, Robot
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.host import Clock
 
 FEWEST_LOOKS, MOST_LOOKS, MOST_EXACT_LOOKS = 2, 6, 8
 ATTEMPTS = 4

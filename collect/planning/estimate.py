@@ -10,8 +10,8 @@ from brushloop.collect.planning.walk import StepMoves
 from brushloop.collect.rig.config import BrushConfig, RigConfig
 from brushloop.collect.rig.config_devices import ModbusPumpConfig
 from brushloop.collect.rig.devices import limits_of
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import Pose
 from brushloop.sessions.records import Condition
 
 SETTLE_S = 0.12

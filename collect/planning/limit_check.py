@@ -24,11 +24,10 @@ from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.arcs.controller import Controller, six
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.arcs.rpc import RpcConnection, open_arcs
+from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import LimitExceeded, ProtocolViolation
-from brushloop.drivers.geometry import from_wire, to_wire
-from brushloop.drivers.rotation import inverse, product, turned
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.geometry import from_wire, inverse, product, to_wire, turned
 
 TOUCH_CLEAR_MM = 5.0
 

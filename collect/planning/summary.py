@@ -22,7 +22,7 @@ from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import Press
 from brushloop.sessions.records import Condition
 

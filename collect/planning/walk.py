@@ -41,7 +41,7 @@ from brushloop.collect.rig.paper import Layout, PaperPlane, Patch, Sheet
 from brushloop.collect.touch.heights import lowest_z_mm
 from brushloop.collect.touch.places import patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import PressResult, StepKind, StepResult
 
 

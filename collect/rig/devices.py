@@ -13,15 +13,13 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.devices import Camera, ForceSensor, Identity, Ink, Robot
 from brushloop.drivers.errors import noting_lateness
-from brushloop.drivers.exclusive import Claimed, claimed
 from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.host import Claimed, Clock, claimed
 from brushloop.drivers.ink.pump import ModbusPump
 from brushloop.drivers.ink.station import InkStation
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.protocols import Camera, ForceSensor, Ink, Robot
-from brushloop.drivers.samples import Identity
 
 FORCE_CONNECT_S = 10.0
 """Time to open the bus, even through a gateway, and get a first round."""

@@ -19,10 +19,10 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig
 from brushloop.collect.rig.devices import make_camera, make_force, make_ink, make_robot
 from brushloop.collect.rig.optics import lens_of
-from brushloop.drivers.arcs.codes import MOVING_ALLOWED, RobotMode
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
+from brushloop.drivers.devices import Identity, Stamp
 from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.samples import Identity, Stamp
+from brushloop.drivers.host import Clock
 
 T = TypeVar("T")
 CALLS = 20

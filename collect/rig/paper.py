@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from brushloop.collect.errors import SheetFull, StepError
 from brushloop.collect.rig.config import PaperConfig
-from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.rotation import Quaternion, of_angles, product, turned, unit
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import Quaternion, brush_pose, of_angles, product, turned, unit
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ from brushloop.collect.rig.check import check_rig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import Finding
 from brushloop.collect.rig.scrub import Scrubber, numbers_only, scrubber_of
-from brushloop.drivers.arcs.rpc import Framing
 from brushloop.drivers.arcs.survey import Exchange, rtde_answers, survey
+from brushloop.drivers.arcs.wire import Framing
 
 FORMAT = 1
 ENDING = ".zip"

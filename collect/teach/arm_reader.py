@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from brushloop.drivers.arcs.codes import LOOPBACK_CONTROL_BOX
-from brushloop.drivers.arcs.controller import six
-from brushloop.drivers.arcs.framing import numbers
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, six
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.arcs.rpc import DEVICE, Framing, RpcConnection, open_arcs
+from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, numbers, open_arcs
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire
-from brushloop.drivers.samples import Pose
 
 READ_ONLY = frozenset(
     {

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from brushloop.collect.rig.optics import gray
 from brushloop.collect.teach.store import Notebook
 from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
-from brushloop.drivers.clock import Clock
-from brushloop.drivers.samples import Stamp
+from brushloop.drivers.devices import Stamp
+from brushloop.drivers.host import Clock
 
 Gray = NDArray[np.uint8]
 LATE_MS = 2500.0

@@ -13,7 +13,7 @@ from brushloop.collect.teach.arm_reader import Address, ArmReader, reading
 from brushloop.collect.teach.back import BackGuide
 from brushloop.collect.teach.guide import Guide, Picture, Shown, Tone
 from brushloop.collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, now_utc
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.host import Clock
 
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")

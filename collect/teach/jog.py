@@ -18,11 +18,10 @@ from brushloop.collect.teach.guide import Brought, JogStep, JogView, Target, Tar
 from brushloop.collect.teach.maths.tip import tip_of
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.devices import Pose, Robot
 from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.geometry import lean
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.protocols import Robot
-from brushloop.drivers.samples import Pose
 
 STEPS_MM = (0.1, 0.5, 2.0, 5.0)
 SPEED_MM_S, ACC_MM_S2 = 20.0, 200.0

@@ -16,8 +16,8 @@ from pydantic import Field, ValidationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
 from brushloop.collect.rig.plausible import Check, unmeasured
-from brushloop.drivers.arcs.rpc import Framing
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.arcs.wire import Framing
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.disk import fsync_folder, sync
 
 MAX_BYTES = 1024 * 1024

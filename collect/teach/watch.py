@@ -11,8 +11,8 @@ from brushloop.collect.teach.cameras import taught_camera
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Picture
 from brushloop.collect.teach.maths.tip import tip_of
+from brushloop.drivers.devices import Pose, Stamp
 from brushloop.drivers.errors import DeviceError
-from brushloop.drivers.samples import Pose, Stamp
 
 POSE_S = 0.3
 """Time between two poses."""

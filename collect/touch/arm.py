@@ -15,8 +15,8 @@ from brushloop.collect.motion.moves import Move
 from brushloop.collect.rig.config_touch import ForceTouchConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.touch.force import Reading
-from brushloop.drivers.clock import Clock
-from brushloop.drivers.samples import ForceSample, Frame, QueuedLine
+from brushloop.drivers.devices import ForceSample, Frame, QueuedLine
+from brushloop.drivers.host import Clock
 
 
 class Effector(Protocol):

@@ -18,7 +18,7 @@ from brushloop.collect.touch.arm import Effector, TouchArm
 from brushloop.collect.touch.force import Floats
 from brushloop.collect.touch.heights import KnownHeights, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
 from brushloop.collect.touch.places import SpotGrid, coarse_count, fine_count
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Frame
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from brushloop.collect.rig.config_touch import SelfCheckConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.arm import Effector, TouchArm
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import SelfCheckResult
 
 Floats = NDArray[np.float64]

@@ -75,7 +75,7 @@ class SessionBrowser:
 
         from brushloop.collect.rig.config import load_rig
         from brushloop.collect.rig.doctor import examine
-        from brushloop.drivers.clock import HostClock
+        from brushloop.drivers.host import HostClock
 
         return asyncio.run(examine(load_rig(self.paths.config), HostClock()))
 

@@ -24,7 +24,7 @@ from brushloop.collect.teach.guide import (
     Target,
     WentBack,
 )
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 
 Kind = Literal["choose", "number", "text", "bring", "jog"]
 Answer = str | float | Brought | JogStep

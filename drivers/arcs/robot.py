@@ -6,20 +6,27 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, TypeVar
 
-from brushloop.drivers.arcs.codes import LOOPBACK_CONTROL_BOX
-from brushloop.drivers.arcs.controller import Condition, Controller
-from brushloop.drivers.arcs.departure import Departure
-from brushloop.drivers.arcs.queueing import OwnPath, capped, feed, legs_of, queue_all
-from brushloop.drivers.arcs.rpc import DEVICE, RpcConnection, open_arcs
-from brushloop.drivers.arcs.settings import ArcsOptions, make_ready, power_on
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Condition, Controller
+from brushloop.drivers.arcs.motion import (
+    Look,
+    Messages,
+    OwnPath,
+    Tolerance,
+    capped,
+    feed,
+    legs_of,
+    planned_s,
+    queue_all,
+    until_settled,
+)
+from brushloop.drivers.arcs.settings import ArcsOptions, Departure, make_ready, power_on
 from brushloop.drivers.arcs.stopping import Stopper, Watchdog
 from brushloop.drivers.arcs.telemetry import Telemetry
-from brushloop.drivers.arcs.waiting import Look, Messages, Tolerance, planned_s, until_settled
-from brushloop.drivers.cancellation import finished
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.arcs.wire import DEVICE, RpcConnection, open_arcs
+from brushloop.drivers.devices import Identity, Pose, PoseSample, QueuedLine
 from brushloop.drivers.errors import DeviceError, MotionFailed, NotConnected
+from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import Identity, Pose, PoseSample, QueuedLine
 
 __all__ = ["ArcsOptions", "AuboArcs", "Condition"]
 

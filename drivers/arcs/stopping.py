@@ -14,9 +14,8 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 
-from brushloop.drivers.arcs.codes import ReturnCode
-from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.rpc import DEVICE, RpcConnection
+from brushloop.drivers.arcs.controller import Controller, ReturnCode
+from brushloop.drivers.arcs.wire import DEVICE, RpcConnection
 from brushloop.drivers.errors import DeviceError, MotionFailed, RpcError
 from brushloop.drivers.geometry import distance
 

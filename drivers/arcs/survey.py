@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.arcs.rpc import Framing, RpcConnection, open_arcs
-from brushloop.drivers.arcs.rtde import RtdeStream
-from brushloop.drivers.arcs.telemetry import JOINTS_SEGMENT, POSE_SEGMENT
+from brushloop.drivers.arcs.telemetry import JOINTS_SEGMENT, POSE_SEGMENT, RtdeStream
+from brushloop.drivers.arcs.wire import Framing, RpcConnection, open_arcs
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, RpcError
 
 OF_THE_CONTROLLER = (

@@ -17,9 +17,9 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
 from brushloop.drivers.camera.source import DEVICE, CameraOptions, Source, open_source
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
-from brushloop.drivers.samples import Frame, Identity, Stamp
+from brushloop.drivers.host import Clock
 
 if TYPE_CHECKING:
     import numpy as np

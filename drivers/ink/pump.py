@@ -20,11 +20,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.cancellation import finished
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, crc16
-from brushloop.drivers.samples import Identity
 
 DEVICE = "pump"
 WRITE_REGISTER = 0x06

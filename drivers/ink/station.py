@@ -13,10 +13,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
+from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, crc16
-from brushloop.drivers.samples import Identity
 
 DEVICE = "ink"
 MAX_LINE_BYTES = 96

@@ -7,22 +7,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from brushloop.drivers.sim.brush.brush import BrushSpec
-from brushloop.drivers.sim.brush.spec import within
-
-
-@dataclass(frozen=True, slots=True)
-class SoundHead:
-    """The `[quality]` settings of a rig.toml that depend on the brush; raises ValueError out of range."""
-
-    head_mm: float
-    """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
-    misplaced_mm: float
-    """Distance from there at which a mark counts as misplaced."""
-
-    def __post_init__(self) -> None:
-        within("head_mm", self.head_mm, -20.0, 20.0)
-        within("misplaced_mm", self.misplaced_mm, 0.1, 20.0)
+from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,9 +27,8 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from brushloop.drivers.sim.described import SimFileError
-from brushloop.drivers.sim.faults.board import Hung
-from brushloop.drivers.sim.faults.kinds import fault_of
+from brushloop.drivers.sim.brush.spec import SimFileError
+from brushloop.drivers.sim.faults import Hung, fault_of
 from brushloop.drivers.sim.rig import Faults
 from brushloop.drivers.sim.server import LoopbackServer
 

@@ -1,29 +1,160 @@
-"""The loopback rig as a whole: one world, the devices around it on 127.0.0.1 and on ptys, and its faults."""
+"""The loopback rig as a whole: one world, the devices around it on 127.0.0.1 and on ptys, faults, and `rig.toml`."""
 
 from __future__ import annotations
 
 import asyncio
 import functools
 import math
+from dataclasses import dataclass
 from typing import Any, Literal
 
-from brushloop.drivers.arcs.codes import SafetyMode
-from brushloop.drivers.force.rounds import Wrench
-from brushloop.drivers.rotation import columns, inverse, of_angles, product
-from brushloop.drivers.sim.arcs.power import EMERGENCY_STOPS
-from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL, Wrench
+from brushloop.drivers.geometry import columns, inverse, of_angles, product
+from brushloop.drivers.sim.arcs.cabinet import EMERGENCY_STOPS
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.faults.board import FaultBoard
-from brushloop.drivers.sim.faults.kinds import KINDS, Device, Fault, ForceFault, InkFault
-from brushloop.drivers.sim.faults.phases import Truth
+from brushloop.drivers.sim.faults import KINDS, Device, Fault, FaultBoard, Truth
 from brushloop.drivers.sim.instruments.force_board import ForceBoard, SocketcandServer
-from brushloop.drivers.sim.instruments.ink_station import Instrument, PtyLine, StationFirmware
-from brushloop.drivers.sim.instruments.modbus_pump import PumpFirmware
-from brushloop.drivers.sim.rig_toml import PUMP_ML, Addresses, rig_toml
+from brushloop.drivers.sim.instruments.ink import Instrument, PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.sim.world import World
+
+LOOPBACK_HEAD = "# The loopback rig"
+TAUGHT_TOUCH_ERROR_MM = 0.03
+"""Error of a taught touch height."""
+SEEN_S = 0.05
+"""Real time within which a pose is seen by polling."""
+PUMP_ML = 0.1
+"""Delivery of the loopback pump, ml per revolution."""
+
+
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """Where the devices of one rig are served."""
+
+    host: str
+    arcs_port: int
+    rtde_port: int
+    camera_port: int
+    force_port: int | None
+    ink_path: str | None
+
+
+def rig_toml(config: SimConfig, at: Addresses) -> str:
+    """TOML text; addresses as served."""
+    table, view, brush = config.table, config.view, config.brush
+    touch_z_mm = table.paper_z_mm + TAUGHT_TOUCH_ERROR_MM
+    return f"""\
+{LOOPBACK_HEAD}, seed {config.seed}. Simulated: nothing measured on it is a result on paper.
+name = "loopback rig"
+
+[robot]
+kind = "aubo-arcs"
+host = "{at.host}"
+port = {at.arcs_port}
+rtde_port = {at.rtde_port}
+tcp_offset_mm = [0.0, 0.0, 180.0]
+
+[robot.limits]
+x_mm = [200.0, 640.0]
+y_mm = [-260.0, 260.0]
+z_mm = [95.0, 400.0]
+tilt_deg = 15.0
+speed_mm_s = 250.0
+acc_mm_s2 = 1000.0
+
+[camera]
+kind = "opencv"
+source = "http://{at.host}:{at.camera_port}/stream.mjpg"
+latency_ms = 250.0
+max_delay_ms = 3000.0     # drawn and encoded on the same machine as the run, a picture may be late
+max_jitter_ms = 2000.0
+lens = "simulated, {view.px_per_mm:g} px/mm, no distortion"
+
+[brush]
+name = "{config.brush_name or f"simulated bristle bundle, seed {brush.seed}"}"
+radius_mm = {brush.radius_mm}
+length_mm = {brush.length_mm}
+max_depth_mm = 22.0
+
+[paper]
+name = "simulated Xuan paper"
+origin_mm = [{table.origin_mm[0]}, {table.origin_mm[1]}]
+yaw_deg = {table.yaw_deg}
+touch_z_mm = {touch_z_mm:.3f}
+size_mm = [{table.sheet_mm[0]}, {table.sheet_mm[1]}]
+cell_mm = [40.0, 24.0]
+touch_point_mm = [2.0, 2.0]
+
+[ink]
+name = "simulated ink"
+well_mm = [{table.well_mm[0]}, {table.well_mm[1]}]
+dip_z_mm = {table.paper_z_mm + table.ink_level_mm - 8.0}
+{_ink_device(config, at)}{_force_table(config, at)}
+[board]
+squares = [{table.board_squares[0]}, {table.board_squares[1]}]
+square_mm = {table.board_square_mm}
+marker_mm = {table.board_marker_mm}
+dictionary = "{table.board_dictionary}"
+origin_mm = [{table.board_origin_mm[0]}, {table.board_origin_mm[1]}]
+
+[motion]
+safe_z_mm = {table.paper_z_mm + 60.0}
+park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
+travel_speed_mm_s = 200.0
+press_speed_mm_s = 20.0
+acc_mm_s2 = 800.0
+{_dwell(config)}{_quality(config)}"""
+
+
+def _ink_device(config: SimConfig, at: Addresses) -> str:
+    match config.ink_device:
+        case "station":
+            return f'\n[ink.device]\nkind = "ink-station"\nport = "{at.ink_path}"\nlight = 0.8\n'
+        case "pump":
+            return f'\n[ink.device]\nkind = "modbus-pump"\nport = "{at.ink_path}"\nml_per_revolution = {PUMP_ML}\n'
+        case "none":
+            return ""
+
+
+def _force_table(config: SimConfig, at: Addresses) -> str:
+    if at.force_port is None:
+        return ""
+    return f"""
+[force]
+kind = "sri-m8123"
+interface = "socketcand"
+channel = "{LOOPBACK_CHANNEL}"
+host = "{at.host}"
+port = {at.force_port}
+{_staleness(config)}"""
+
+
+def _dwell(config: SimConfig) -> str:
+    """`least_dwell_s` if simulated time runs fast: else a whole dwell could pass between two polls."""
+    if config.rate <= 2.0:
+        return ""
+    return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs at {config.rate:g} times real time\n"
+
+
+def _staleness(config: SimConfig) -> str:
+    """`stale_ms` of a real sensor; more if simulated time is fast: a sample's age then says little about the arm."""
+    if config.rate <= 1.0:
+        return "stale_ms = 100.0\n"
+    return f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs at {config.rate:g} times real time\n"
+
+
+def _quality(config: SimConfig) -> str:
+    if config.head is None:
+        return ""
+    return f"""
+[quality]
+head_mm = {config.head.head_mm}
+misplaced_mm = {config.head.misplaced_mm}
+"""
+
 
 HOST = "127.0.0.1"
 """Not configurable: no other machine may drive or watch a simulated arm by mistake."""
@@ -54,9 +185,9 @@ class Faults:
         arcs.faults = rtde.faults = camera.faults = self.board
         self._ink, self._force = ink, force
         if ink is not None:
-            ink.next_fault = lambda: InkFault(kind) if (kind := self._kind(Device.INK)) else None
+            ink.next_fault = lambda: self._kind(Device.INK)
         if force is not None:
-            force.next_fault = lambda: ForceFault(kind) if (kind := self._kind(Device.FORCE)) else None
+            force.next_fault = lambda: self._kind(Device.FORCE)
         self._watching: asyncio.Task[None] | None = None
 
     def hang(self, fault: Fault) -> int:
@@ -120,9 +251,9 @@ class Faults:
                 self._arcs.stop_as(stop.kind)
             await asyncio.sleep(TICK_S if waits else IDLE_TICK_S)
 
-    def _kind(self, device: Device) -> str:
+    def _kind(self, device: Device) -> str | None:
         fault = self.board.meet(device, "", KINDS[device])
-        return "" if fault is None else fault.kind
+        return None if fault is None else fault.kind
 
 
 class LoopbackRig:

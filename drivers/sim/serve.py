@@ -9,11 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.control import live_control
-from brushloop.drivers.sim.described import SimFileError
-from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.rig_toml import LOOPBACK_HEAD
+from brushloop.drivers.sim.rig import LOOPBACK_HEAD, LoopbackRig
 
 
 def serve(

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.rounds import Wrench
 from brushloop.drivers.geometry import brush_pose, from_wire, lean
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.kinematics import Matrix, matrix_of
 from brushloop.drivers.sim.arm.motion import MotionQueue
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush
 from brushloop.drivers.sim.brush.contact import Contact, ContactWatch, Reaction, bent_toward, leaning_with
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
-from brushloop.drivers.sim.brush.flaws import Flaw, flaw_of_load, natural_split
+from brushloop.drivers.sim.brush.footprint import Flaw, flaw_of_load, natural_split
 from brushloop.drivers.sim.brush.paper import Paper
 from brushloop.drivers.sim.config import SimConfig
 

@@ -1,6 +1,6 @@
 """A driver: a syringe pump that takes `DOSE 0.500` as a line of text over TCP and answers `OK`.
 
-A driver is a class that has the methods of its protocol in `drivers/protocols.py` (here `Ink`). It goes into
+A driver is a class that has the methods of its protocol in `drivers/devices.py` (here `Ink`). It goes into
 `drivers/ink/`, its options into the union of ink devices in `collect/rig/config_devices.py`, and its construction into
 `make_ink` in `collect/rig/devices.py`. Write its simulator into `drivers/sim/instruments/` in the same go: real wire
 bytes from both sides are what the tests of the driver, of the faults and of the whole rig run on.
@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import asyncio
 
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import DoseBudget
-from brushloop.drivers.samples import Identity
 
 
 class SyringePump:

@@ -1,6 +1,6 @@
 """A fault of the loopback rig: the camera's pictures are upside down, as after somebody has turned its mount.
 
-The kind goes into `KINDS` in `drivers/sim/faults/kinds.py`, what it does into the simulator of its device; for a fault
+The kind goes into `KINDS` in `drivers/sim/faults.py`, what it does into the simulator of its device; for a fault
 of single pictures that is `SPOILED` in `drivers/sim/camera/mjpeg_server.py`. `brushloop fault` knows it at once.
 `docs/faults.md` says what a run makes of it; `tests/collect/faults/test_matrix.py` holds that.
 """
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from brushloop.drivers.sim.camera.mjpeg_server import SPOILED
-from brushloop.drivers.sim.faults.kinds import KINDS, Device
+from brushloop.drivers.sim.faults import KINDS, Device
 
 
 def upside_down(jpeg: bytes) -> bytes:

@@ -16,10 +16,10 @@ import pytest
 
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
-from brushloop.drivers.arcs.rpc import RpcConnection
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.force import stream
-from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.force import sri_m8123 as stream
+from brushloop.drivers.host import HostClock
+from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.rig import LoopbackRig
 from tests.collect.until import wait_for_end

@@ -13,8 +13,8 @@ from brushloop.collect.motion.moves import Move, Room, Way, over_sheet_move, pho
 from brushloop.collect.planning.walk import StepMoves
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import to_paper
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.motion import MotionQueue
 
 SAME_MM, SAME_DEG = 1e-6, 1e-4

@@ -11,7 +11,7 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.headless import eta_text
-from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
 from tests.command import brushloop

@@ -10,8 +10,8 @@ import pytest
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import make_robot, sole_driver
 from brushloop.drivers.arcs.robot import Condition
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.samples import Identity, Pose
+from brushloop.drivers.devices import Identity, Pose
+from brushloop.drivers.host import HostClock
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SPEED_MM_S
 
 QUESTION = "Keep a hand at the emergency stop. May the arm move? [y/N] "

@@ -15,15 +15,13 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import limits_of, make_robot, sole_driver
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceError, LimitExceeded
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.samples import Pose
-from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.host import HostClock
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig import HOST
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import HOST, Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 from tests.contract.asking import permission_refused
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SAME_PLACE_MM, SPEED_MM_S, Enabled, raised

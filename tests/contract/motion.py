@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 
 LIFT_MM = 5.0
 """No test sends the tip higher than this above where it stood, lower than that, or sideways."""

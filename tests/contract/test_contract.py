@@ -17,11 +17,11 @@ import pytest
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of, make_robot
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.rpc import RpcConnection
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.devices import Pose, PoseSample, QueuedLine
 from brushloop.drivers.errors import LimitExceeded, MotionError, NotConnected
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.samples import Pose, PoseSample, QueuedLine
+from brushloop.drivers.host import HostClock
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SLOW_MM_S, SPEED_MM_S, Enabled, raised
 
 GENTLY = {"speed_mm_s": SPEED_MM_S, "acc_mm_s2": ACC_MM_S2}

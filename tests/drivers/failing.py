@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from brushloop.drivers.sim.faults.kinds import ForceFault, InkFault
 from brushloop.drivers.sim.instruments.force_board import ForceBoard
-from brushloop.drivers.sim.instruments.ink_station import PtyLine
+from brushloop.drivers.sim.instruments.ink import PtyLine
 
 
-def fail_rounds(board: ForceBoard, *faults: ForceFault) -> None:
+def fail_rounds(board: ForceBoard, *faults: str) -> None:
     """Apply these faults to the board's next rounds, one each."""
     coming = iter(faults)
     board.next_fault = lambda: next(coming, None)
 
 
-def fail_requests(line: PtyLine, *faults: InkFault) -> None:
+def fail_requests(line: PtyLine, *faults: str) -> None:
     """Apply these faults to the next requests on the line, one each."""
     coming = iter(faults)
     line.next_fault = lambda: next(coming, None)

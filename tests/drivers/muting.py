@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
-from brushloop.drivers.sim.arcs.server import ArcsServer
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 
 
 def mute(server: ArcsServer | RtdeServer) -> None:

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.world import SimClock
 
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance, from_wire, interpolate, lean, to_wire
-from brushloop.drivers.samples import Pose
 
 lengths = st.floats(-900.0, 900.0)
 headings = st.floats(-180.0, 180.0)

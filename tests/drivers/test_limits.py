@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceError, LimitExceeded
 from brushloop.drivers.geometry import brush_pose, from_wire, interpolate, lean, steepest_deg, to_wire
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import Pose
 
 LIMITS = Limits((200.0, 640.0), (-260.0, 260.0), (95.0, 400.0), tilt_deg=15.0, speed_mm_s=250.0, acc_mm_s2=1000.0)
 INSIDE: dict[str, float] = {"x": 400.0, "y": 0.0, "z": 200.0, "tilt": 5.0, "speed": 100.0, "acceleration": 500.0}

@@ -10,8 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from brushloop.drivers import rotation
-from brushloop.drivers.rotation import Quaternion
+from brushloop.drivers import geometry as rotation
+from brushloop.drivers.geometry import Quaternion
 
 parts = st.floats(-1.0, 1.0)
 quaternions = st.tuples(parts, parts, parts, parts).filter(lambda q: math.hypot(*q) > 0.1).map(rotation.unit)

@@ -14,9 +14,9 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_protobuf.decoder import DecoderFactory
 
 from brushloop.collect.engine.recorder import Recorder
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import PoseSample, Stamp
 from brushloop.drivers.geometry import Pose
-from brushloop.drivers.samples import PoseSample, Stamp
+from brushloop.drivers.host import HostClock
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import image_message

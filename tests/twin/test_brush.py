@@ -14,8 +14,7 @@ from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import Grid, grid_of
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.drivers.sim.brush.spec import ALLOWED
-from brushloop.drivers.sim.brush_file import PAPER, load_brush
+from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
 from brushloop.twin.brush import (
     SHAPE,
     SPREAD,

@@ -19,9 +19,7 @@ from typer.testing import CliRunner
 import brushloop.__main__
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.heldout import HeldOut
-from brushloop.drivers.sim.brush.spec import BrushSpec
-from brushloop.drivers.sim.brush_file import load_brush
-from brushloop.drivers.sim.config import SoundHead
+from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead, load_brush
 from brushloop.twin.brush import SHAPE
 from brushloop.twin.file import Notes, noise_of, twin_toml
 from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, workers

@@ -22,7 +22,7 @@ from brushloop.collect.quality.checks import check_capture, check_drawing, check
 from brushloop.collect.quality.verdict import Check, Family, Verdict
 from brushloop.collect.rig.optics import undistorted
 from brushloop.collect.rig.paper import Patch
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Frame
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions import records
 from brushloop.sessions.events import BoardResult, CaptureResult, Press

@@ -20,7 +20,7 @@ from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.places import used_patches as touched_patches
-from brushloop.drivers.cancellation import finished
+from brushloop.drivers.host import finished
 from brushloop.sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:

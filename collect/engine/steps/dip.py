@@ -15,7 +15,7 @@ from brushloop.collect.errors import NeedsOperator
 from brushloop.collect.motion.moves import Move
 from brushloop.collect.motion.procedures import TOUCH_TOLERANCE_MM
 from brushloop.collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
-from brushloop.drivers.samples import PoseSample
+from brushloop.drivers.devices import PoseSample
 from brushloop.sessions.events import DipResult
 
 LEVEL_RISES = 0.005

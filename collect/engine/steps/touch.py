@@ -20,7 +20,7 @@ from brushloop.collect.touch.arm import ForceTap
 from brushloop.collect.touch.heights import PlaneResult, kept
 from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import SelfCheckResult, TouchResult, ZeroTouchResult
 
 

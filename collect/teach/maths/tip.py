@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import CannotTeach
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 
 Floats = NDArray[np.float64]
 LEAST_TOUCHES = 4

@@ -8,7 +8,7 @@ from brushloop.collect.errors import CannotTeach
 from brushloop.collect.teach.arm_reader import Address, Cabinet, answers, find_framing, reading
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.store import Notebook, StepName
-from brushloop.drivers.arcs.codes import MOVING_ALLOWED
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 
 RTDE_PORT = 30010

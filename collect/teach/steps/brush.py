@@ -9,7 +9,7 @@ from brushloop.collect.rig.devices import make_ink
 from brushloop.collect.rig.plausible import brush_shorter_than_tool, deepest_press
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.store import Notebook, StepName
-from brushloop.drivers.clock import Clock
+from brushloop.drivers.host import Clock
 
 DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""

@@ -16,8 +16,8 @@ from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.guide import Target
 from brushloop.collect.teach.maths.sheet import corners_of
 from brushloop.collect.teach.store import Notebook, StepName, Taught, now_utc
+from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
-from brushloop.drivers.samples import ForceSample
 
 CHANNEL = "can0"
 """Channel of a gateway, unless one was typed."""

@@ -14,8 +14,8 @@ from brushloop.collect.teach.jog import Point, hull
 from brushloop.collect.teach.rig_text import rig_of
 from brushloop.collect.teach.steps.places import sheet_corners, sheet_heights, tips
 from brushloop.collect.teach.store import Notebook, StepName, Taught, Value, now_utc
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Pose
 
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""

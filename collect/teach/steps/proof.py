@@ -20,7 +20,7 @@ from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.rig_text import rig_of, rig_text
 from brushloop.collect.teach.store import Notebook, StepName
-from brushloop.drivers.cancellation import finished
+from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.drivers import rotation
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import columns, of_matrix, unit, vector
 
 Matrix = NDArray[np.float64]
 Joints = tuple[float, float, float, float, float, float]
@@ -81,7 +81,7 @@ def _descend(target: Matrix, q: Matrix) -> Matrix | None:
         frames = _frames(q.tolist())
         flange = frames[-1]
         shift = target[:3, 3] - flange[:3, 3]
-        turn = rotation.vector(rotation.of_matrix((target[:3, :3] @ flange[:3, :3].T).tolist()))
+        turn = vector(of_matrix((target[:3, :3] @ flange[:3, :3].T).tolist()))
         if np.linalg.norm(shift) < CLOSE_M and math.hypot(*turn) < CLOSE_RAD:
             return q
         x, y, z = axes = frames[:, :3, 2].T
@@ -110,7 +110,7 @@ def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
 def matrix_of(pose: Pose) -> Matrix:
     """A pose (mm) as a 4x4 matrix (m)."""
     matrix: Matrix = np.eye(4)
-    matrix[:3, :3] = np.transpose(rotation.columns(rotation.unit(pose.quaternion)))
+    matrix[:3, :3] = np.transpose(columns(unit(pose.quaternion)))
     matrix[:3, 3] = np.array(pose.position_mm) / 1e3
     return matrix
 
@@ -118,7 +118,7 @@ def matrix_of(pose: Pose) -> Matrix:
 def pose_of(matrix: Matrix) -> Pose:
     """A 4x4 matrix (m) as a pose (mm)."""
     x, y, z = (float(v) * 1e3 for v in matrix[:3, 3])
-    return Pose(x, y, z, *rotation.of_matrix(matrix[:3, :3].tolist()))
+    return Pose(x, y, z, *of_matrix(matrix[:3, :3].tolist()))
 
 
 def inverted(matrix: Matrix) -> Matrix:

@@ -1,9 +1,8 @@
-"""The loopback arm's motion: a queue of moves with trapezoidal timing and rounded corners, evaluated on demand.
+"""The loopback arm's motion: one path of lines and rounded corners, travelled with trapezoidal speed.
 
-Moves are lines in space or in joints, and the path can be held and resumed, as a controller does.
-
-The result does not depend on when it is evaluated. A later move may change how an earlier one ends, but only if that
-agrees with the motion so far; otherwise the arm comes to rest between the two.
+The path is a list of pieces. The speed at each junction is as high as the pieces' limits allow: a backward pass makes
+sure that the arm can still slow down, a forward pass that it can be that fast. The path can be held and resumed, as a
+controller does. Lengths are in mm, speeds in mm/s; in rad and rad/s where a path is angular.
 """
 
 from __future__ import annotations
@@ -11,16 +10,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
-from brushloop.drivers.sim.arm.paths import JointLine, Line, Part, Path, fixed
-from brushloop.drivers.sim.arm.plan import Corners, Move, Ramp, pieces_of, ramps_of
+from brushloop.drivers.sim.arm.paths import Corner, JointLine, Line, Ramp, fixed
 
 STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""
@@ -28,55 +26,93 @@ SAME_POSE_MM = 1e-4
 SAME_POSE_DEG = 1e-4
 SAME_JOINT_RAD = 1e-6
 RESTS_KEPT = 64
-AGREES = 1e-6
-"""Two timings that differ by less count as equal; in mm, rad, mm/s or rad/s."""
+SHORTEST_CUT = 1e-6
+SLACK = 1e-9
+"""Tolerance for rounding of speeds."""
+REST = 1e-6
+"""A speed, in mm/s or rad/s, below which the arm rests."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One accepted move. It ends at rest unless `blend_mm` is the distance from its end at which it may be left."""
+
+    ident: int
+    path: Line | JointLine
+    speed: float
+    acc: float
+    duration_s: float = 0.0
+    blend_mm: float = 0.0
+
+    def paced(self, fraction: float, rests: int) -> float:
+        """The speed at which it takes `duration_s`, but at most that share of its speed.
+
+        `rests` is the number of its ends at rest. T(v) = length / v + rests v / (2 acc), solved for v.
+        """
+        length, speed = self.path.length, self.speed * fraction
+        fastest = min(speed, math.sqrt(2.0 * self.acc * length / rests)) if rests else speed
+        if not length or self.duration_s <= length / fastest + 0.5 * rests * fastest / self.acc:
+            return speed
+        if not rests:
+            return length / self.duration_s
+        lead = self.acc * self.duration_s
+        return (lead - math.sqrt(max(lead * lead - 2.0 * rests * self.acc * length, 0.0))) / rests
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A stretch of the path between two junctions at which speeds are matched.
+
+    A corner belongs to the move that it leads into, and is taken at constant speed, as the bend needs all of the
+    acceleration; after a hold the arm speeds up within it.
+    """
+
+    move: Move
+    path: Line | JointLine | Corner
+    enter: float
+    """Distance along the path at which it was begun."""
+    begin: float
+    """Distance along the path at which its timing begins."""
+    end: float
+    cap: float
+    acc: float
+    rests: int = 2
+    even: bool = False
+
+    @property
+    def corner(self) -> bool:
+        """Whether it joins two lines."""
+        return isinstance(self.path, Corner)
+
+    @property
+    def length(self) -> float:
+        """What is left of it."""
+        return max(self.end - self.begin, 0.0)
+
+    def joints(self, done: float) -> Joints | None:
+        """The joints at a distance along its path; None where the path is not given in joints."""
+        return self.path.joints(done) if isinstance(self.path, JointLine) else None
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A timed piece of a move, which begins at distance `enter` of `path`. From `stop_s`, if set, it decelerates."""
+    """A piece and its timing."""
 
-    ident: int
-    path: Path
-    enter: float
+    piece: Piece
     ramp: Ramp
     begin_s: float
-    corner: bool = False
-    stop_s: float | None = None
-    stop_acc: float = 0.0
-    stops: bool = False
+    brakes: bool = False
     """True for a piece that brakes for a stop or hold."""
 
     @property
     def end_s(self) -> float:
         """Time at which the piece ends."""
-        if self.stop_s is None:
-            return self.begin_s + self.ramp.duration_s
-        done, speed = self.ramp.at(self.stop_s - self.begin_s)
-        left = speed * speed - 2.0 * self.stop_acc * max(self.ramp.length - done, 0.0)
-        return self.stop_s + (speed - math.sqrt(max(left, 0.0))) / self.stop_acc
+        return self.begin_s + self.ramp.duration_s
 
     def at(self, now_s: float) -> tuple[float, float]:
-        """(distance, speed) within the piece at `now_s`."""
-        if self.stop_s is None or now_s <= self.stop_s:
-            return self.ramp.at(now_s - self.begin_s)
-        done, speed = self.ramp.at(self.stop_s - self.begin_s)
-        dt = min(now_s, self.end_s) - self.stop_s
-        return min(done + speed * dt - 0.5 * self.stop_acc * dt * dt, self.ramp.length), speed - self.stop_acc * dt
-
-    def pose(self, now_s: float) -> Pose:
-        """Where the tip is at `now_s`."""
-        return self.path.pose(self.enter + self.at(now_s)[0])
-
-    def joints(self, now_s: float) -> Joints | None:
-        """The joints at `now_s`; None if the path is not given in joints."""
-        return self.path.joints(self.enter + self.at(now_s)[0])
-
-    def way(self) -> list[Pose]:
-        """The travelled path, as the vertices of a polyline."""
-        total = self.at(self.end_s)[0]
-        pieces = self.path.stretches
-        return [self.path.pose(self.enter + total * k / pieces) for k in range(pieces + 1)]
+        """(distance along the path, speed) at `now_s`."""
+        done, speed = self.ramp.at(now_s - self.begin_s)
+        return (self.piece.end if done >= self.ramp.length else self.piece.begin + done), speed
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,34 +123,85 @@ class Rest:
     pose: Pose
 
 
+def timed(pieces: Sequence[Piece], v_in: float, begin_s: float) -> list[Segment] | None:
+    """The timing of pieces that are begun with `v_in` and end at rest; None if the arm could not slow down in time."""
+    if not pieces:
+        return []
+    caps = [p.cap for p in pieces]
+    for i in (i for i, p in enumerate(pieces) if p.corner):
+        caps[i] = min(caps[max(i - 1, 0) : i + 2])
+    speeds = [0.0] * (len(pieces) + 1)
+
+    def reach(i: int, speed: float) -> float:
+        return speed if pieces[i].even else math.sqrt(speed * speed + 2.0 * pieces[i].acc * pieces[i].length)
+
+    for i in range(len(pieces) - 1, 0, -1):
+        joined = pieces[i - 1].corner or pieces[i].corner
+        speeds[i] = min(caps[i - 1], caps[i], reach(i, speeds[i + 1])) if joined else 0.0
+    if v_in > reach(0, speeds[1]) * (1.0 + SLACK) + SLACK:
+        return None
+    speeds[0] = v_in
+    segments: list[Segment] = []
+    for i, piece in enumerate(pieces):
+        speeds[i + 1] = min(speeds[i + 1], reach(i, speeds[i]))
+        cap = min(caps[i], speeds[i]) if piece.even else caps[i]
+        segments.append(Segment(piece, Ramp(piece.length, cap, piece.acc, speeds[i], speeds[i + 1]), begin_s))
+        begin_s = segments[-1].end_s
+    return segments
+
+
+def joined(before: Sequence[Piece], move: Move, fraction: float) -> list[Piece]:
+    """The pieces with a move appended, and with a corner into it where the last one may be left before its end."""
+    last = before[-1] if before else None
+    cut = 0.0
+    match last.path if last else None, move.path:
+        case Line() as a, Line() as b if last and not a.angular and not b.angular and a.fix is b.fix:
+            cut = min(last.move.blend_mm, 0.5 * a.length, 0.5 * b.length, a.length - last.enter)
+            if cut > SHORTEST_CUT:
+                corner = Corner(a, b, cut)
+                acc = min(last.acc, move.acc)
+                # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
+                limit = math.sqrt(2.0 * cut * acc / max(corner.bend, 1e-12))
+                rests = 1 - (move.blend_mm > 0.0)
+                return [
+                    *before[:-1],
+                    replace(last, end=a.length - cut),
+                    Piece(move, corner, 0.0, 0.0, corner.length, limit, acc, even=True),
+                    Piece(move, b, cut, cut, b.length, move.paced(fraction, rests), move.acc, rests),
+                ]
+        case _:
+            pass
+    rests = 2 - (move.blend_mm > 0.0)
+    path = move.path
+    return [*before, Piece(move, path, 0.0, 0.0, path.length, move.paced(fraction, rests), move.acc, rests)]
+
+
 class MotionQueue:
     """A queue of moves. `on_path(start, end)` is called for every stretch once it has been travelled.
 
-    `tool` is the true flange to tip.
+    `tool` is the true flange to tip. The path does not depend on when it is looked at.
     """
 
     def __init__(
         self, home: Pose, on_path: Callable[[Pose, Pose], None], tool: Matrix | None = None, capacity: int = 64
     ) -> None:
         self.tool: Matrix = np.eye(4) if tool is None else tool
-        self._held: list[Move] | None = None
-        self._solved: tuple[Pose, Joints] | None = None
-        """The last pose whose joints were found, and the joints."""
         self.fraction = 1.0
         """Speed factor for every move that has not begun."""
         self.near: Joints = HOME
         """The last known joints, from which inverse kinematics starts."""
+        self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
+        """The newest places and times at which the arm came to rest."""
+        self._segments: list[Segment] = []
+        self._held: list[Piece] | None = None
+        """What is left of the path between `hold` and `resume`."""
+        self._solved: tuple[Pose, Joints] | None = None
+        """The last pose whose joints were found, and the joints."""
         self._rest = home
         self._rest_since_s = -1.0
         self._on_path = on_path
         self._capacity = capacity
-        self._queue: deque[Segment] = deque()
-        self._moves: list[Move] = []
-        """Every unfinished move, in order."""
-        self._corners: Corners = {}
-        self._next_id: int = 0
-        self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
-        """The newest places and times at which the arm came to rest."""
+        self._next_id = 0
 
     @property
     def full(self) -> bool:
@@ -124,17 +211,13 @@ class MotionQueue:
     @property
     def size(self) -> int:
         """Number of moves queued, running or held; one that decelerates into a stop or a hold counts once."""
-        return len({segment.ident for segment in self._queue} if self._held is None else self._held)
+        pieces = [s.piece for s in self._segments] if self._held is None else self._held
+        return len({piece.move.ident for piece in pieces})
 
     @property
     def held(self) -> bool:
         """True between `hold` and `resume`, even if nothing was moving."""
         return self._held is not None
-
-    @property
-    def running(self) -> Segment | None:
-        """The piece of the path that is being travelled; None at rest."""
-        return self._queue[0] if self._queue else None
 
     def add(
         self,
@@ -157,13 +240,8 @@ class MotionQueue:
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG:
             return False
         line = Line(start, target, fix)
-        unit = 1e-3 if line.angular else 1.0
-        self._append(
-            Move(
-                self._next_id, line, speed_mm_s * unit, acc_mm_s2 * unit, duration_s, 0.0 if line.angular else blend_mm
-            ),
-            now_s,
-        )
+        unit, blend = (1e-3, 0.0) if line.angular else (1.0, blend_mm)
+        self._append(Move(self._next_id, line, speed_mm_s * unit, acc_mm_s2 * unit, duration_s, blend), now_s)
         return True
 
     def add_joints(self, joints: Joints, speed_rad_s: float, acc_rad_s2: float, now_s: float, least_s: float) -> bool:
@@ -171,85 +249,75 @@ class MotionQueue:
         self.advance(now_s)
         target = pose_of(forward(joints) @ self.tool)
         travel_mm, turn_deg = distance(self._last(), target)
-        idle = not self._queue and not self._held
+        idle = not self._segments and not self._held
         turned = max(abs(a - b) for a, b in zip(joints, self.near, strict=True))
         if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and (not idle or turned <= SAME_JOINT_RAD):
             return False
-        path = JointLine(self._last_joints(), joints, self.tool)
-        self._append(Move(self._next_id, path, speed_rad_s, acc_rad_s2, least_s), now_s)
+        last = self._last_piece()
+        start = (last.joints(last.end) if last else None) or self.near_joints(self._last())
+        self._append(Move(self._next_id, JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, least_s), now_s)
         return True
 
     def advance(self, now_s: float) -> None:
         """Retire every piece that is over by `now_s`."""
-        while self._queue and self._queue[0].end_s <= now_s:
-            segment = self._queue.popleft()
-            if segment.corner:
-                self._moves = [replace(m, lead=None) if m.ident == segment.ident else m for m in self._moves]
-            elif not segment.stops:
-                self._moves = [m for m in self._moves if m.ident != segment.ident]
-            self._finish(segment)
+        while self._segments and self._segments[0].end_s <= now_s:
+            self._finish(self._segments.pop(0))
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Decelerate along the path and forget the rest, held or not; a second stop changes nothing."""
-        self.advance(now_s)
         self._brake(acc_mm_s2, acc_rad_s2, now_s)
         self._held = None
 
     def hold(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Decelerate on the path and keep it; `exec_id` stays that of the move in which the arm comes to rest."""
-        self.advance(now_s)
-        if self._held is not None:
-            return
-        moves, planned = self._moves, list(self._queue)
-        resting = self._brake(acc_mm_s2, acc_rad_s2, now_s)
-        # a move that was already braking has lost its target; moves queued behind it have not begun
-        self._held = moves if resting is None else []
-        if resting is None:
-            return
-        segment, done = resting
-        rest = next(i for i, m in enumerate(moves) if m.ident == segment.ident)
-        move = moves[rest]
-        if segment.corner:
-            after = next(s.enter for s in planned if s.ident == segment.ident and not s.corner)
-            rest_of_it = Part(segment.path, segment.enter + done)
-            first = replace(move, lead=(rest_of_it, segment.ramp.speed), enter=after)
-        else:
-            first = replace(move, enter=segment.enter + done, lead=None, held=True)
-        self._held = [first, *moves[rest + 1 :]]
+        if self._held is None:
+            self._held = self._brake(acc_mm_s2, acc_rad_s2, now_s)
 
     def resume(self, now_s: float) -> None:
         """Resume the path that was held, from where the arm came to rest."""
         self.advance(now_s)
         held, self._held = self._held, None
-        if held:
-            self._moves = [*self._moves, *held]
-            self._replan(0, now_s)
+        self._segments += timed(held or [], 0.0, self._end_s(now_s)) or []
 
     def set_fraction(self, fraction: float, now_s: float) -> None:
-        """Run every move that has not begun at this share of its speed, 0 to 1."""
-        self.advance(now_s)
+        """Run every move that has not begun at this share of its speed, 0 to 1.
+
+        A change that the arm could not follow in time takes effect with the next move.
+        """
         self.fraction = fraction
-        begun = {s.ident for s in self._queue if s.begin_s <= now_s}
-        first = next((i for i, m in enumerate(self._moves) if m.ident not in begun), len(self._moves))
-        self._replan(first, now_s)
+        begun = self.exec_id(now_s)
+
+        def slowed(piece: Piece) -> Piece:
+            if piece.corner or piece.move.ident == begun:
+                return piece
+            return replace(piece, cap=piece.move.paced(fraction, piece.rests))
+
+        self._held = None if self._held is None else [slowed(piece) for piece in self._held]
+        self._retime([slowed(s.piece) for s in self._segments if not s.brakes], now_s)
 
     def pose(self, now_s: float) -> Pose:
         """Where the tip is."""
         self.advance(now_s)
-        return self._queue[0].pose(now_s) if self._queue else self._rest
+        return self._segments[0].piece.path.pose(self._segments[0].at(now_s)[0]) if self._segments else self._rest
+
+    def target(self, now_s: float) -> Pose | None:
+        """End of the piece of the path that is being travelled; None at rest."""
+        self.advance(now_s)
+        return self._segments[0].piece.path.pose(self._segments[0].piece.end) if self._segments else None
 
     def exec_id(self, now_s: float) -> int:
         """Id of the running move, or of the one that is held; -1 when there is none. A corner belongs to the move that
         it leads into."""
         self.advance(now_s)
-        if self._queue:
-            return self._queue[0].ident
-        return self._held[0].ident if self._held else -1
+        if self._segments:
+            return self._segments[0].piece.move.ident
+        return self._held[0].move.ident if self._held else -1
 
     def joints(self, now_s: float) -> Joints:
         """Joint positions for the present pose of the tip."""
         self.advance(now_s)
-        exact = self._queue[0].joints(now_s) if self._queue else None
+        segment = self._segments[0] if self._segments else None
+        exact = segment.piece.joints(segment.at(now_s)[0]) if segment else None
         return exact or self.near_joints(self.pose(now_s))
 
     def near_joints(self, tip: Pose) -> Joints:
@@ -262,101 +330,87 @@ class MotionQueue:
     def steady(self, now_s: float) -> bool:
         """True once the queue has been empty for `STEADY_LAG_S`."""
         self.advance(now_s)
-        return not self._queue and now_s - self._rest_since_s >= STEADY_LAG_S
+        return not self._segments and now_s - self._rest_since_s >= STEADY_LAG_S
 
     def _finish(self, segment: Segment) -> None:
-        way = segment.way()
-        self._rest, self._rest_since_s = way[-1], segment.end_s
-        self.near = segment.joints(segment.end_s) or self.near
+        piece = segment.piece
+        way = piece.end - piece.enter
+        places = [piece.path.pose(piece.enter + way * k / piece.path.stretches) for k in range(piece.path.stretches)]
+        places.append(piece.path.pose(piece.end))
+        self._rest, self._rest_since_s = places[-1], segment.end_s
+        self.near = piece.joints(piece.end) or self.near
         if segment.ramp.v_out == 0.0:
-            self.rests.append(Rest(segment.end_s, way[-1]))
-        if segment.ramp.length:
-            for start, end in itertools.pairwise(way):
+            self.rests.append(Rest(segment.end_s, places[-1]))
+        if way > 0.0:
+            for start, end in itertools.pairwise(places):
                 self._on_path(start, end)
+
+    def _last_piece(self) -> Piece | None:
+        return (self._held or [s.piece for s in self._segments] or [None])[-1]
 
     def _last(self) -> Pose:
         """Where the last accepted move ends."""
-        if moves := self._held or self._moves:
-            path = moves[-1].path
-            return path.pose(path.length)
-        return self._queue[-1].pose(self._queue[-1].end_s) if self._queue else self._rest
+        last = self._last_piece()
+        return self._rest if last is None else last.path.pose(last.end)
 
-    def _last_joints(self) -> Joints:
-        path = (self._held or self._moves)[-1].path if self._held or self._moves else None
-        if path is not None:
-            exact = path.joints(path.length)
-        else:
-            exact = self._queue[-1].joints(self._queue[-1].end_s) if self._queue else None
-        return exact or self.near_joints(self._last())
+    def _end_s(self, now_s: float) -> float:
+        return self._segments[-1].end_s if self._segments else now_s
 
     def _append(self, move: Move, now_s: float) -> None:
         self._next_id += 1
         if self._held is not None:
-            self._held.append(move)
+            self._held = joined(self._held, move, self.fraction)
             return
-        self._moves.append(move)
-        first = self._moves[0].ident
-        self._corners = {key: corner for key, corner in self._corners.items() if key[0] >= first}
-        self._replan(0, now_s)
+        free = [s.piece for s in self._segments if not s.brakes]
+        pieces = joined(free, move, self.fraction)
+        if len(pieces) == len(free) + 1 or not self._retime(pieces, now_s):
+            # it begins at rest: the moves before it stay as they are
+            alone = joined([], move, self.fraction)
+            self._segments += timed(alone, 0.0, self._end_s(now_s)) or []
 
-    def _replan(self, first: int, now_s: float) -> None:
-        """Replan the timing that can still change, from the move at index `first` or a later one."""
-        queue = list(self._queue)
-        for k in range(first, len(self._moves)):
-            chain = self._moves[k:]
-            mine = [i for i, s in enumerate(queue) if s.ident == chain[0].ident and not s.stops]
-            # a corner that was planned stays with the move before it; one that was held begins the chain
-            at = next((i for i in mine if chain[0].lead or not queue[i].corner), len(queue))
-            planned = queue[at] if at < len(queue) else None
-            if planned is not None:
-                begin_s, v_in = planned.begin_s, planned.ramp.v_in
-            else:
-                begin_s, v_in = (queue[-1].end_s if queue else now_s), 0.0
-            if planned is not None and not chain[0].lead:
-                chain = [replace(chain[0], enter=planned.enter), *chain[1:]]
-            begun = planned if planned is not None and planned.begin_s < now_s else None
-            pieces = pieces_of(
-                chain, self.fraction, self._corners, None if begun is None or begun.corner else begun.ramp.speed
-            )
-            ramps = ramps_of(pieces, v_in)
-            if ramps is None or (begun is not None and not _agree(begun.ramp, ramps[0], now_s - begun.begin_s)):
-                continue
-            del queue[at:]
-            for piece, ramp in zip(pieces, ramps, strict=True):
-                queue.append(Segment(piece.ident, piece.path, piece.begin, ramp, begin_s, piece.corner))
-                begin_s += ramp.duration_s
-            break
-        self._queue = deque(queue)
+    def _retime(self, pieces: list[Piece], now_s: float) -> bool:
+        """Time the pieces anew from where the arm is; False, and no change, if it could not follow."""
+        braking = [s for s in self._segments if s.brakes]
+        begin_s, speed = (braking[-1].end_s if braking else now_s), 0.0
+        if self._segments and not braking:
+            done, speed = self._segments[0].at(now_s)
+            if done > pieces[0].end:
+                return False
+            pieces = [replace(pieces[0], begin=done), *pieces[1:]]
+        segments = timed(pieces, speed, begin_s)
+        if segments is None:
+            return False
+        self._segments = [*braking, *segments]
+        return True
 
-    def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> tuple[Segment, float] | None:
-        """Come to rest on the path; return (piece, distance within it) of that place, or None if nothing was moving."""
-        queue, self._moves = list(self._queue), []
-        if not queue or queue[0].stops:
-            self._queue = deque(s for s in queue if s.stops)
-            return None
-        front, now_done = queue[0], queue[0].at(now_s)
-        done, speed = now_done
-        left, last = front.ramp.length - done, 0
-        while queue[last].ramp.v_out > 0.0 and last + 1 < len(queue):
-            last += 1
-            left += queue[last].ramp.length
-        # never farther than the path would have gone
-        acc = max(acc_rad_s2 if front.ramp.angular else acc_mm_s2, speed * speed / (2.0 * left) if left > 0.0 else 0.0)
-        braking = [replace(front, stop_s=now_s, stop_acc=acc, stops=True)]
-        speed = math.sqrt(max(speed * speed - 2.0 * acc * (front.ramp.length - done), 0.0))
-        at, rest = front, braking[0].at(braking[0].end_s)[0]
-        for segment in queue[1 : last + 1]:
-            if speed <= AGREES:
-                break
-            way = min(speed * speed / (2.0 * acc), segment.ramp.length)
+    def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> list[Piece]:
+        """Come to rest on the path; return what is left of it, from there on."""
+        self.advance(now_s)
+        free = [s for s in self._segments if not s.brakes]
+        left_over = [s.piece for s in free]
+        self._segments = [s for s in self._segments if s.brakes]
+        if self._segments or not free:
+            return left_over
+        done, speed = free[0].at(now_s)
+        left_over[0] = replace(left_over[0], begin=done)
+        running = next(i for i, s in enumerate(free) if s.ramp.v_out == 0.0) + 1
+        left = sum(piece.length for piece in left_over[:running])
+        acc = acc_rad_s2 if left_over[0].path.angular else acc_mm_s2
+        acc = max(acc, speed * speed / (2.0 * left) if left > 0.0 else 0.0)  # never farther than it would have gone
+        while speed > REST and running:
+            piece = left_over.pop(0)
+            running -= 1
+            way = min(speed * speed / (2.0 * acc), piece.length)
             after = math.sqrt(max(speed * speed - 2.0 * acc * way, 0.0))
-            ramp = Ramp(way, speed, acc, segment.ramp.angular, speed, after if after > AGREES else 0.0)
-            braking.append(replace(segment, ramp=ramp, begin_s=braking[-1].end_s, stops=True))
-            at, rest, speed = segment, way, after
-        self._queue = deque(braking)
-        return at, rest
-
-
-def _agree(old: Ramp, new: Ramp, t: float) -> bool:
-    """Whether the two timings have the same distance and speed at `t`."""
-    return all(abs(a - b) <= AGREES for a, b in zip(old.at(t), new.at(t), strict=True))
+            after = after if after > REST else 0.0
+            rest = piece.begin + way
+            ramp = Ramp(way, speed, acc, speed, after)
+            self._segments.append(Segment(replace(piece, end=rest), ramp, self._end_s(now_s), brakes=True))
+            speed = after
+            if not after:
+                left_over.insert(0, replace(piece, enter=rest, begin=rest))
+        # from a rest in a corner, or just before one, the arm speeds up within it
+        first = next((i for i, p in enumerate(left_over[:2]) if p.corner), None)
+        if first is not None:
+            left_over[first] = replace(left_over[first], even=False)
+        return left_over

@@ -1,16 +1,18 @@
-"""Paths of the loopback arm's tip: lines in space and in joints, and the corners that join two lines in space."""
+"""Paths of the loopback arm's tip: lines in space and in joints, corners between lines, and speed along them.
+
+Lengths are in mm, or in rad where a path is angular.
+"""
 
 from __future__ import annotations
 
-import abc
 import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance, interpolate
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.kinematics import Joints, Matrix, forward, matrix_of, pose_of
 
 ROTATION_AS_LINEAR_MM = 1.0
@@ -20,35 +22,13 @@ STRETCHES = 16
 """Number of straight pieces in which a curved path is reported to the world."""
 
 
-class Path(abc.ABC):
-    """A path of `length` mm, or rad where `angular`."""
-
-    @property
-    @abc.abstractmethod
-    def length(self) -> float:
-        """Length from end to end."""
-
-    @property
-    def angular(self) -> bool:
-        """True where lengths are in rad."""
-        return False
-
-    @property
-    def stretches(self) -> int:
-        """Number of straight pieces that approximate it; 1 for a straight line."""
-        return STRETCHES
-
-    @abc.abstractmethod
-    def pose(self, done: float) -> Pose:
-        """Where the true tip is after `done`."""
-
-    def joints(self, done: float) -> Joints | None:
-        """The joints there; None where the path is not given in joints."""
-        return None
+def fixed(pose: Pose, fix: Matrix | None) -> Pose:
+    """The true tip, from the tool centre point that was configured."""
+    return pose if fix is None else pose_of(matrix_of(pose) @ fix)
 
 
 @dataclass(frozen=True)
-class Line(Path):
+class Line:
     """Straight for the tool centre point that was configured; `fix` leads from there to the true tip (None: same)."""
 
     start: Pose
@@ -88,12 +68,14 @@ class Line(Path):
 
 
 @dataclass(frozen=True)
-class Corner(Path):
+class Corner:
     """The parabola that leaves `a` at `cut` before its end and meets `b` at `cut` after its start, turns included."""
 
     a: Line
     b: Line
     cut: float
+    angular = False
+    stretches = STRETCHES
 
     @property
     def length(self) -> float:
@@ -115,17 +97,14 @@ class Corner(Path):
 
 
 @dataclass(frozen=True)
-class JointLine(Path):
+class JointLine:
     """Straight in joints; its length is the angle of the joint that turns farthest."""
 
     start: Joints
     end: Joints
     tool: Matrix
-
-    @property
-    def angular(self) -> bool:
-        """Lengths are in rad."""
-        return True
+    angular = True
+    stretches = STRETCHES
 
     @property
     def length(self) -> float:
@@ -145,37 +124,54 @@ class JointLine(Path):
         return pose_of(forward(self.joints(done)) @ self.tool)
 
 
-@dataclass(frozen=True)
-class Part(Path):
-    """What is left of a path after `begin`."""
+@dataclass(frozen=True, slots=True)
+class Ramp:
+    """A speed profile: from `v_in` at `acc` to `speed`, then at `acc` to `v_out`; a short path does not reach `speed`.
 
-    whole: Path
-    begin: float
+    Time is in s. `v_in` and `v_out` must be within reach of each other.
+    """
 
-    @property
-    def length(self) -> float:
-        """Length of the rest."""
-        return max(self.whole.length - self.begin, 0.0)
-
-    @property
-    def angular(self) -> bool:
-        """The same as for the whole path."""
-        return self.whole.angular
+    length: float
+    speed: float
+    acc: float
+    v_in: float = 0.0
+    v_out: float = 0.0
 
     @property
-    def stretches(self) -> int:
-        """The same as for the whole path."""
-        return self.whole.stretches
+    def peak(self) -> float:
+        """The speed between the two slopes."""
+        if self.v_in >= self.speed:
+            return max(self.speed, self.v_out)
+        if not self.length:
+            return self.v_in
+        highest = math.sqrt(self.acc * self.length + 0.5 * (self.v_in * self.v_in + self.v_out * self.v_out))
+        return max(min(self.speed, highest), self.v_in, self.v_out)
 
-    def pose(self, done: float) -> Pose:
-        """Where the tip is."""
-        return self.whole.pose(self.begin + done)
+    @property
+    def duration_s(self) -> float:
+        """Time for the whole length."""
+        return sum(self._times())
 
-    def joints(self, done: float) -> Joints | None:
-        """The same as for the whole path."""
-        return self.whole.joints(self.begin + done)
+    def at(self, t: float) -> tuple[float, float]:
+        """(distance, speed) at time `t`, clamped to the ends."""
+        if t <= 0.0:
+            return 0.0, self.v_in
+        up_s, along_s, down_s = self._times()
+        if t >= up_s + along_s + down_s:
+            return self.length, self.v_out
+        peak = self.peak
+        if t < up_s:
+            slope = math.copysign(self.acc, peak - self.v_in)
+            return self.v_in * t + 0.5 * slope * t * t, self.v_in + slope * t
+        if t >= up_s + along_s:
+            left = up_s + along_s + down_s - t
+            return self.length - self.v_out * left - 0.5 * self.acc * left * left, self.v_out + self.acc * left
+        return 0.5 * (self.v_in + peak) * up_s + peak * (t - up_s), peak
 
-
-def fixed(pose: Pose, fix: Matrix | None) -> Pose:
-    """The true tip, from the tool centre point that was configured."""
-    return pose if fix is None else pose_of(matrix_of(pose) @ fix)
+    def _times(self) -> tuple[float, float, float]:
+        if not self.length:
+            return 0.0, 0.0, 0.0
+        peak = self.peak
+        up_s, down_s = abs(peak - self.v_in) / self.acc, (peak - self.v_out) / self.acc
+        along = self.length - 0.5 * (self.v_in + peak) * up_s - 0.5 * (self.v_out + peak) * down_s
+        return up_s, max(along, 0.0) / peak, down_s

@@ -12,8 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.sim.brush.drag import Stances, Waypoint, draw_drag
-from brushloop.drivers.sim.brush.flaws import Flaw, Trouble, draw_trouble
-from brushloop.drivers.sim.brush.footprint import Tuft, blank_footprint, draw_wander, grow_bristles, print_footprint
+from brushloop.drivers.sim.brush.footprint import (
+    Flaw,
+    Trouble,
+    Tuft,
+    blank_footprint,
+    draw_trouble,
+    draw_wander,
+    grow_bristles,
+    print_footprint,
+)
 from brushloop.drivers.sim.brush.mechanics import (
     LOAD_STEP_MM,
     Bundle,

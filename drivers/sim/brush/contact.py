@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.drivers import rotation
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.rounds import Wrench
-from brushloop.drivers.geometry import interpolate, lean
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.geometry import columns, interpolate, lean, of_vector, product, unit
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 
 SIDEWAYS_MM = 0.5
@@ -62,7 +61,7 @@ class ContactWatch:
 def _sideways_mm(a: Pose, b: Pose) -> float:
     """Travel along the paper or across the brush's axis, whichever is shorter."""
     way = np.subtract(b.position_mm, a.position_mm)
-    axis = np.array(rotation.columns(rotation.unit(b.quaternion))[2])
+    axis = np.array(columns(unit(b.quaternion))[2])
     return min(math.hypot(way[0], way[1]), float(np.linalg.norm(way - (way @ axis) * axis)))
 
 
@@ -116,7 +115,7 @@ class Reaction:
         push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
         push, weight_n = (push_n * part for part in normal), (0.0, 0.0, self._weight_n)
         force_n = [a - b + c for a, b, c in zip(push, weight_n, finger_n, strict=True)]
-        axes = rotation.columns(rotation.unit(tip.quaternion))
+        axes = columns(unit(tip.quaternion))
         fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in axes)
         return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0
 
@@ -127,8 +126,8 @@ def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
         return pose
     nx, ny, nz = normal
     share = math.acos(nz) / math.hypot(nx, ny)  # of (ny, -nx, 0), the cross product of the normal and the level one
-    level = rotation.of_vector((share * ny, share * -nx, 0.0))
-    return Pose(*pose.position_mm, *rotation.product(level, rotation.unit(pose.quaternion)))
+    level = of_vector((share * ny, share * -nx, 0.0))
+    return Pose(*pose.position_mm, *product(level, unit(pose.quaternion)))
 
 
 def bent_toward(pose: Pose, tilt_deg: float, heading_deg: float, set_lean_deg: float) -> float:
@@ -139,7 +138,7 @@ def bent_toward(pose: Pose, tilt_deg: float, heading_deg: float, set_lean_deg: f
     lean of `set_lean_deg` would. Without the set, a brush that leans by a tenth of a degree would bend into any
     direction.
     """
-    along, _, _ = rotation.columns(rotation.unit(pose.quaternion))
+    along, _, _ = columns(unit(pose.quaternion))
     wrist_deg = math.degrees(math.atan2(along[1], along[0]))
     off = math.radians(math.remainder(heading_deg - wrist_deg, 360.0))
     if abs(off) < ALONG_RAD:

@@ -1,10 +1,27 @@
-"""The constants of one individual simulated brush, with their allowed ranges."""
+"""The constants of one individual simulated brush, with their allowed ranges, and the TOML file that describes it.
+
+```toml
+name = "our goat-hair brush no. 3, simulated"   # in every recording and report made with it
+[brush]
+stiffness_n_mm2 = 150.0                         # the fields of `BrushSpec`; a field that is left out has its default
+[camera]
+noise = 1.4                                     # gray levels; may be left out
+[quality]                                       # for the `[quality]` of the rig.toml; may be left out
+head_mm = 2.2
+misplaced_mm = 4.0
+```
+"""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
+from typing import Annotated, ClassVar
+
+from pydantic import BaseModel, Field, ValidationError
 
 ALLOWED: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
@@ -103,3 +120,104 @@ def within(name: str, value: float, low: float, high: float) -> None:
     """Raise ValueError, naming value and range, unless `low` <= `value` <= `high`."""
     if not low <= value <= high:
         raise ValueError(f"{name} = {value:g} is outside {low:g} .. {high:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class SoundHead:
+    """The `[quality]` settings of a rig.toml that depend on the brush; raises ValueError out of range."""
+
+    head_mm: float
+    """How far a sound mark begins behind the zero-touch point, on the side away from its tip."""
+    misplaced_mm: float
+    """Distance from there at which a mark counts as misplaced."""
+
+    def __post_init__(self) -> None:
+        within("head_mm", self.head_mm, -20.0, 20.0)
+        within("misplaced_mm", self.misplaced_mm, 0.1, 20.0)
+
+
+class SimFileError(Exception):
+    """A file or socket cannot be used, read or written: path, field, what is allowed."""
+
+    exit_code: ClassVar[int] = 2
+
+    def __init__(self, path: Path, field: str, what: str) -> None:
+        self.path = path
+        self.field = field
+        self.what = what
+        super().__init__(f"{path}: {field}: {what}" if field else f"{path}: {what}")
+
+
+def complaint(error: ValidationError) -> tuple[str, str]:
+    """(field, what is wrong with it), one line; an unknown key first, as it is often a misspelt one."""
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    field = ".".join(str(part) for part in first["loc"])
+    given = "" if first["type"] in ("missing", "value_error") else f" (given: {str(first['input'])[:60]!r})"
+    more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""
+    return _plain(field), _plain(f"{first['msg'].removeprefix('Value error, ')}{given}{more}")
+
+
+def _plain(text: str) -> str:
+    """One printable line, whatever the file holds."""
+    return "".join(char if char.isprintable() else "?" for char in text)[:300]
+
+
+MAX_BYTES = 256 * 1024
+MAX_NOISE_GRAY = 30.0
+LOOPBACK = "loopback"
+"""Name of the brush whose constants are the defaults of `BrushSpec`."""
+PAPER = "paper"
+"""Name under which the brush of `PAPER_FILE` is chosen."""
+PAPER_FILE = Path(__file__).with_name("paper_brush.toml")
+"""The brush made to agree with the paper's Table 2 (`python -m bench paper-brush`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedBrush:
+    """A brush, and the name under which it is recorded."""
+
+    spec: BrushSpec
+    name: str
+    noise_gray: float | None = None
+    """Standard deviation of the camera's noise that was measured with it; None for the rig's default."""
+    head: SoundHead | None = None
+    """Where its sound marks begin; None for the default of `rig.toml`."""
+
+
+class _Camera(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    noise: Annotated[float, Field(ge=0.0, le=MAX_NOISE_GRAY)]
+
+
+class _File(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    name: Annotated[str, Field(min_length=1, max_length=120, pattern=r'^[^\x00-\x1f\x7f"\\]+$')]
+    brush: BrushSpec
+    camera: _Camera | None = None
+    quality: SoundHead | None = None
+
+
+def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
+    """Read the file, or take one of the shipped brushes if `path` is just `paper` or `loopback`.
+
+    `seed` is that of the individual for `loopback`; any other brush has its own. Raises `SimFileError`.
+    """
+    if str(path) == LOOPBACK:
+        return NamedBrush(BrushSpec(seed=seed), "")
+    found = _read(PAPER_FILE if str(path) == PAPER else path)
+    return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise, found.quality)
+
+
+def _read(path: Path) -> _File:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise SimFileError(path, "", f"is larger than {MAX_BYTES} bytes")
+        return _File.model_validate(tomllib.loads(data.decode("utf-8")))
+    except FileNotFoundError:
+        raise SimFileError(path, "", "no such file") from None
+    except OSError as error:
+        raise SimFileError(path, "", error.strerror or str(error)) from None
+    except ValidationError as error:
+        raise SimFileError(path, *complaint(error)) from None
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
+        raise SimFileError(path, "", f"is not TOML: {error}") from None

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.camera.source import LOOPBACK_SERVER
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.sim.camera.scene import NOISE_FIELDS
 from brushloop.drivers.sim.config import View
-from brushloop.drivers.sim.faults.board import FaultBoard
-from brushloop.drivers.sim.faults.kinds import KINDS, Device
+from brushloop.drivers.sim.faults import KINDS, Device, FaultBoard
 from brushloop.drivers.sim.server import LoopbackServer
 
 NOISE_LEVELS = 6

@@ -1,19 +1,164 @@
-"""What the camera sees: sheet, board, ink and tool in perspective, under uneven light with glare, shadow and noise."""
+"""What the loopback cameras see: sheet, board, ink and tool in perspective, under uneven light with glare and noise."""
 
 from __future__ import annotations
 
 import functools
+import itertools
+import math
+from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import columns as axes
+from brushloop.drivers.geometry import of_vector
+from brushloop.drivers.sim.arm.kinematics import Matrix, skeleton
 from brushloop.drivers.sim.brush.paper import PX_PER_MM
-from brushloop.drivers.sim.camera.held import Held, held_picture
-from brushloop.drivers.sim.camera.optics import Optics
-from brushloop.drivers.sim.config import Table
+from brushloop.drivers.sim.config import Table, View
 from brushloop.drivers.sim.world import World
+
+Floats = NDArray[np.float64]
+SHADOW_SOFTNESS = 0.02
+"""Width of the shadow's edge, as a share of the image."""
+
+
+class Optics:
+    """Projection of the paper plane to pixels, and the uneven light on the sheet."""
+
+    def __init__(self, view: View, seed: int) -> None:
+        self.homography = homography(view)
+        self.light = _light(view, np.random.default_rng([seed, 11]))
+        self.glare = _glare(view, self.homography) if view.glare else None
+        self.camera_matrix = camera_matrix(view)
+        self.distortion: Floats = np.array([view.k1, 0.0, 0.0, 0.0])
+        self._map = self._undistorted_places(view) if view.k1 else None
+
+    def image_of(self, paper_mm: Floats) -> Floats:
+        """(n, 2) pixels (centres on integers) of (n, 2) points of the paper plane, distortion included."""
+        undistorted = self.undistorted_image_of(paper_mm)
+        rays = np.column_stack([undistorted, np.ones(len(undistorted))]) @ np.linalg.inv(self.camera_matrix).T
+        none = np.zeros(3)
+        distorted, _ = cv2.projectPoints(rays[:, None], none, none, self.camera_matrix, self.distortion)
+        return np.asarray(distorted, np.float64).reshape(-1, 2)
+
+    def undistorted_image_of(self, paper_mm: Floats) -> Floats:
+        """The same as `image_of`, for a lens without distortion."""
+        mapped = np.column_stack([paper_mm, np.ones(len(paper_mm))]) @ self.homography.T
+        return np.asarray(mapped[:, :2] / mapped[:, 2:], np.float64)
+
+    def distort(self, undistorted: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """An image as this lens would have taken it; the same if the lens is perfect."""
+        if self._map is None:
+            return undistorted
+        distorted = cv2.remap(undistorted, self._map, np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return cast("NDArray[np.uint8]", distorted)
+
+    def _undistorted_places(self, view: View) -> NDArray[np.float32]:
+        """(h, w, 2): for every pixel of the distorted image, its place in the undistorted one."""
+        columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+        places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
+        return places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
+
+
+def camera_matrix(view: View) -> Floats:
+    """(3, 3) of the pinhole, in pixels; its principal point is the middle of the image."""
+    f, cx, cy = view.focal * view.width_px, (view.width_px - 1) / 2, (view.height_px - 1) / 2
+    return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+
+
+def stance(view: View, lens_mm: tuple[float, float, float]) -> tuple[Floats, Floats]:
+    """(rotation (3, 3), translation (3,) in mm) from the paper frame to that of a camera at `lens_mm`.
+
+    The camera looks at the middle of the view; without a turn its x axis lies over the paper's.
+    """
+    aim = np.array([*view.centre_mm, 0.0]) - lens_mm
+    ahead = aim / np.linalg.norm(aim)
+    across = np.array([1.0, 0.0, 0.0]) - ahead[0] * ahead
+    across = across / np.linalg.norm(across)
+    turn = math.radians(view.turn_deg)
+    right = math.cos(turn) * across - math.sin(turn) * np.cross(ahead, across)
+    rotation = np.asarray(np.stack([right, np.cross(ahead, right), ahead]), np.float64)
+    return rotation, np.asarray(-rotation @ np.array(lens_mm), np.float64)
+
+
+def homography(view: View) -> NDArray[np.float64]:
+    """(3, 3) from the paper plane in mm to image pixels, pixel centres on integers; rows run against y."""
+    if view.lens_mm is not None:
+        rotation, shift = stance(view, view.lens_mm)
+        return camera_matrix(view) @ np.column_stack([rotation[:, 0], rotation[:, 1], shift])
+    turn = math.radians(view.turn_deg)
+    cos, sin, s = math.cos(turn), math.sin(turn), view.px_per_mm
+    x, y = view.centre_mm
+    to_centre = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
+    flat = np.array([[s * cos, -s * sin, 0.0], [-s * sin, -s * cos, 0.0], [0.0, 0.0, 1.0]])
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, view.keystone / view.height_px, 1.0]])
+    to_image = np.array([[1.0, 0.0, view.width_px / 2], [0.0, 1.0, view.height_px / 2], [0.0, 0.0, 1.0]])
+    return to_image @ tilt @ flat @ to_centre
+
+
+def _light(view: View, rng: np.random.Generator) -> NDArray[np.float32]:
+    x = np.linspace(0.0, 1.0, view.width_px, dtype=np.float32)
+    y = np.linspace(0.0, 1.0, view.height_px, dtype=np.float32)[:, None]
+    slope = 1.0 - view.shade * (0.6 * x + 0.4 * y) ** 2
+    across = math.cos(angle := rng.uniform(0.0, 2.0 * math.pi)) * (x - 0.5) + math.sin(angle) * (y - 0.5)
+    edge = rng.uniform(-0.1, 0.1)
+    in_shadow = 1.0 / (1.0 + np.exp(-(across - edge) / SHADOW_SOFTNESS))
+    return (slope * (1.0 - view.shadow * in_shadow)).astype(np.float32)
+
+
+def _glare(view: View, paper_to_image: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Gray levels (h, w) that a lamp's reflection adds; the lens's distortion of it is left out."""
+    u, v, scale = paper_to_image @ np.array([*view.glare_mm, 1.0])
+    x, y = np.arange(view.width_px) - u / scale, np.arange(view.height_px)[:, None] - v / scale
+    sigma_px = view.glare_sigma_mm * view.px_per_mm
+    return (view.glare * np.exp(-0.5 * (x**2 + y**2) / sigma_px**2)).astype(np.float32)
+
+
+PRINT_PX_PER_MM = 6.0
+EDGE_MM = 5.0
+"""White edge of the print around the board."""
+WHITE, BLACK, BEHIND = 245, 20, 110
+FINGER_MM = 9.0
+"""Radius of the thumb that covers a little of the print at either side."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """How a board is held, in the camera's frame: x right, y down, z ahead."""
+
+    turn_deg: tuple[float, float, float]
+    """Rotation vector from the camera's axes to the board's; zero is face on and upright."""
+    centre_mm: tuple[float, float, float]
+
+
+def held_picture(
+    board: cv2.aruco.CharucoBoard, table: Table, view: View, optics: Optics, held: Held
+) -> NDArray[np.float32]:
+    """(h, w) float32 gray levels of the board in hand, under the light of the table."""
+    size_x_mm, size_y_mm = (n * table.board_square_mm for n in table.board_squares)
+    inner = board.generateImage((round(size_x_mm * PRINT_PX_PER_MM), round(size_y_mm * PRINT_PX_PER_MM)))
+    edge = round(EDGE_MM * PRINT_PX_PER_MM)
+    columns, rows = inner.shape[1] + 2 * edge, inner.shape[0] + 2 * edge
+    paper = np.full((rows, columns), WHITE, np.uint8)
+    paper[edge:-edge, edge:-edge] = np.where(np.asarray(inner) > 127, WHITE, BLACK)
+    for column in (0, columns):
+        cv2.circle(paper, (column, rows // 2), round(FINGER_MM * PRINT_PX_PER_MM), (150,), -1)
+    # raster pixel centres -> mm from the middle of the board -> image
+    s = 1.0 / PRINT_PX_PER_MM
+    to_mm = np.array([[s, 0.0, -0.5 * s * (columns - 1)], [0.0, s, -0.5 * s * (rows - 1)], [0.0, 0.0, 1.0]])
+    rx, ry, rz = (math.radians(turn_deg) for turn_deg in held.turn_deg)
+    right, down, _ = axes(of_vector((rx, ry, rz)))
+    plane = np.column_stack([right, down, held.centre_mm])
+    flat = cv2.warpPerspective(
+        paper, optics.camera_matrix @ plane @ to_mm, (view.width_px, view.height_px), borderValue=BEHIND
+    )
+    blurred = cv2.GaussianBlur(optics.distort(np.asarray(flat, np.uint8)), (0, 0), view.blur_px)
+    return blurred.astype(np.float32) * optics.light
+
 
 TABLE_GRAY = 120
 PAPER_GRAY = 228
@@ -206,3 +351,43 @@ def read_strip(frame: NDArray[np.uint8]) -> int:
     row = frame[STRIP_PX // 2 : STRIP_PX * 3 // 2, : STRIP_BITS * STRIP_PX].mean(axis=0)
     blocks = row.reshape(STRIP_BITS, STRIP_PX)[:, 2:-2].mean(axis=1) > 127
     return sum(1 << i for i, bit in enumerate(blocks) if bit)
+
+
+WIDTH_PX, HEIGHT_PX = 640, 480
+PX_PER_M = 260.0
+FOOT_PX = (320, 400)
+"""The foot of the arm in the picture."""
+WALL, TABLE, STEEL, BRUSH = 185, 95, 40, 15
+NOISE = 2.0
+
+
+class RoomScene:
+    """The arm, seen along a level direction at `azimuth_rad` from the base's y axis."""
+
+    def __init__(self, world: World, azimuth_rad: float) -> None:
+        self._world = world
+        self._across = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0])
+        self._noise = np.random.default_rng([world.config.seed, 17])
+        self._bones: Matrix = np.zeros((0, 3))
+
+    def tool(self) -> Pose:
+        """Pose of the tool now. Advances the world, so only the thread that owns the world may call it."""
+        tip = self._world.tool()
+        joints = self._world.motion.joints(self._world.clock.now_s())
+        self._bones = np.vstack([skeleton(joints), np.array(tip.position_mm) / 1e3])
+        return tip
+
+    def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
+        """A (480, 640) gray image of the arm at the last `tool()`."""
+        image = np.full((HEIGHT_PX, WIDTH_PX), WALL, np.float32)
+        image[FOOT_PX[1] :] = TABLE
+        points = [self._place(bone) for bone in self._bones]
+        for start, end in itertools.pairwise(points[:-1]):
+            cv2.line(image, start, end, (STEEL,), 12)
+        if points:
+            cv2.line(image, points[-2], points[-1], (BRUSH,), 5)
+        noisy = image + self._noise.normal(0.0, NOISE, image.shape)
+        return np.clip(noisy, 0.0, 255.0).astype(np.uint8)
+
+    def _place(self, at_m: Matrix) -> tuple[int, int]:
+        return round(FOOT_PX[0] + PX_PER_M * float(at_m @ self._across)), round(FOOT_PX[1] - PX_PER_M * float(at_m[2]))

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
-from brushloop.drivers.sim.faults.kinds import ForceFault
 from brushloop.drivers.sim.server import LoopbackServer
 
 BUS_ERROR = 0x04
@@ -48,7 +47,7 @@ class ForceBoard:
         self._force = force
         self._noise = (noise_n,) * 3 + (noise_nm,) * 3
         self._random = random.Random(seed)
-        self.next_fault: Callable[[], ForceFault | None] = lambda: None
+        self.next_fault: Callable[[], str | None] = lambda: None
         """Asked for the fault of each round."""
         self._before: Wrench | None = None
 
@@ -64,29 +63,29 @@ class ForceBoard:
         if not self.streaming:
             return
         fault = self.next_fault()
-        if fault is ForceFault.SILENCE:
+        if fault == "silence":
             return
-        if fault in (ForceFault.BUS_OFF, ForceFault.BUS_ERROR):
-            self.streaming = fault is not ForceFault.BUS_OFF
-            yield CanFrame(BUS_OFF if fault is ForceFault.BUS_OFF else BUS_ERROR, bytes(8), error=True)
+        if fault in ("bus-off", "bus-error"):
+            self.streaming = fault != "bus-off"
+            yield CanFrame(BUS_OFF if fault == "bus-off" else BUS_ERROR, bytes(8), error=True)
             return
         values = self._force(t_s)
         fx, fy, fz, mx, my, mz = (v + self._random.gauss(0.0, s) for v, s in zip(values, self._noise, strict=True))
-        if fault is ForceFault.STUCK and self._before is not None:
+        if fault == "stuck" and self._before is not None:
             fx, fy, fz, mx, my, mz = self._before
         self._before = (fx, fy, fz, mx, my, mz)
         wrench = (
             fx,
             fy,
-            math.nan if fault is ForceFault.NAN else fz,
-            math.inf if fault is ForceFault.INF else mx,
+            math.nan if fault == "nan" else fz,
+            math.inf if fault == "inf" else mx,
             my,
             mz,
         )
-        left_out = {ForceFault.NO_FIRST: 0, ForceFault.NO_SECOND: 1, ForceFault.NO_THIRD: 2}
+        left_out = {"no-first": 0, "no-second": 1, "no-third": 2}
         for place, (can_id, data) in enumerate(encode_round(wrench)):
             if fault is None or left_out.get(fault) != place:
-                yield CanFrame(can_id, data[:4] if fault is ForceFault.SHORT and place == 1 else data)
+                yield CanFrame(can_id, data[:4] if fault == "short" and place == 1 else data)
 
 
 FRAME_S = 0.0002

@@ -27,14 +27,12 @@ from typing import Any
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
-from brushloop.drivers.sim.camera.held import Held
 from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
-from brushloop.drivers.sim.camera.room import RoomScene
+from brushloop.drivers.sim.camera.scene import Held, RoomScene
 from brushloop.drivers.sim.config import View
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
-from brushloop.drivers.sim.lab.aims import TOUCHED, Aims
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.lab.facts import LIFT_MM, PICTURE_PX, draw
-from brushloop.drivers.sim.lab.hand import Hand
+from brushloop.drivers.sim.lab.hand import TOUCHED, Aims, Hand
 from brushloop.drivers.sim.lab.seen import PRESS_SHARE, Seen
 from brushloop.drivers.sim.lab.traps import Trap, mended, spring
 from brushloop.drivers.sim.rig import LoopbackRig

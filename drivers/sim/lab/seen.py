@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.drivers.sim.camera.optics import camera_matrix
-from brushloop.drivers.sim.lab.facts import Facts
-from brushloop.drivers.sim.lab.places import CORNERS, corner, in_base
+from brushloop.drivers.sim.camera.scene import camera_matrix
+from brushloop.drivers.sim.lab.facts import CORNERS, Facts, corner, in_base
 from brushloop.drivers.sim.lab.traps import Trap
 from brushloop.drivers.sim.world import tool_of
 

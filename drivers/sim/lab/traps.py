@@ -11,8 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from brushloop.drivers.sim.lab.facts import Facts
-from brushloop.drivers.sim.lab.places import CORNERS, over_sheet
+from brushloop.drivers.sim.lab.facts import CORNERS, Facts, over_sheet
 
 
 class Trap(StrEnum):

@@ -20,7 +20,7 @@ from brushloop.collect.rig.paper import to_base
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 
 VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)

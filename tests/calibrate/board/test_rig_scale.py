@@ -9,7 +9,7 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.view import see_board_and_lens
-from brushloop.drivers.sim.camera.optics import Optics
+from brushloop.drivers.sim.camera.scene import Optics
 from brushloop.drivers.sim.config import Table
 from tests.calibrate.simulated_rigs import CAMERAS, board_of, boards, lens_views, true_scale
 

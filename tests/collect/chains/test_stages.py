@@ -13,7 +13,7 @@ from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from tests.sessions.conftest import Make
 
 SETTINGS = Settings(

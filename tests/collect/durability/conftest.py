@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.journal import JOURNAL_NAME
 
 if TYPE_CHECKING:

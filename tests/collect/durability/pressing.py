@@ -13,7 +13,7 @@ from brushloop.collect.motion.procedures import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, make_robot
 from brushloop.collect.rig.paper import Sheet
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.sessions.records import Condition
 
 

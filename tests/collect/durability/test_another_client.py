@@ -19,10 +19,10 @@ from brushloop.collect.motion.procedures import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import connected
 from brushloop.collect.rig.paper import Patch, Sheet, to_base
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ArmMoved, PathDisturbed
 from brushloop.drivers.geometry import brush_pose, to_wire
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.host import HostClock
 from brushloop.sessions.records import Condition
 from tests.waiting import PATIENCE_S
 

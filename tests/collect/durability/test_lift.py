@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.drivers.loopback import ask
 from brushloop.drivers.sim.config import Table
-from brushloop.drivers.sim.fault_client import ask
-from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults import Phase
 from tests.waiting import wait_until
 
 PAPER_MM = Table().paper_z_mm

@@ -15,7 +15,7 @@ from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.tui.captures import Review
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic

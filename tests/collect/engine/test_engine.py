@@ -12,9 +12,9 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import UNCHECKED, Engine
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import CollectAborted, ConfigError
-from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.errors import RobotNotSafe
-from brushloop.drivers.samples import Identity
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import replay
 from brushloop.sessions.recording import Recording

@@ -11,8 +11,8 @@ import pytest
 
 from brushloop.collect.engine.force_guard import ForceGuard
 from brushloop.collect.errors import ForceTooHigh, arm_at_fault, describe, rest_is_unknown
+from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.drivers.errors import DeviceError, MotionFailed
-from brushloop.drivers.samples import ForceSample, Stamp
 
 
 class Cell:

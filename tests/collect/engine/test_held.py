@@ -9,7 +9,7 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.errors import ConfigError
-from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
 from tests.collect.until import until, wait_for_end
 from tests.command import brushloop

@@ -13,7 +13,7 @@ from brushloop.collect.errors import ForceTooHigh, NeedsOperator, PosesLate
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.errors import ConnectionLost, Stuck
 from brushloop.drivers.ink.port import InkRefused
-from brushloop.drivers.sim.faults.kinds import Device, Fault
+from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.journal import RunState, replay
 from brushloop.sessions.records import Topic

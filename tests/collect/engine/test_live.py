@@ -27,7 +27,7 @@ from brushloop.collect.engine.live import HOST, QUEUE_LIMIT, LiveView
 from brushloop.collect.engine.telemetry import FRAME_PERIOD_S
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import CollectRequest, collect
-from brushloop.drivers.samples import Frame, Stamp
+from brushloop.drivers.devices import Frame, Stamp
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.messages import encode_png, image_message, pose_message

@@ -16,10 +16,10 @@ from brushloop.collect.protocols.presses import GridConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, make_robot
 from brushloop.collect.tui.app import OperatorApp
+from brushloop.drivers.devices import Identity
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Identity
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from tests.collect.tui.fake import TOUCHED, FakeEngine, picture
 from tests.collect.tui.screen_text import look
 

@@ -24,9 +24,9 @@ from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.planning.limit_check import distinct_steps
 from brushloop.collect.protocols.steps import StepKind
 from brushloop.collect.tui.browser import Paths, SessionBrowser
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.sessions.errors import InputError
 from brushloop.sessions.events import CaptureResult, Condition, Done, Press, PressResult
 from brushloop.sessions.journal import RunState

@@ -10,8 +10,8 @@ import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.rpc import RpcConnection
-from brushloop.drivers.arcs.waiting import Tolerance, until_settled
+from brushloop.drivers.arcs.motion import Tolerance, until_settled
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
 from tests.collect.until import until, wait_for_end
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from conftest import Lab
 
     from brushloop.collect.engine.engine import Engine
-    from brushloop.drivers.samples import Pose
+    from brushloop.drivers.devices import Pose
 
 
 PAPER_Z_MM, SAFE_Z_MM = 120.0, 180.0

@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 from brushloop.collect.engine.recorder import Recorder
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.samples import ForceSample, Stamp
+from brushloop.drivers.devices import ForceSample, Stamp
+from brushloop.drivers.host import HostClock
 from brushloop.sessions.mcap_writer import Outgoing
 
 MS = 1_000_000

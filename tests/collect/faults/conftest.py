@@ -16,8 +16,8 @@ import pytest
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.drivers.arcs import stopping
-from brushloop.drivers.arcs.rpc import RpcConnection
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.world import SimClock

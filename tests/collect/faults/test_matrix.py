@@ -17,8 +17,9 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
 from brushloop.drivers.arcs import stopping
-from brushloop.drivers.arcs.codes import SafetyMode
-from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -28,9 +29,7 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.samples import Pose
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Fault
-from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults import ALWAYS, Fault, Phase
 from brushloop.sessions.journal import replay
 from brushloop.sessions.store import SessionStore
 from tests.collect.faults.conftest import CAMERA_TIMEOUT_S

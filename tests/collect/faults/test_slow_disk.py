@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from brushloop.collect.engine.control import State
-from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_writer import McapWriter

@@ -15,9 +15,9 @@ from brushloop.collect.motion.procedures import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import Sheet
-from brushloop.drivers.samples import Identity, Pose, QueuedLine
+from brushloop.drivers.devices import Identity, Pose, QueuedLine
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.sessions.records import Condition
 
 NOBODY = Identity("robot", "made up", "", True)

@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.errors import ArmInPicture, CameraLate
 from brushloop.collect.photograph.delay import CameraDelay, Look
-from brushloop.drivers.samples import Frame
+from brushloop.drivers.devices import Frame
 from tests.collect.photograph.theatre import OUT_MM, OVER_MM, PERIOD_S, Theatre
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from brushloop.collect.photograph.photographer import ArmTrips, Photographer
 from brushloop.collect.rig.config_devices import CameraConfig
-from brushloop.drivers.clock import Clock
-from brushloop.drivers.samples import Frame, Pose, PoseSample, Stamp
+from brushloop.drivers.devices import Frame, Pose, PoseSample, Stamp
+from brushloop.drivers.host import Clock
 from tests.simulated_time import LoopClock
 
 PERIOD_S, TRIP_S = 0.02, 0.06

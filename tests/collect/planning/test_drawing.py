@@ -17,11 +17,11 @@ from brushloop.collect.protocols.steps import Drawn, DrawStep
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import Rig, limits_of, make_robot
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import LimitExceeded
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 
 WRITE = Path(__file__).parents[3] / "examples" / "protocol-write.toml"

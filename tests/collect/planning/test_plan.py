@@ -21,7 +21,7 @@ from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.sessions.records import Condition
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

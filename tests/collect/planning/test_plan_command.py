@@ -19,13 +19,13 @@ from brushloop.collect.planning.summary import make_plan
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.drivers.arcs.codes import RobotMode
+from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.errors import ConnectionLost, ProtocolViolation
 from brushloop.drivers.geometry import brush_pose, from_wire
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.arm.kinematics import inverted, matrix_of
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 from tests.command import brushloop
 

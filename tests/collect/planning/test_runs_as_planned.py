@@ -15,7 +15,7 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.steps import MARKING, Step, StepKind
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import StepResult
 from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting

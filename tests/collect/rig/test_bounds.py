@@ -11,8 +11,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
-from brushloop.drivers.sim.brush_file import load_brush
-from brushloop.drivers.sim.described import SimFileError
+from brushloop.drivers.sim.brush.spec import SimFileError, load_brush
 from brushloop.model.generator import TrainError
 from brushloop.model.generator.config import load_config
 from tests.collect.rig.test_config import RIG

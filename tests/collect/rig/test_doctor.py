@@ -9,9 +9,9 @@ import pytest
 
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.doctor import examine
-from brushloop.drivers.arcs.codes import SafetyMode
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.sim.faults.kinds import Device, Fault
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.host import HostClock
+from brushloop.drivers.sim.faults import Device, Fault
 from tests.command import brushloop
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import PaperPlane, fit_plane, to_base, to_paper
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance, lean
-from brushloop.drivers.samples import Pose
 
 CORNERS = [(5.0, 5.0), (235.0, 5.0), (5.0, 165.0), (235.0, 165.0)]
 slopes = st.floats(-0.017, 0.017)  # 1 deg

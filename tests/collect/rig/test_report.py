@@ -16,7 +16,7 @@ from brushloop.collect.rig.scrub import numbers_only, scrubber_of
 from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 from tests.command import brushloop
 from tests.drivers.arcs.transcript import Archive

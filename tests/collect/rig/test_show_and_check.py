@@ -10,7 +10,7 @@ import pytest
 
 from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from tests.command import brushloop
 
 

@@ -14,9 +14,9 @@ import pytest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import sole_driver
-from brushloop.drivers import exclusive as sole
+from brushloop.drivers import host as sole
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 
 HOLD = """
 import encodings.idna, os, sys, time

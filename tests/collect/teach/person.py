@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.collect.operator import Choice
 from brushloop.collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.rounds import Wrench
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.rig import LoopbackRig
 
 CORNERS = ("lower left", "lower right", "upper right", "upper left")

@@ -12,8 +12,8 @@ from brushloop.collect.teach.guide import LeftOff, Shown, StepState
 from brushloop.collect.teach.steps.camera import CameraStep
 from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.collect.teach.wizard import Wizard
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import DeviceTimeout
+from brushloop.drivers.host import HostClock
 
 
 class Leaving:

@@ -10,8 +10,8 @@ import pytest
 from brushloop.collect.teach.arm_reader import Address, Cabinet, reading
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.steps.arm import ArmStep
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World

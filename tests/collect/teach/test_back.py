@@ -15,7 +15,7 @@ from brushloop.collect.teach.steps.brush import BrushStep
 from brushloop.collect.teach.steps.force import ForceStep
 from brushloop.collect.teach.store import Taught, now_utc
 from brushloop.collect.teach.wizard import Wizard
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 
 TAUGHT = {
     "robot.tcp_offset_mm": [0.0, 0.0, 180.0],

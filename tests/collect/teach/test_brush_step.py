@@ -9,7 +9,7 @@ import pytest
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.steps.brush import STATION, BrushStep
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 
 
 class Enter:

@@ -16,9 +16,9 @@ from brushloop.collect.teach.jog import BELOW_MM, ROOM_MM, SPEED_MM_S, touch
 from brushloop.collect.teach.store import touch_of
 from brushloop.collect.tui.teach_app import TeachApp
 from brushloop.collect.tui.teach_guide import ScreenGuide
-from brushloop.drivers.arcs.codes import RobotMode
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
@@ -133,14 +133,12 @@ async def test_a_stop_in_the_middle_of_a_step_stops_the_arm(tmp_path: Path) -> N
     motion = server.cabinet.world.motion
     task = asyncio.create_task(touched(day_of(server.port, Jogger([JogStep("x", 5.0)]), tmp_path, armed=True)))
     async with asyncio.timeout(20.0):
-        while motion.running is None:
+        while motion.target(server.cabinet.now_s()) is None:
             await asyncio.sleep(0.005)
-            server.cabinet.world.tool()
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task
-    server.cabinet.world.tool()
-    assert motion.running is None
+    assert motion.target(server.cabinet.now_s()) is None
     assert server.cabinet.world.tool().x_mm < HOME_MM[0] + 4.0
     await server.stop()
 

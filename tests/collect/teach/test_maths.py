@@ -18,7 +18,7 @@ from brushloop.collect.errors import CannotTeach
 from brushloop.collect.teach.jog import hull
 from brushloop.collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
 from brushloop.collect.teach.maths.tip import AxisFit, elsewhere, find_axis, find_tip, tip_of
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 
 BOARD = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
 PIN_MM = np.array([320.0, 150.0, 90.0])

@@ -15,8 +15,8 @@ from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Shown
 from brushloop.collect.teach.steps.places import VIEW, PlacesStep, text_of
 from brushloop.collect.teach.store import touch_of
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World

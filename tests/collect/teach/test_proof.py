@@ -15,9 +15,9 @@ from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Shown
 from brushloop.collect.teach.steps import proof
 from brushloop.collect.teach.steps.proof import ProofStep, folder_beside, slowly
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 
 
 def test_each_proof_is_recorded_in_a_new_folder_beside_the_rig(tmp_path: Path) -> None:

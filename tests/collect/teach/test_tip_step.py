@@ -15,8 +15,8 @@ from brushloop.collect.teach.guide import Brought, Target
 from brushloop.collect.teach.steps.arm import ArmStep
 from brushloop.collect.teach.steps.tip import TipStep
 from brushloop.collect.teach.store import Notebook, touch_of
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.lab.seen import truth
 from tests.collect.teach.person import leaning
 from tests.collect.teach.unknown import InLab, in_lab

@@ -10,7 +10,7 @@ import pytest
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.watch import watched
 from brushloop.collect.tui.teach_guide import ScreenGuide
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World

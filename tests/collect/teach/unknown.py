@@ -21,7 +21,7 @@ from brushloop.collect.rig.paper import to_base
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
 from brushloop.collect.teach.wizard import Wizard
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.lab.lab import UnknownLab
 from brushloop.drivers.sim.lab.seen import Seen, truth
 from brushloop.drivers.sim.lab.traps import Trap

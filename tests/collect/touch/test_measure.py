@@ -17,8 +17,8 @@ from brushloop.collect.operator import Asker
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.touch.heights import PlaneResult
 from brushloop.collect.touch.measure import Jogged, asked, measure_plane
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
-from brushloop.drivers.samples import Pose
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench

@@ -16,8 +16,8 @@ from brushloop.collect.rig.devices import connected
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.arm import ForceTap
 from brushloop.collect.touch.measure import measure_plane
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.rig import LoopbackRig
 from tests.collect.sent import not_checked, noting

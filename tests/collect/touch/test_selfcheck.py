@@ -27,7 +27,7 @@ from brushloop.collect.touch.selfcheck import (
     triangle_of,
     triangle_on,
 )
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import SelfCheckResult
 
 if TYPE_CHECKING:

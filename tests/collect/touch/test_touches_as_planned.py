@@ -17,7 +17,7 @@ from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet
 from brushloop.collect.touch.measure import Jogged, measure_plane
 from brushloop.collect.touch.selfcheck import partners, self_check, triangle_on
-from brushloop.drivers.samples import Pose
+from brushloop.drivers.devices import Pose
 from tests.collect.sent import lowest_mm, not_checked, not_sent
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 from bench.harness import lines_of_input, tell
-from brushloop.drivers.arcs.codes import SafetyMode
-from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import LoopbackRig
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brushloop.drivers.arcs.framing import MAX_DEPTH, BareDecoder
-from brushloop.drivers.arcs.rpc import encode_bare_request
+from brushloop.drivers.arcs.wire import MAX_DEPTH, BareDecoder, encode_bare_request
 from brushloop.drivers.errors import ProtocolViolation
 
 scalars = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(allow_nan=False), st.text())

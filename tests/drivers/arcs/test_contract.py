@@ -11,12 +11,12 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from brushloop.drivers.arcs.codes import RobotMode
+from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.rpc import Framing
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.errors import ConnectionLost, NotPowered, RobotNotSafe, RpcError
 from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 
 NEAR = brush_pose(260.0, -220.0, 250.0)

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs.controller import Controller
+from brushloop.drivers.arcs.motion import Tolerance, until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.rpc import RpcConnection
 from brushloop.drivers.arcs.settings import TOOL_OFFSET, require_same
-from brushloop.drivers.arcs.waiting import Tolerance, until_settled
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ArmMoved, LimitExceeded, NotPowered, RobotNotSafe, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.rig import HOST
 

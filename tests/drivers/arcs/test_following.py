@@ -9,10 +9,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from brushloop.drivers.arcs import queueing
-from brushloop.drivers.arcs.codes import QueueFull
-from brushloop.drivers.arcs.queueing import legs_of
+from brushloop.drivers.arcs import motion as queueing
+from brushloop.drivers.arcs.controller import QueueFull
+from brushloop.drivers.arcs.motion import legs_of
 from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ConnectionLost,
     LimitExceeded,
@@ -23,7 +24,6 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arcs.server import ArcsServer
 
 WAY = {"speed_mm_s": 40.0, "acc_mm_s2": 800.0, "blend_mm": 1.0}

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brushloop.drivers.arcs.framing import MAX_PAYLOAD_BYTES, FrameDecoder, encode
-from brushloop.drivers.arcs.rpc import FACTORY_LOGIN_TOKEN, encode_request
+from brushloop.drivers.arcs.wire import FACTORY_LOGIN_TOKEN, MAX_PAYLOAD_BYTES, FrameDecoder, encode, encode_request
 from brushloop.drivers.errors import ProtocolViolation
 
 payloads = st.lists(st.binary(max_size=300), max_size=8)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import pytest
 
 from brushloop.drivers.arcs.telemetry import LagMeter
+from brushloop.drivers.devices import Pose, PoseSample, Stamp
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Pose, PoseSample, Stamp
 
 Path = Callable[[float], Pose]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.framing import numbers
+from brushloop.drivers.arcs.wire import numbers
 
 
 def test_integers_and_floats_are_numbers() -> None:

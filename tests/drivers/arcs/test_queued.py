@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import ConnectionLost, LimitExceeded, MotionFailed, MotionRefused
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.samples import Pose, QueuedLine
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from tests.drivers.muting import mute
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.codes import OutOfReach, QueueFull, RobotMode, SafetyMode, WrongOperationalMode
+from brushloop.drivers.arcs.controller import OutOfReach, QueueFull, RobotMode, SafetyMode, WrongOperationalMode
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import MotionFailed, MotionRefused, RpcError
 from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.arm.kinematics import forward, pose_of

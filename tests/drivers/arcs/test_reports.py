@@ -11,7 +11,7 @@ import pytest
 
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
 from brushloop.drivers.arcs.survey import survey
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from tests.drivers.arcs.transcript import AnsweringByName, Archive, following, serving
 

@@ -9,9 +9,10 @@ from collections.abc import Callable
 import pytest
 
 from brushloop.drivers.arcs import robot as robot_module
-from brushloop.drivers.arcs.codes import RobotMode, SafetyMode
+from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
+from brushloop.drivers.arcs.motion import planned_s
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.waiting import planned_s
+from brushloop.drivers.devices import Pose, PoseSample, Robot
 from brushloop.drivers.errors import (
     ConnectionLost,
     LimitExceeded,
@@ -26,8 +27,6 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.protocols import Robot
-from brushloop.drivers.samples import Pose, PoseSample
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from tests.drivers.muting import mute
 

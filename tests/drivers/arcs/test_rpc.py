@@ -8,8 +8,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from brushloop.drivers.arcs.framing import encode
-from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.wire import RpcConnection, encode
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
 from tests.drivers.arcs.transcript import Answer, Controller, following, hang_up, nothing, reply, result, sends
 

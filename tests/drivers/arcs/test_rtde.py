@@ -15,18 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brushloop.drivers.arcs import telemetry
-from brushloop.drivers.arcs.framing import FrameDecoder, encode, encode_short
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.rtde import PING, RtdeStream, decode_message, encode_sample, encode_topic, outputs_of
 from brushloop.drivers.arcs.settings import ArcsOptions
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.arcs.telemetry import PING, RtdeStream, decode_message, encode_sample, encode_topic, outputs_of
+from brushloop.drivers.arcs.wire import FrameDecoder, encode, encode_short
+from brushloop.drivers.devices import PoseSample, QueuedLine
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import PoseSample, QueuedLine
-from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
-from brushloop.drivers.sim.arcs.server import ArcsServer
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from brushloop.drivers.sim.server import LoopbackServer
 from tests.drivers.muting import mute

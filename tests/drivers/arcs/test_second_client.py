@@ -11,10 +11,10 @@ import pytest
 
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import PathDisturbed
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Pose, QueuedLine
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.rig import HOST
 

@@ -8,12 +8,12 @@ import asyncio
 import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.devices import QueuedLine
 from brushloop.drivers.errors import DeviceTimeout, MotionFailed, RobotNotSafe
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import QueuedLine
 from brushloop.drivers.sim.arcs.server import ArcsServer
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from tests.waiting import PATIENCE_S
 
 TOP_Z_MM, DEEP_Z_MM = 300.0, 200.0

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode
-from brushloop.drivers.arcs.rpc import Framing, encode_bare_request, encode_request
+from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, Framing, encode, encode_bare_request, encode_request
 
 Answer = Callable[[str, asyncio.StreamWriter], Awaitable[None]]
 Line = tuple[str, dict[str, Any] | None, Answer]

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera, opencv
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Camera, Frame, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
-from brushloop.drivers.protocols import Camera
-from brushloop.drivers.samples import Frame, Stamp
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.camera.scene import Scene, read_strip
 from brushloop.drivers.sim.config import SimConfig, View

@@ -10,9 +10,9 @@ import pytest
 
 from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera
 from brushloop.drivers.camera.opencv import Fault, FrameHealth
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
-from brushloop.drivers.samples import Stamp
+from brushloop.drivers.host import HostClock
 
 CLOCK = HostClock()
 PERIOD = 100_000_000

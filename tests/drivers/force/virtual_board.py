@@ -15,7 +15,6 @@ from typing import Self
 import can
 
 from brushloop.drivers.force.rounds import Wrench
-from brushloop.drivers.sim.faults.kinds import ForceFault
 from brushloop.drivers.sim.instruments.force_board import CanFrame, ForceBoard
 from tests.drivers.failing import fail_rounds
 
@@ -63,7 +62,7 @@ class SimForceSensor:
         if self._thread is not None:
             self._thread.join()
 
-    def fail(self, *faults: ForceFault) -> None:
+    def fail(self, *faults: str) -> None:
         """Let the next rounds meet these, one each."""
         fail_rounds(self.board, *faults)
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.rpc import RpcConnection
-from brushloop.drivers.arcs.waiting import Messages
+from brushloop.drivers.arcs.motion import Messages
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import DeviceError, MotionFailed, RpcError
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, mutated, noise, truncated
 

@@ -13,8 +13,8 @@ import cbor2
 import pytest
 from hypothesis import given
 
-from brushloop.drivers.arcs.framing import encode_short
-from brushloop.drivers.arcs.rtde import MAX_MESSAGE_BYTES, RtdeStream, decode_message, outputs_of
+from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, RtdeStream, decode_message, outputs_of
+from brushloop.drivers.arcs.wire import encode_short
 from brushloop.drivers.errors import DeviceError, ProtocolViolation
 from tests.drivers.fuzz.inputs import EXAMPLES, LEAST_INPUTS, MANY, mutated, noise, truncated
 

@@ -10,8 +10,8 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 
-from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode, encode_short
-from brushloop.drivers.arcs.rtde import MAX_MESSAGE_BYTES, PING, encode_sample
+from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, encode_sample
+from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, encode_short
 from brushloop.drivers.errors import ProtocolViolation
 from tests.drivers.fuzz.inputs import (
     EXAMPLES,

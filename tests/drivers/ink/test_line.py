@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink.port import crc16
 from brushloop.drivers.ink.station import MAX_LINE_BYTES, Line, Reply, find_reply, number_of, seal, unseal
-from brushloop.drivers.sim.instruments.ink_station import StationFirmware
+from brushloop.drivers.sim.instruments.ink import StationFirmware
 
 DOC = Path(__file__).parents[3] / "docs" / "ink-station.md"
 THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink.pump import exception, find_reply, read_write, seal, unseal, write_register
-from brushloop.drivers.sim.instruments.modbus_pump import PumpFirmware
+from brushloop.drivers.sim.instruments.ink import PumpFirmware
 
 THOROUGH = settings(max_examples=10 * settings.default.max_examples, deadline=None)
 SOME = settings(max_examples=100, deadline=None)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -19,12 +19,10 @@ from brushloop.drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
-from brushloop.drivers.protocols import Ink
-from brushloop.drivers.sim.faults.kinds import InkFault
-from brushloop.drivers.sim.instruments.ink_station import PtyLine
-from brushloop.drivers.sim.instruments.modbus_pump import PumpFirmware
+from brushloop.drivers.sim.instruments.ink import PtyLine, PumpFirmware
 from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3
@@ -53,7 +51,7 @@ def firmware() -> PumpFirmware:
 
 
 @pytest.fixture
-def line(firmware: PumpFirmware) -> Iterator[PtyLine]:
+async def line(firmware: PumpFirmware) -> AsyncIterator[PtyLine]:
     with PtyLine(firmware, late_s=1.5 * TIMEOUT_S) as it:
         yield it
 
@@ -158,7 +156,7 @@ async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
     dosing = asyncio.create_task(pump.dose(2.0))
     while not firmware.running:
         await asyncio.sleep(0.01)
-    fail_requests(line, InkFault.LATE)
+    fail_requests(line, "late")
     for _ in range(times):
         dosing.cancel()
         await asyncio.sleep(0.02)
@@ -183,13 +181,13 @@ async def test_a_cancelled_dose_whose_stop_fails_says_so(firmware: PumpFirmware,
         await pump.close()
 
 
-@pytest.mark.parametrize("fault", [InkFault.DEAF, InkFault.GARBAGE, InkFault.LATE, InkFault.MISTAKEN])
+@pytest.mark.parametrize("fault", ["deaf", "garbage", "late", "mistaken"])
 @pytest.mark.parametrize("at", ["start", "stop"])
 async def test_a_fault_anywhere_leaves_the_pump_stopped(
-    fault: InkFault, at: str, firmware: PumpFirmware, line: PtyLine, pump: ModbusPump
+    fault: str, at: str, firmware: PumpFirmware, line: PtyLine, pump: ModbusPump
 ):
     before = {"start": 1, "stop": 2}[at]
-    fail_requests(line, *[InkFault.SPLIT] * before, fault)
+    fail_requests(line, *["split"] * before, fault)
     if at == "stop":
         await pump.dose(0.01)  # the second stop is confirmed
     else:
@@ -203,7 +201,7 @@ async def test_a_fault_anywhere_leaves_the_pump_stopped(
 async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmware, line: PtyLine, wait_s: float):
     pump = pump_at(line.path)
     await pump.connect()
-    fail_requests(line, *[InkFault.SPLIT] * 3)
+    fail_requests(line, *["split"] * 3)
     dosing = asyncio.create_task(pump.dose(0.01))
     await asyncio.sleep(wait_s)
     await pump.close()
@@ -215,7 +213,7 @@ async def test_closing_in_mid_dose_leaves_the_pump_stopped(firmware: PumpFirmwar
 async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
     pump = pump_at(line.path)
     await pump.connect()
-    fail_requests(line, InkFault.SPLIT, InkFault.SPLIT, InkFault.UNPLUG)
+    fail_requests(line, "split", "split", "unplug")
     with pytest.raises(ConnectionLost, match=r"stop: .*may still be running.*Check cable"):
         await pump.dose(0.01)
     with pytest.raises(ConnectionLost):
@@ -223,7 +221,7 @@ async def test_a_pulled_cable_says_that_the_pump_may_run(line: PtyLine):
 
 
 async def test_a_late_reply_does_not_pass_for_the_next(line: PtyLine, firmware: PumpFirmware, pump: ModbusPump):
-    fail_requests(line, InkFault.LATE)
+    fail_requests(line, "late")
     with pytest.raises(DeviceTimeout, match="not started"):
         await pump.dose(0.01)
     await pump.dose(0.01)

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance, to_wire
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
 from brushloop.drivers.sim.arcs.methods import methods
 from brushloop.drivers.sim.config import SimConfig

@@ -14,10 +14,9 @@ import brushloop.__main__
 from bench.brushes import FROZEN
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from brushloop.drivers.sim.brush_file import LOOPBACK, PAPER, load_brush
+from brushloop.drivers.sim.brush.spec import LOOPBACK, PAPER, SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.described import SimFileError
-from brushloop.drivers.sim.rig_toml import Addresses, rig_toml
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.serve import LabRefused
 
 PRESSED = (

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.arcs.framing import FrameDecoder, encode
+from brushloop.drivers.arcs.wire import FrameDecoder, encode
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
-from brushloop.drivers.clock import HostClock
-from brushloop.drivers.samples import Stamp
+from brushloop.drivers.devices import Stamp
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim import rig as rig_module
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig, View

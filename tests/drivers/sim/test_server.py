@@ -6,8 +6,7 @@ import asyncio
 
 import pytest
 
-from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.control import ControlServer

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.brush.drag import INK_PER_MM
-from brushloop.drivers.sim.brush.flaws import Flaw
+from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World
 

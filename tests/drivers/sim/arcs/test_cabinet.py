@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
 from brushloop.drivers.sim.arm.kinematics import HOME
 
@@ -131,7 +131,7 @@ def test_a_path_can_be_held_again_and_again_even_before_the_arm_has_come_to_rest
     on.clock.s += 20.0
     assert on.exec_id == -1
     assert on.off_mm(START) == pytest.approx(0.0)
-    assert on.cabinet.motion._moves == []
+    assert on.cabinet.motion.size == 0
 
 
 def test_an_abort_ends_a_hold_and_forgets_the_path(on: Any):

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs.power import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
+from brushloop.drivers.sim.arcs.cabinet import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
 from brushloop.drivers.sim.world import SimClock
 
 NEAR = brush_pose(350.0, -230.0, 260.0)

@@ -10,11 +10,10 @@ from typing import Any
 import cbor2
 import pytest
 
-from brushloop.drivers.arcs.framing import FrameDecoder, encode, encode_short
-from brushloop.drivers.arcs.rtde import PING, encode_topic
+from brushloop.drivers.arcs.telemetry import PING, encode_topic
+from brushloop.drivers.arcs.wire import FrameDecoder, encode, encode_short
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs.rtde_server import RtdeServer
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.rig import HOST
 
 EVERYTHING = ["timestamp", "R1_actual_q", "R1_robot_mode", "R1_safety_mode", "R1_actual_TCP_pose"]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from brushloop.drivers.arcs.framing import BareDecoder, FrameDecoder, encode
+from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.rig import HOST
 

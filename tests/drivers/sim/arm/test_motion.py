@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.arm.motion import STEADY_LAG_S, MotionQueue
-from brushloop.drivers.sim.arm.plan import Ramp
+from brushloop.drivers.sim.arm.paths import Ramp
 
 ramps = st.builds(Ramp, st.floats(0.01, 800.0), st.floats(0.5, 250.0), st.floats(10.0, 1000.0))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw
-from brushloop.drivers.sim.brush.flaws import COHESIVE_LOAD, flaw_of_load, natural_split
+from brushloop.drivers.sim.brush.footprint import COHESIVE_LOAD, flaw_of_load, natural_split
 from brushloop.drivers.sim.brush.paper import Footprint
 
 SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)

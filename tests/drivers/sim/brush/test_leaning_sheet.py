@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.samples import Pose
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.contact import bent_toward, leaning_with
 from brushloop.drivers.sim.config import SimConfig, Table

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.drivers.sim.camera.optics import Optics
-from brushloop.drivers.sim.camera.scene import Scene, board
+from brushloop.drivers.sim.camera.scene import Optics, Scene, board
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.world import World
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.camera.optics import homography
-from brushloop.drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, read_strip
+from brushloop.drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, homography, read_strip
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.world import World
 

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Iterator
 import pytest
 
 from brushloop.drivers.arcs import stopping
-from brushloop.drivers.arcs.rpc import RpcConnection
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import LoopbackRig
 

@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from brushloop.drivers.sim.faults.board import MOST, FaultBoard
-from brushloop.drivers.sim.faults.kinds import KINDS, REPLIES, STOPS, Device, Fault
-from brushloop.drivers.sim.faults.phases import Phase
+from brushloop.drivers.sim.faults import KINDS, MOST, REPLIES, STOPS, Device, Fault, FaultBoard, Phase
 
 
 @dataclass

@@ -14,11 +14,11 @@ import pytest
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.camera.opencv import Fault as Judgement
 from brushloop.drivers.camera.opencv import FrameHealth
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceTimeout
-from brushloop.drivers.samples import Stamp
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.camera.scene import read_strip
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from tests.waiting import wait_until
 

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brushloop.drivers.arcs.codes import SafetyMode
+from brushloop.drivers.arcs.controller import SafetyMode
+from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.control import MAX_LINE_BYTES, ControlServer, live_control
-from brushloop.drivers.sim.described import SimFileError
 from brushloop.drivers.sim.rig import LoopbackRig
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.sim.fault_client import FaultRefused, ask, request_of
+from brushloop.drivers.loopback import FaultRefused, ask, request_of
 from tests.waiting import PATIENCE_S, wait_until
 
 NOTHING: dict[str, object] = {"on": None, "count": None, "id": None}

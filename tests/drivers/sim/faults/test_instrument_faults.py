@@ -8,12 +8,12 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stuck
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, unseal
-from brushloop.drivers.sim.faults.kinds import Device, Fault
+from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import HOST, Faults, LoopbackRig
 
 

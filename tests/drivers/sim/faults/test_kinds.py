@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from brushloop.drivers.sim.faults.kinds import Device, fault_of
+from brushloop.drivers.sim.faults import Device, fault_of
 
 
 def test_a_fault_has_what_its_request_says() -> None:

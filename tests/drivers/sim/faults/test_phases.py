@@ -4,41 +4,57 @@ from __future__ import annotations
 
 import pytest
 
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.faults.phases import Phase, Spot, Truth, phase_of
+from brushloop.drivers.sim.faults import Phase, Truth
 from brushloop.drivers.sim.world import World
 
 TABLE = Table()
-HOME = Spot(-100.0, 200.0, 140.0)
-OVER, NEAR, ON, IN = (Spot(100.0, 80.0, h) for h in (60.0, 8.0, 0.03, -15.0))
-WELL = Spot(*TABLE.well_mm, 60.0)
-INK = Spot(*TABLE.well_mm, 2.0)
+OVER, NEAR, ON, IN = ((100.0, 80.0, h) for h in (60.0, 8.0, 0.03, -15.0))
+WELL, INK = (*TABLE.well_mm, 60.0), (*TABLE.well_mm, 2.0)
+HOME = None
+"""Where the tip rests when the rig starts."""
+
+
+def base(spot: tuple[float, float, float] | None) -> Pose:
+    """The pose of a place in the paper frame, in mm above the sheet; the table's yaw is 90 deg."""
+    if spot is HOME:
+        return brush_pose(*SimConfig().home_mm)
+    x, y, above = spot
+    return brush_pose(TABLE.origin_mm[0] - y, TABLE.origin_mm[1] + x, TABLE.paper_z_mm + above)
 
 
 @pytest.mark.parametrize(
     ("here", "to", "phase"),
     [
-        (HOME, None, Phase.PARKED),
-        (OVER, None, Phase.RESTING),
+        (HOME, HOME, Phase.PARKED),
+        (OVER, OVER, Phase.RESTING),
         (HOME, OVER, Phase.TRAVELLING),
         (OVER, NEAR, Phase.TRAVELLING),  # the fast approach ends above the paper
         (NEAR, ON, Phase.DESCENDING),
         (ON, IN, Phase.DESCENDING),
-        (ON, None, Phase.PRESSED),
-        (IN, None, Phase.PRESSED),
+        (ON, ON, Phase.PRESSED),
+        (IN, IN, Phase.PRESSED),
         (IN, NEAR, Phase.LIFTING),
         (NEAR, OVER, Phase.LIFTING),
         (OVER, HOME, Phase.TRAVELLING),
         (HOME, WELL, Phase.TRAVELLING),
         (WELL, INK, Phase.DIPPING),
-        (INK, None, Phase.DIPPING),
+        (INK, INK, Phase.DIPPING),
         (INK, WELL, Phase.DIPPING),
         (WELL, HOME, Phase.TRAVELLING),
     ],
 )
-def test_each_piece_of_a_press_and_of_a_dip_has_its_phase(here: Spot, to: Spot | None, phase: Phase):
-    assert phase_of(TABLE, HOME, here, to) is phase
+def test_each_piece_of_a_press_and_of_a_dip_has_its_phase(
+    here: tuple[float, float, float] | None, to: tuple[float, float, float] | None, phase: Phase
+):
+    world = World(SimConfig())
+    world.clock = clock = StoppedClock()  # type: ignore[assignment]
+    world.motion.add(base(here), 200.0, 1000.0, clock.s)
+    clock.s = 100.0
+    world.motion.add(base(to), 200.0, 1000.0, clock.s)
+    assert Truth(world).phase() is phase
 
 
 class StoppedClock:

@@ -7,10 +7,9 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from brushloop.drivers.arcs.codes import RobotMode, SafetyMode
+from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsOptions
-from brushloop.drivers.clock import HostClock
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -20,9 +19,10 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs.server import ArcsServer
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home

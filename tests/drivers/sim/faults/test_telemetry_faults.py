@@ -11,11 +11,11 @@ import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsOptions
-from brushloop.drivers.clock import HostClock
+from brushloop.drivers.devices import PoseSample
 from brushloop.drivers.errors import Stale
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.samples import PoseSample
-from brushloop.drivers.sim.faults.kinds import ALWAYS, Device, Fault
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 
 

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 import brushloop.__main__
+from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.control import live_control
-from brushloop.drivers.sim.fault_client import FaultRefused
 from brushloop.drivers.sim.lab.lab import UnknownLab
 from brushloop.drivers.sim.serve import LabRefused
 

@@ -11,12 +11,11 @@ import pytest
 
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.arcs.rpc import RpcConnection, open_arcs
+from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.errors import DeviceTimeout, WrongGeneration
 from brushloop.drivers.sim.camera.scene import board
-from brushloop.drivers.sim.lab.facts import draw, in_picture
+from brushloop.drivers.sim.lab.facts import CORNERS, corner, draw, in_picture
 from brushloop.drivers.sim.lab.lab import ARCS_PORT, CAMERA_PORTS, UnknownLab
-from brushloop.drivers.sim.lab.places import CORNERS, corner
 from brushloop.drivers.sim.lab.traps import Trap, mended, spring
 
 FAST = 500.0

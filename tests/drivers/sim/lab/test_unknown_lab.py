@@ -14,14 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.arcs.rpc import RpcConnection, open_arcs
+from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.geometry import from_wire, lean
 from brushloop.drivers.sim.arm.kinematics import forward, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.camera.scene import board
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.lab.facts import draw, in_picture
+from brushloop.drivers.sim.lab.facts import CORNERS, corner, draw, in_picture
 from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab
-from brushloop.drivers.sim.lab.places import CORNERS, corner
 from brushloop.drivers.sim.lab.seen import truth
 from brushloop.drivers.sim.rig import _at_sensor
 from brushloop.drivers.sim.world import tool_of

@@ -1,22 +1,68 @@
-"""Allow only one driver per device on a machine, across all users.
+"""The host computer: its clock, work that must end although its caller is cancelled, and one driver per device.
 
-On Linux a claim is an abstract socket, a name that the kernel keeps: it leaves no file behind, ends with its process in
-any case, and is visible to every user of the machine, but not in a container with a separate network. On other systems
-it is a lock on a file that every user may open, in a folder shared by all users.
+On Linux a claim on a device is an abstract socket, a name kept by the kernel: it leaves no file behind, ends with its
+process in any case, and is visible to every user of the machine, but not in a container with a separate network. On
+other systems it is a lock on a file that every user may open, in a folder shared by all users.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import os
 import socket
 import struct
 import sys
-from collections.abc import Generator
+import time
+from collections.abc import Coroutine, Generator
 from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 from filelock import FileLock, Timeout
+
+
+class Clock(Protocol):
+    """A source of nanoseconds since the epoch that never goes backwards."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since 1970-01-01 UTC; never less than the value returned before."""
+        ...
+
+
+class HostClock:
+    """Wall time read once, then carried forward by the monotonic clock.
+
+    An NTP step or an operator who sets the clock during a session must not reorder a recording.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Nanoseconds since the epoch: wall time when this clock was created, plus monotonic time since."""
+        return self._offset_ns + time.monotonic_ns()
+
+
+T = TypeVar("T")
+
+
+async def finished(work: Coroutine[Any, Any, T]) -> T:
+    """Run `work` to its end, however often the caller is cancelled meanwhile, and return its result.
+
+    If `work` fails, its error is raised, because it tells more than a cancellation; else a cancellation is raised now.
+    """
+    task, cancelled = asyncio.ensure_future(work), None
+    while not task.done():
+        try:
+            await asyncio.wait([task])
+        except asyncio.CancelledError as error:
+            cancelled = error
+    result = task.result()
+    if cancelled is not None:
+        raise cancelled
+    return result
+
 
 WAITING = 64
 """Length of the backlog: refused processes connect to learn who holds the name, and are never served."""

@@ -1,0 +1,314 @@
+"""Faults of the loopback rig: what may go wrong, when it begins and how long it lasts.
+
+Every server of the rig asks the board, before it answers, whether a fault strikes. What a run does about each fault in
+each phase is in the table of docs/faults.md, "Ten faults in ten phases"; tests/collect/faults/test_matrix.py checks it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.sim.brush.spec import complaint
+from brushloop.drivers.sim.world import World
+
+ON_PAPER_MM = 0.1
+"""A tip that ends or rests no farther above than this counts as on the paper, which is taught with an error."""
+ALL_BUT_THERE_MM = 0.1
+"""Remaining descent that counts as pressed: a dwell is the very slow end of a descent."""
+LIFT_MM = 10.0
+"""Distance from the paper within which rising counts as lifting."""
+HOME_MM = 1.0
+
+
+class Phase(StrEnum):
+    """What the arm is doing: the first of these that applies."""
+
+    DIPPING = "dipping"
+    """Over the well, and below its rim or on the way there."""
+    PRESSED = "pressed"
+    """On or below the paper plane, over the sheet: at rest, or in the last tenth of a millimetre of the way down."""
+    DESCENDING = "descending"
+    """Over the sheet, on a line down that ends on or below the paper plane."""
+    LIFTING = "lifting"
+    """Over the sheet, rising from the paper or from just above it."""
+    TRAVELLING = "travelling"
+    """Any other motion."""
+    PARKED = "parked"
+    """At rest where the tip was when the rig started, which is where its `rig.toml` parks it."""
+    RESTING = "resting"
+    """At rest anywhere else."""
+
+
+class Truth:
+    """The facts about one world that faults may wait for. Use it in the thread that owns the world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def now_s(self) -> float:
+        """Simulated seconds since the rig started."""
+        return self._world.clock.now_s()
+
+    @property
+    def presses(self) -> int:
+        """Marks on the paper so far: the index of the press to come."""
+        return len(self._world.presses)
+
+    def target(self) -> Pose | None:
+        """End of the piece of the path that is being travelled; None at rest."""
+        return self._world.motion.target(self.now_s())
+
+    def phase(self) -> Phase:
+        """What the arm does now."""
+        config, here, to = self._world.config, self._world.tool(), self.target()
+        x_mm, y_mm, above_mm = self._on_paper(here)
+        (size_x_mm, size_y_mm), end_mm = config.table.sheet_mm, above_mm if to is None else self._on_paper(to)[2]
+        over_well = math.dist((x_mm, y_mm), config.table.well_mm) <= config.table.well_radius_mm
+        over_sheet = 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
+        if over_well and min(above_mm, end_mm) < config.table.well_depth_mm:
+            return Phase.DIPPING
+        if to is None:
+            if over_sheet and above_mm <= ON_PAPER_MM:
+                return Phase.PRESSED
+            return Phase.PARKED if math.dist(here.position_mm, config.home_mm) <= HOME_MM else Phase.RESTING
+        if over_sheet and above_mm < 0.0 and 0.0 <= above_mm - end_mm <= ALL_BUT_THERE_MM:
+            return Phase.PRESSED
+        if over_sheet and end_mm < above_mm and end_mm <= ON_PAPER_MM:
+            return Phase.DESCENDING
+        if over_sheet and end_mm > above_mm and above_mm <= LIFT_MM:
+            return Phase.LIFTING
+        return Phase.TRAVELLING
+
+    def _on_paper(self, pose: Pose) -> tuple[float, float, float]:
+        """x and y in the paper frame, and the distance from the paper along its normal."""
+        x_mm, y_mm = self._world.to_paper(pose.x_mm, pose.y_mm)
+        return x_mm, y_mm, self._world.config.table.above_mm(x_mm, y_mm, pose.z_mm)
+
+
+ALWAYS = 1_000_000
+"""A count that no session reaches."""
+
+
+class Device(StrEnum):
+    """The device that fails."""
+
+    ROBOT = "robot"
+    """The controller's JSON-RPC port."""
+    TELEMETRY = "telemetry"
+    """Its RTDE port."""
+    CAMERA = "camera"
+    INK = "ink"
+    FORCE = "force"
+
+
+LOST = frozenset({"deaf"})
+"""The request never arrives: it is neither carried out nor answered."""
+REPLIES = frozenset({"mute", "late", "split", "duplicate", "wrong-id", "malformed", "garbage", "drop"})
+"""The request is carried out; something is wrong with its reply."""
+STOPS = frozenset({"protective-stop", "emergency-stop", "safeguard-stop"})
+"""The cabinet stops the arm by itself; only a person ends that."""
+
+KINDS: dict[Device, frozenset[str]] = {
+    Device.ROBOT: LOST | REPLIES | STOPS,
+    Device.TELEMETRY: frozenset({"mute", "late", "malformed", "drop"}),
+    Device.CAMERA: frozenset({"stale", "black", "frozen", "torn", "drop"}),
+    Device.INK: frozenset({"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}),
+    Device.FORCE: frozenset(
+        {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off", "stuck"}
+    ),
+}
+"""What each kind does is in docs/faults.md."""
+
+
+class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
+    """One fault. All conditions of its trigger must hold at once; without any it begins at once.
+
+    Once begun it strikes every matching request, push or frame until its `count` or `for_s` is over.
+    """
+
+    device: Device
+    kind: str
+    after_s: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    """Earliest beginning, in simulated seconds since the rig started."""
+    on: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]{0,79}$")] | None = None
+    """Only requests of this method: `moveLine`, or in full `rob1.MotionControl.moveLine`; `login` for the login."""
+    nth: Annotated[int, Field(ge=1, le=ALWAYS)] = 1
+    """Begins with the n-th request, push or frame for which all other conditions hold."""
+    phase: Phase | None = None
+    """Begins only while the arm is really doing this."""
+    press: Annotated[int, Field(ge=0, le=ALWAYS)] | None = None
+    """Begins only while this many presses are on the paper: from lifting off one to lifting off the next."""
+    count: Annotated[int, Field(ge=1, le=ALWAYS)] | None = None
+    """Number of strikes; 1 where neither this nor `for_s` is given."""
+    for_s: Annotated[float, Field(gt=0.0, le=86_400.0)] | None = None
+    """Duration in real seconds from its beginning; the timeouts of drivers are in real time too."""
+    late_s: Annotated[float, Field(ge=0.001, le=60.0)] = 0.3
+    """How late a `late` reply or push of the robot comes, in real seconds."""
+
+    @model_validator(mode="after")
+    def _coherent(self) -> Fault:
+        kinds = KINDS[self.device]
+        if self.kind not in kinds:
+            raise ValueError(f"kind = {self.kind!r} is not one of {self.device}'s: {', '.join(sorted(kinds))}")
+        if self.count is not None and self.for_s is not None:
+            raise ValueError("count and for_s exclude each other")
+        if self.on is not None and self.device is not Device.ROBOT:
+            raise ValueError(f"on = {self.on!r}: only the robot has methods")
+        if self.kind in STOPS and (self.for_s is not None or self.count not in (None, 1)):
+            raise ValueError(f"{self.kind} happens once and lasts until a person ends it: no count, no for_s")
+        if self.by_itself and self.nth != 1:
+            raise ValueError(f"nth = {self.nth} counts nothing here: {self.kind} of {self.device} waits for no request")
+        if "late_s" in self.model_fields_set and (self.kind != "late" or self.device is Device.INK):
+            raise ValueError("late_s goes with kind = 'late' of robot and telemetry only")
+        return self
+
+    @property
+    def by_itself(self) -> bool:
+        """True if it begins without a request."""
+        return self.device is Device.INK or (self.kind in STOPS and self.on is None)
+
+    @property
+    def strikes(self) -> int | None:
+        """Number of strikes; None where `for_s` ends it."""
+        return None if self.for_s is not None else self.count or 1
+
+    def matches(self, op: str) -> bool:
+        """Whether the fault waits for `op`, a method's full name."""
+        return self.on is None or op == self.on or op.endswith(f".{self.on}")
+
+
+def fault_of(values: dict[str, Any]) -> Fault:
+    """One fault from a client's request. Raises ValueError with one line that names the field."""
+    try:
+        return Fault.model_validate(values)
+    except ValidationError as error:
+        field, what = complaint(error)
+        raise ValueError(f"{field}: {what}" if field else what) from None
+
+
+KEPT = 100
+"""Finished faults that are still listed."""
+MOST = 1000
+"""Most faults on the board at once."""
+
+
+@dataclass(slots=True)
+class Hung:
+    """A fault on the board and its progress."""
+
+    ident: int
+    fault: Fault
+    begun: bool = False
+    seen: int = 0
+    """Requests that matched before it began."""
+    struck: int = 0
+    until_s: float | None = None
+    """Real time at which `for_s` is over; None before it begins."""
+
+
+class FaultBoard:
+    """Faults in the order in which they were added; of several that match one request the first strikes it."""
+
+    def __init__(self, truth: Truth, real_s: Callable[[], float] = time.monotonic) -> None:
+        self._truth = truth
+        self._real_s = real_s
+        self._idents = itertools.count(1)
+        self._hanging: dict[int, Hung] = {}
+        self.over: deque[Hung] = deque(maxlen=KEPT)
+        """The newest finished faults."""
+
+    def hang(self, fault: Fault) -> int:
+        """Add a fault; return the number by which it can be removed. Raises ValueError above `MOST`."""
+        if len(self._hanging) >= MOST:
+            raise ValueError(f"there are already {MOST} faults on the board")
+        hung = Hung(next(self._idents), fault)
+        self._hanging[hung.ident] = hung
+        return hung.ident
+
+    def take(self, ident: int) -> bool:
+        """Remove a fault; return False if none has that number."""
+        return self._hanging.pop(ident, None) is not None
+
+    def clear(self) -> int:
+        """Remove all, those that have begun too; return how many there were."""
+        count, self._hanging = len(self._hanging), {}
+        return count
+
+    @property
+    def hanging(self) -> tuple[Hung, ...]:
+        """Faults that are waiting or active."""
+        self._expire()
+        return tuple(self._hanging.values())
+
+    @property
+    def waits_by_itself(self) -> bool:
+        """True while a fault waits that no request triggers: `due` must be polled."""
+        return any(hung.fault.by_itself and not hung.begun for hung in tuple(self._hanging.values()))
+
+    def meet(self, device: Device, op: str, kinds: frozenset[str]) -> Fault | None:
+        """The fault, of these kinds, that strikes this request, push or frame; it counts as one strike."""
+        for hung in self.hanging:
+            fault = hung.fault
+            if fault.device is device and fault.kind in kinds and self._strikes(hung, op):
+                return fault
+        return None
+
+    def due(self) -> list[Fault]:
+        """Begin the faults that are due now without a request; return the stops among them, which are finished."""
+        stops: list[Fault] = []
+        for hung in self.hanging:
+            if hung.fault.by_itself and not hung.begun and self._holds(hung.fault):
+                self._begin(hung)
+                if hung.fault.kind in STOPS:
+                    hung.struck = 1
+                    self._end(hung)
+                    stops.append(hung.fault)
+        return stops
+
+    def _strikes(self, hung: Hung, op: str) -> bool:
+        fault = hung.fault
+        if not fault.matches(op):
+            return False
+        if not hung.begun:
+            if fault.by_itself or not self._holds(fault):
+                return False
+            hung.seen += 1
+            if hung.seen < fault.nth:
+                return False
+            self._begin(hung)
+        hung.struck += 1
+        if fault.strikes is not None and hung.struck >= fault.strikes:
+            self._end(hung)
+        return True
+
+    def _begin(self, hung: Hung) -> None:
+        hung.begun = True
+        if hung.fault.for_s is not None:
+            hung.until_s = self._real_s() + hung.fault.for_s
+
+    def _holds(self, fault: Fault) -> bool:
+        truth = self._truth
+        return (
+            truth.now_s() >= fault.after_s
+            and (fault.press is None or truth.presses == fault.press)
+            and (fault.phase is None or truth.phase() is fault.phase)
+        )
+
+    def _expire(self) -> None:
+        for hung in tuple(self._hanging.values()):
+            if hung.until_s is not None and self._real_s() >= hung.until_s:
+                self._end(hung)
+
+    def _end(self, hung: Hung) -> None:
+        if self.take(hung.ident):
+            self.over.append(hung)

@@ -1,0 +1,297 @@
+"""Serial instruments on a pty: the ink station's firmware, a Modbus pump, and the line and faults that both share."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import tempfile
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, Self
+
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.ink import pump
+from brushloop.drivers.ink.pump import (
+    MAX_RPM,
+    RUN_REGISTER,
+    SPEED_REGISTER,
+    STOP,
+    WRITE_BYTES,
+    WRITE_REGISTER,
+    exception,
+    read_write,
+)
+from brushloop.drivers.ink.station import number_of, seal, unseal
+from brushloop.drivers.sim.world import Well
+
+GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
+BYTE_S = 0.001
+
+
+class Instrument(Protocol):
+    """The device at the other end of the line; bytes in, bytes out."""
+
+    def take(self, buffer: bytearray) -> bytes | None:
+        """Remove one request from the buffer; None while it is incomplete."""
+        ...
+
+    def answer(self, request: bytes) -> bytes | None:
+        """Carry out the request and reply; None for silence."""
+        ...
+
+    def damage(self, reply: bytes) -> bytes:
+        """The reply with a wrong checksum."""
+        ...
+
+    def mistake(self, reply: bytes) -> bytes:
+        """A valid reply, but not to this request."""
+        ...
+
+
+class PtyLine:
+    """An instrument on a pseudo terminal, served by the running event loop; open `path` as the serial port.
+
+    `path` is a link of its own that goes with the cable, as udev's do: the kernel gives the number of a closed
+    terminal to the next one, so a driver that connects again by number would reach another instrument.
+    """
+
+    def __init__(self, instrument: Instrument, *, late_s: float = 0.3) -> None:
+        self.instrument = instrument
+        self.path = ""
+        self._late_s = late_s
+        self.next_fault: Callable[[], str | None] = lambda: None
+        """Asked for the fault of each request."""
+        self._terminal: tuple[int, int] | None = None
+        self._buffer = bytearray()
+
+    def __enter__(self) -> Self:
+        """Open the pty and serve it."""
+        master, slave = self._terminal = os.openpty()
+        tty.setraw(slave)  # or the terminal would echo, and translate line ends
+        self.path = str(Path(tempfile.mkdtemp(prefix="brushloop-line-")) / "tty")
+        Path(self.path).symlink_to(os.ttyname(slave))
+        asyncio.get_running_loop().add_reader(master, self._read)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the pty; harmless where it was never opened."""
+        self.unplug()
+        if self.path:
+            Path(self.path).parent.rmdir()
+            self.path = ""
+
+    def unplug(self) -> None:
+        """Pull the cable: the port is gone."""
+        terminal, self._terminal = self._terminal, None
+        if terminal is not None:
+            asyncio.get_running_loop().remove_reader(terminal[0])
+            Path(self.path).unlink(missing_ok=True)
+            for end in terminal:
+                os.close(end)
+
+    def _read(self) -> None:
+        assert self._terminal is not None
+        self._buffer += os.read(self._terminal[0], 4096)
+        while (request := self.instrument.take(self._buffer)) is not None:
+            self._meet(request)
+
+    def _write(self, reply: bytes) -> None:
+        if self._terminal is not None:
+            with contextlib.suppress(OSError):
+                os.write(self._terminal[0], reply)
+
+    def _meet(self, request: bytes) -> None:
+        fault, later = self.next_fault(), asyncio.get_running_loop().call_later
+        if fault == "unplug":
+            self.unplug()
+            return
+        reply = None if fault == "deaf" else self.instrument.answer(request)
+        if reply is None:
+            return
+        match fault:
+            case "mute":
+                pass
+            case "garbage":
+                self._write(GARBAGE)
+            case "late":
+                later(self._late_s, self._write, reply)
+            case "split":
+                for index in range(len(reply)):
+                    later(index * BYTE_S, self._write, reply[index : index + 1])
+            case "damaged":
+                self._write(self.instrument.damage(reply))
+            case "mistaken":
+                self._write(self.instrument.mistake(reply))
+            case "echo":
+                self._write(request)
+            case _:
+                self._write(reply)
+
+
+class StationFirmware:
+    """The ink station's side of docs/ink-station.md, with a well, a reservoir, a light and a lid."""
+
+    def __init__(self, well: Well | None = None, reservoir_ml: float = 100.0) -> None:
+        self.well = well or Well(10.0, capacity_ml=20.0)
+        self.reservoir_ml = reservoir_ml
+        self.light = 0.0
+        self.lid_open = True
+        self._memory: tuple[bytes, bytes] = (b"", b"")
+
+    def take(self, buffer: bytearray) -> bytes | None:
+        """One line."""
+        end = buffer.find(b"\n") + 1
+        if not end:
+            return None
+        line = bytes(buffer[:end])
+        del buffer[:end]
+        return line
+
+    def answer(self, request: bytes) -> bytes | None:
+        """The reply; a repeated line is answered from memory, a damaged one not at all."""
+        if request == self._memory[0]:
+            return self._memory[1]
+        try:
+            line = unseal(request)
+        except ProtocolViolation:
+            return None  # the number that it carries cannot be trusted
+        try:
+            text = self._obey(line.text.split(" "))
+        except ProtocolViolation:
+            text = "err 2 not a number"
+        reply = seal(line.number, text)
+        self._memory = (request, reply)
+        return reply
+
+    def damage(self, reply: bytes) -> bytes:
+        """One character of the checksum changed."""
+        return reply[:-2] + (b"0" if reply[-2:-1] != b"0" else b"1") + b"\n"
+
+    def mistake(self, reply: bytes) -> bytes:
+        """A reply with the number of the previous request."""
+        line = unseal(reply)
+        return seal((line.number - 1) % 1000, line.text)
+
+    def _obey(self, words: list[str]) -> str:
+        match words:
+            case ["identify"]:
+                return "ok ink-station 1 1.0.0 loopback"
+            case ["dose", volume]:
+                return self._dose(number_of(volume))
+            case ["light", level]:
+                if number_of(level) > 1.0:
+                    return "err 2 light goes to 1"
+                self.light = number_of(level)
+                return "ok"
+            case ["lid", ("open" | "close") as word]:
+                self.lid_open = word == "open"
+                return "ok"
+            case ["level"]:
+                return f"ok {self.well.share:.3f}"
+            case _:
+                return "err 1 unknown command"
+
+    def _dose(self, volume_ml: float) -> str:
+        if not self.lid_open:
+            return "err 5 lid is closed"
+        if volume_ml > self.reservoir_ml:
+            return "err 4 reservoir is empty"
+        if self.well.ml + volume_ml > self.well.capacity_ml:
+            return "err 3 well would overflow"
+        self.reservoir_ml -= volume_ml
+        self.well.add(volume_ml)
+        return f"ok {volume_ml:.3f}"
+
+
+FULL_SPEED = 2
+
+
+class PumpFirmware:
+    """A simulated pump with `now_s` as its clock; the pumped volume can be read at any time."""
+
+    def __init__(
+        self,
+        *,
+        unit: int = 1,
+        ml_per_revolution: float = 0.1,
+        reservoir_ml: float = math.inf,
+        on_pumped: Callable[[float], None] = lambda _volume_ml: None,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.unit = unit
+        self.rpm = 0.0
+        self.starts = 0
+        self._ml_per_revolution = ml_per_revolution
+        self._reservoir_ml = reservoir_ml
+        self._on_pumped = on_pumped
+        self._now_s = now_s
+        self._run = STOP
+        self._pumped_ml = 0.0
+        self._since_s = now_s()
+
+    @property
+    def running(self) -> bool:
+        """Whether the rotor turns."""
+        return self._run != STOP
+
+    @property
+    def pumped_ml(self) -> float:
+        """Volume pumped so far."""
+        self._settle()
+        return self._pumped_ml
+
+    def take(self, buffer: bytearray) -> bytes | None:
+        """Take eight bytes, the length of every known request; None if there are fewer."""
+        if len(buffer) < WRITE_BYTES:
+            return None
+        frame = bytes(buffer[:WRITE_BYTES])
+        del buffer[:WRITE_BYTES]
+        return frame
+
+    def answer(self, request: bytes) -> bytes | None:
+        """The reply; None for a wrong CRC or another unit, as Modbus requires."""
+        try:
+            unit, function, *_ = pump.unseal(request)
+        except ProtocolViolation:
+            return None
+        if unit != self.unit:
+            return None
+        if function != WRITE_REGISTER:
+            return exception(unit, function & 0x7F, 1)
+        _, register, value = read_write(request)
+        self._settle()
+        if register not in (SPEED_REGISTER, RUN_REGISTER):
+            return exception(unit, function, 2)
+        if value > (MAX_RPM * 100 if register == SPEED_REGISTER else FULL_SPEED):
+            return exception(unit, function, 3)
+        if register == SPEED_REGISTER:
+            self.rpm = value / 100
+        else:
+            self.starts += value != STOP and not self.running
+            self._run = value
+        return request
+
+    def damage(self, reply: bytes) -> bytes:
+        """The reply with the last byte of its CRC changed."""
+        return reply[:-1] + bytes([reply[-1] ^ 0x55])
+
+    def mistake(self, reply: bytes) -> bytes:
+        """A valid confirmation of another register."""
+        return pump.seal(bytes([self.unit, WRITE_REGISTER, 0x00, 0x77, 0x00, 0x00]))
+
+    def _settle(self) -> None:
+        now_s = self._now_s()
+        rpm = {STOP: 0.0, FULL_SPEED: MAX_RPM}.get(self._run, self.rpm)
+        turned_ml = rpm / 60.0 * self._ml_per_revolution * (now_s - self._since_s)
+        volume_ml = min(turned_ml, self._reservoir_ml - self._pumped_ml)  # an empty tube pumps air
+        self._pumped_ml += volume_ml
+        self._on_pumped(volume_ml)
+        self._since_s = now_s
