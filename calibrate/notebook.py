@@ -31,10 +31,10 @@ from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Se
 from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit, FitRequest, FitResult, fit_presses
 from brushloop.calibrate.presses import Refused, crop, read_presses
+from brushloop.calibrate.remote import local_path
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate.command import Request, ValidationOutput, check
 from brushloop.calibrate.validate.command import validate as run_validation
-from brushloop.calibrate.validate.inputs import local_path
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.similarity import csim, ssim
 from brushloop.sessions.recording import Capture, Recording

@@ -118,7 +118,7 @@ def captures(
     """Write captured presses in the format that `brushloop train tune` reads."""
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target
-    from brushloop.calibrate.validate.inputs import open_session
+    from brushloop.calibrate.validate.command import one_source, open_session
     from brushloop.calibrate.validate.tuning import align_captures, write_captures
     from brushloop.sessions.disk import number
     from brushloop.sessions.records import Condition
@@ -131,11 +131,12 @@ def captures(
             raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
         cells.append(Condition(depth_mm, tilt_deg))
     check_target(out, ".safetensors", generator)
-    opened = [open_session(place, out.parent / "work", calibration, None) for place in session]
+    opened = [open_session(place, calibration, None) for place in session]
+    one_source(opened)
     aligned = align_captures(opened, generator)
     count = write_captures(aligned, out, cells)
     for name, why in aligned.left_out:
         say(f"left out: {name}: {why}")
     if cells:
-        say(f"left out, as requested: {len(aligned.cells) - count} presses of {len(cells)} cells")
+        say(f"left out, as requested: {len(aligned.images) - count} presses of {len(cells)} cells")
     say(f"{count} presses ({aligned.source}): {out}")

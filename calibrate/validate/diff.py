@@ -12,6 +12,7 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 from rich.table import Table
@@ -104,32 +105,33 @@ class Difference:
 
 def compare(before: Path, after: Path) -> Difference:
     """Compare two reports, or two validated sessions. Raises `CalibrationError` if they are not comparable."""
-    one, other = report_path(before), report_path(after)
-    a, b = load_report(one), load_report(other)
-    if a.source != b.source:
-        raise CalibrationError(str(other), f"is of {b.source}, {one} of {a.source}: they cannot be compared")
-    by_stroke = bool({s.recording_sha256 for s in a.sessions} & {s.recording_sha256 for s in b.sessions})
-    old, new = read_scores(one, a, by_stroke=by_stroke), read_scores(other, b, by_stroke=by_stroke)
-    tests: list[tuple[Series, Paired, float, float]] = []
-    for series in old:
-        if series not in new:
-            continue
-        both = sorted(old[series].keys() & new[series].keys())
-        first, second = (np.array([100.0 * side[series][key] for key in both]) for side in (old, new))
+    paths = report_path(before), report_path(after)
+    old, new = (load_report(path) for path in paths)
+    if old.source != new.source:
+        what = f"is of {new.source}, {paths[0]} of {old.source}: they cannot be compared"
+        raise CalibrationError(str(paths[1]), what)
+    by_stroke = bool({s.recording_sha256 for s in old.sessions} & {s.recording_sha256 for s in new.sessions})
+    first = read_scores(paths[0], old, by_stroke=by_stroke)
+    last = read_scores(paths[1], new, by_stroke=by_stroke)
+    tests: dict[Series, Paired] = {}
+    means: dict[Series, tuple[float, float]] = {}
+    for series in (series for series in first if series in last):
+        both = sorted(first[series].keys() & last[series].keys())
+        values = 100.0 * np.array([[side[series][key] for key in both] for side in (first, last)])
         cells = sorted({key[CELL] for key in both})
         # The error of a model is common to all strokes of a cell.
-        test = paired(first, second, np.array([cells.index(key[CELL]) for key in both], np.int64))
+        test = paired(values[0], values[1], np.array([cells.index(key[CELL]) for key in both], np.int64))
         if test is not None:
-            tests.append((series, test, float(first.mean()), float(second.mean())))
+            tests[series], means[series] = test, (float(values[0].mean()), float(values[1].mean()))
     if not tests:
-        raise CalibrationError(str(other), f"has no stroke, cell or model in common with {one}")
-    corrected = holm([test.p for _, test, _, _ in tests])
+        raise CalibrationError(str(paths[1]), f"has no stroke, cell or model in common with {paths[0]}")
+    corrected = holm([test.p for test in tests.values()])
     changes = [
-        Change(series, mean, then, test, p) for (series, test, mean, then), p in zip(tests, corrected, strict=True)
+        Change(series, *means[series], test, p) for (series, test), p in zip(tests.items(), corrected, strict=True)
     ]
-    models = [{series[0] for series in side} for side in (old, new)]
-    only = (sorted(models[0] - models[1]), sorted(models[1] - models[0]))
-    return Difference(a, b, "stroke" if by_stroke else "cell", changes, *only)
+    models = [{series[0] for series in side} for side in (first, last)]
+    only = sorted(models[0] - models[1]), sorted(models[1] - models[0])
+    return Difference(old, new, "stroke" if by_stroke else "cell", changes, *only)
 
 
 def report_path(place: Path) -> Path:
@@ -160,13 +162,12 @@ def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, 
     if digest != report.scores_sha256:
         raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
     recordings = {s.session_id: s.recording_sha256 for s in report.sessions}
-    sums: dict[Series, dict[tuple[str, ...], tuple[float, int]]] = {}
+    scores: dict[Series, dict[tuple[str, ...], list[float]]] = {}
     with table.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             cell = (row["depth_mm"], row["tilt_deg"])
             key = (*cell, recordings[row["session_id"]], as_text(row["stroke_id"])) if by_stroke else cell
             for measure in MEASURES:
-                series = sums.setdefault((row["model"], row["alignment"], row["tone"], measure), {})
-                total, count = series.get(key, (0.0, 0))
-                series[key] = total + float(row[measure]), count + 1
-    return {name: {key: total / count for key, (total, count) in series.items()} for name, series in sums.items()}
+                series = (row["model"], row["alignment"], row["tone"], measure)
+                scores.setdefault(series, {}).setdefault(key, []).append(float(row[measure]))
+    return {series: {key: fmean(of_key) for key, of_key in keys.items()} for series, keys in scores.items()}

@@ -15,7 +15,6 @@ from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, i
 from brushloop.calibrate.validate.models import ANOTHER, BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT, PRESSES
 from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session, missed_mm
 from brushloop.calibrate.writing.scores import REFERENCE
-from brushloop.sessions.records import Source
 
 CLOSE = 0.5
 """Points below which two models count as equal."""
@@ -28,18 +27,6 @@ MOVED_MM = 0.3
 MISSED_MM = 0.1
 """Difference between the commanded and the reached depth above which a report says so."""
 MAX_NAMED = 6
-MEASURED = {
-    Source.LOOPBACK: "The brush, the ink and the photographs are simulated",
-    Source.REAL: "A robot arm pressed them on paper, a camera photographed them",
-    Source.IMPORT: "They are photographs from elsewhere",
-    Source.IMPORT_SIMULATED: "They are pictures of simulated ink from elsewhere",
-}
-MEANING = {
-    Source.LOOPBACK: "The brush and its ink are simulated, so this tests the method and says nothing about paper.",
-    Source.REAL: "The ink is real: pressed by the arm and photographed, as the recording says.",
-    Source.IMPORT: "The photographs come from elsewhere; their scale and commands were not measured here.",
-    Source.IMPORT_SIMULATED: "The ink was simulated elsewhere, so this says nothing about paper.",
-}
 
 
 def measured(report: Report) -> str:
@@ -52,7 +39,7 @@ def measured(report: Report) -> str:
     models = sum(model.basis != PRESSES for model in report.models)
     return (
         f"{compared} brush presses{where}, from {sessions}, were compared with what {models} stroke models predict "
-        f"for them{left}. Each press is one vertical dab of {brush}. {MEASURED[report.source]} ({report.label})."
+        f"for them{left}. Each press is one vertical dab of {brush} ({report.label})."
     )
 
 
@@ -72,7 +59,7 @@ def verdict(report: Report) -> Iterator[str]:
     if others:
         words = " and ".join(others)
         yield f"{words[0].upper()}{words[1:]}."
-    yield MEANING[report.source]
+    yield source_point(report.source).text
 
 
 def findings(report: Report) -> Iterator[str]:

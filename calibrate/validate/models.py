@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +12,10 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.paper import ROBOT_WRITING
 from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of, levels_of, simulated
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.fit.heldout import RefittedBezier
+from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.validate.inputs import FittedSession
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.fitted import FittedPress
@@ -41,6 +42,18 @@ ORDER = (
     *("ellipse", "line", "circle"),
 )
 """Of the paper's tables, calibrated next to uncalibrated."""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedSession(OpenSession):
+    """An open session and the brush fit that it uses."""
+
+    fit: BrushFit | None
+
+    @classmethod
+    def of(cls, session: OpenSession, fit: BrushFit | None) -> FittedSession:
+        """The session with that fit."""
+        return cls(session.recording, session.sha256, session.strokes, session.calibration, session.store, fit)
 
 
 class ModelInfo(Frozen):
@@ -120,17 +133,10 @@ def in_order(models: Sequence[Model]) -> list[Model]:
 def known_models(
     session: FittedSession, generators: Sequence[Path], view: Field, *, ablations: bool, chosen: Sequence[str]
 ) -> list[Model]:
-    """The models that need no held-out fit. Raises `CalibrationError` if one of `chosen` is unknown."""
-    known = in_order([*_generators(session, generators, view), *_closed_forms(session, view, ablations=ablations)])
-    names = (*dict.fromkeys(model.name for model in known), *HELD_OUT_NAMES)
-    for name in chosen:
-        if name not in names:
-            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(names)}")
-    return known
+    """The models that need no held-out fit: generators, the registered models of the brush, and its fit.
 
-
-def _closed_forms(session: FittedSession, view: Field, *, ablations: bool) -> list[Model]:
-    """The registered models of the session's brush, the fitted one, and CCD-BSM at other lambdas."""
+    Raises `CalibrationError` if one of `chosen` is unknown, and what `load_generator` does.
+    """
     from brushloop.model.fitted import fitted_model
     from brushloop.model.strokes import stroke_model, stroke_models
 
@@ -142,22 +148,26 @@ def _closed_forms(session: FittedSession, view: Field, *, ablations: bool) -> li
     for name, lam in LAMBDAS.items() if ablations else ():
         label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
         models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name=name, label=label))
-    return models
+    known = in_order([*_generators(brush, generators, view), *models])
+    names = (*dict.fromkeys(model.name for model in known), *HELD_OUT_NAMES)
+    for name in chosen:
+        if name not in names:
+            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(names)}")
+    return known
 
 
-def _generators(session: FittedSession, files: Sequence[Path], view: Field) -> list[Model]:
-    """Trained generators, drawn as their traced outlines. Raises what `load_generator` does."""
+def _generators(brush: Brush, files: Sequence[Path], view: Field) -> Iterator[Model]:
+    """Yield trained generators, drawn as their traced outlines; a second one of a name has a number."""
     from brushloop.model.generator.stroke import load_generator
 
-    models: list[Model] = []
-    for number, file in enumerate(files):
-        model = load_generator(file, brush_of(session.header))
-        taken = any(model.name == other.name for other in models)
+    names: set[str] = set()
+    for number, file in enumerate(files, 1):
+        model = load_generator(file, brush)
         images = f"trained on exact images of {model.target.stroke_model.label}"
         basis = f"{images}, then tuned on captures" if model.fitted else images
-        named = {"name": f"{model.name}-{number + 1}"} if taken else {}
-        models.append(_of_model(model, basis, view, sha256=file_sha256(file), **named))
-    return models
+        name = f"{model.name}-{number}" if model.name in names else model.name
+        names.add(name)
+        yield _of_model(model, basis, view, sha256=file_sha256(file), name=name)
 
 
 def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBezier | None], view: Field) -> Model:

@@ -33,13 +33,13 @@ from brushloop.calibrate.report import (
 from brushloop.calibrate.scores import Cell, Row, Stat
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate import findings, tables
-from brushloop.calibrate.validate.inputs import FittedSession
 from brushloop.calibrate.validate.models import (
     BEZIER_REFITTED,
     FITTED,
     FITTED_HELD_OUT,
     GENERATOR_HELD_OUT,
     LAMBDAS,
+    FittedSession,
     ModelInfo,
 )
 from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session

@@ -6,7 +6,7 @@ Everything in terminal, JSON, tables, gates and comparisons comes from it.
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -21,8 +21,14 @@ from brushloop.calibrate.loop.compare import LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.scores import Cell, Row, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.stats import CEILING, Floats, ceiling_values
-from brushloop.calibrate.validate.inputs import Extras, FittedSession, one_source
-from brushloop.calibrate.validate.models import ANOTHER, FITTED, FITTED_HELD_OUT, KINDS_OF_PRESS, ModelInfo
+from brushloop.calibrate.validate.models import (
+    ANOTHER,
+    FITTED,
+    FITTED_HELD_OUT,
+    KINDS_OF_PRESS,
+    FittedSession,
+    ModelInfo,
+)
 from brushloop.calibrate.validate.run import Outcome, Refused, Step
 from brushloop.calibrate.writing.scores import WrittenRecord
 from brushloop.model.ccdbsm import DomainError
@@ -136,14 +142,20 @@ def load_report(path: Path) -> Report:
     return load_sealed(path, Report, MAX_BYTES)
 
 
-def report_of(outcome: Outcome, command: str, scores_sha256: str, extras: Extras) -> Report:
-    """Build one frozen report of a whole run."""
+def report_of(
+    outcome: Outcome,
+    command: str,
+    scores_sha256: str,
+    loops: Iterable[LoopRecord] = (),
+    written: Iterable[WrittenRecord] = (),
+) -> Report:
+    """Build one frozen report of a whole run, with the loops and characters that belong to it."""
     stats = tuple(_stats(outcome.scores))
     scored = {stat.model for stat in stats}
     present = [name for name in (*outcome.scores.models, CEILING) if name in scored]
     order = (FITTED_HELD_OUT, FITTED, "ccd-bsmg", "ccd-bsm", *present)
     report = Report(
-        source=one_source(outcome.sessions),
+        source=outcome.sessions[0].header.source,
         software={name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         command=command,
         mm_per_px=outcome.options.view.mm_per_px,
@@ -155,8 +167,8 @@ def report_of(outcome: Outcome, command: str, scores_sha256: str, extras: Extras
         refused=tuple(outcome.refused),
         by_strokes=tuple(outcome.steps),
         scores_sha256=scores_sha256,
-        loops=extras.loops,
-        written=extras.written,
+        loops=tuple(loops),
+        written=tuple(written),
     )
     return report.sealed()
 

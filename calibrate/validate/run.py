@@ -23,7 +23,6 @@ from brushloop.calibrate.presses import read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Row, Scores, similarities
 from brushloop.calibrate.stats import others_of
 from brushloop.calibrate.store import Arrays, key_of
-from brushloop.calibrate.validate.inputs import FittedSession
 from brushloop.calibrate.validate.models import (
     ANOTHER,
     BEZIER_LEFT_OUT,
@@ -33,6 +32,7 @@ from brushloop.calibrate.validate.models import (
     GENERATOR_HELD_OUT,
     HELD_OUT_NAMES,
     REPEATED,
+    FittedSession,
     Model,
     held_out,
     in_order,

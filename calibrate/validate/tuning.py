@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.place import FINE, Field, Image, brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.presses import Refused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.store import key_of
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
-from brushloop.calibrate.validate.inputs import one_source
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 FOLDS = 5
 """Number of folds: cells are left out by fifths, since a tuning takes a minute."""
 LEARNING_RATE = 2e-3
-NO_CELL = Condition(-1.0, -1.0)
-"""Cell of an image that is not a capture, so that it is never left out."""
 IMAGES = 400
 """Number of images of the fitted CCD-BSM added to the captures; drawn evenly from the generator's ranges."""
 HELD_OUT = 0.1
@@ -48,67 +46,76 @@ HELD_OUT = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class AlignedStrokes:
+class AlignedPresses:
     """Captured presses in a generator's image format."""
 
-    px_mm: float
-    placement: str
+    target: Target
     source: str
+    """Label of the recordings."""
     images: list[Image]
     """(N, N) each."""
-    inputs: list[dict[str, float]]
-    cells: list[Condition]
-    left_out: list[tuple[str, str]]
-    """(stroke, why) of presses that the generator does not draw or that cannot be used."""
+    conditions: list[Condition]
+    left_out: list[Refused]
+    """Presses that the generator does not draw or that cannot be used."""
 
 
-def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedStrokes:
-    """Convert the presses of sessions to the generator's image format. Raises what `load_generator` raises."""
+def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedPresses:
+    """Convert the presses of sessions of one source to the generator's image format. Raises as `load_generator`."""
     from brushloop.model.generator.stroke import load_generator
 
-    target = load_generator(generator).target
-    label = source_label(one_source(sessions), (session.header.brush for session in sessions))
-    aligned = AlignedStrokes(target.px_mm, str(target.placement), label, [], [], [], [])
+    headers = [session.header for session in sessions]
+    label = source_label(headers[0].source, (header.brush for header in headers))
+    aligned = AlignedPresses(load_generator(generator, brush_of(headers[0])).target, label, [], [], [])
     for session in sessions:
-        model = load_generator(generator, brush_of(session.header))
+        target = load_generator(generator, brush_of(session.header)).target
         for capture in session.recording.captures():
             stroke = capture.stroke
             if stroke.depth_mm is None or stroke.tilt_deg is None:
                 aligned.left_out.append((stroke.stroke_id, "has no depth or tilt"))
                 continue
             try:
-                values: dict[str, float] = dict(zip(INPUTS, (stroke.depth_mm, stroke.tilt_deg), strict=True))
-                model.target.check(np.array([list(values.values())]))
+                target.check(np.array([[stroke.depth_mm, stroke.tilt_deg]]))
                 prepared = prepare_press(capture, session.calibration, Field())
                 if prepared.cut:
                     raise CaptureRefused(stroke.stroke_id, "is cut by the edge of its photograph or cell")
-                aligned.images.append(_placed(prepared, model.target))
+                image = _placed(prepared, target)
             except (CaptureRefused, SessionDamaged) as error:
                 aligned.left_out.append((stroke.stroke_id, error.what))
-                continue
             except DomainError as error:
                 aligned.left_out.append((stroke.stroke_id, f"the generator does not draw it: {error}"))
-                continue
-            aligned.inputs.append(values)
-            aligned.cells.append(Condition(stroke.depth_mm, stroke.tilt_deg))
+            else:
+                aligned.images.append(image)
+                aligned.conditions.append(Condition(stroke.depth_mm, stroke.tilt_deg))
     return aligned
 
 
-def write_captures(aligned: AlignedStrokes, out: Path, leave_out: Sequence[Condition] = ()) -> int:
+def write_captures(
+    aligned: AlignedPresses, out: Path, leave_out: Sequence[Condition] = (), fit: FittedPress | None = None
+) -> int:
     """Write the file for `brushloop train tune`, without some cells; return the number of presses.
 
-    Raises `CalibrationError` if fewer than two conditions are left.
+    With a `fit` of the brush, images that it draws are added. Raises `CalibrationError` if fewer than two conditions
+    are left.
     """
+    from brushloop.model.fitted import fitted_model
     from brushloop.model.generator.data import save_captures
 
-    chosen = [k for k, cell in enumerate(aligned.cells) if cell not in leave_out]
-    conditions = len({tuple(aligned.inputs[k].values()) for k in chosen})
+    target = aligned.target
+    chosen = [k for k, condition in enumerate(aligned.conditions) if condition not in leave_out]
+    inputs = np.array([(aligned.conditions[k].depth_mm, aligned.conditions[k].tilt_deg) for k in chosen])
+    images = np.array([aligned.images[k] for k in chosen])
+    if fit is not None:
+        drawn = target.draw(IMAGES, (0,))
+        inputs, images = (
+            np.concatenate([inputs, drawn]),
+            np.concatenate([images, target.images(drawn, fitted_model(fit))]),
+        )
+    conditions = len(np.unique(inputs, axis=0))
     if conditions < 2:
         raise CalibrationError(str(out), f"{conditions} conditions are left, at least 2 are needed to tune on")
-    columns = {name: [aligned.inputs[k][name] for k in chosen] for name in aligned.inputs[0]}
-    stack = np.stack([aligned.images[k] for k in chosen]).astype(np.float32)
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_captures(out, columns, stack, aligned.px_mm, aligned.placement, aligned.source)
+    columns = dict(zip(INPUTS, inputs.T.tolist(), strict=True))
+    save_captures(out, columns, images.astype(np.float32), target.px_mm, str(target.placement), aligned.source)
     return len(chosen)
 
 
@@ -127,7 +134,7 @@ def tuned_by_cell(
     """
     digest = file_sha256(generator)
     files: dict[Condition, Path] = {}
-    aligned: AlignedStrokes | None = None
+    aligned: AlignedPresses | None = None
     for number, (fold, fit) in enumerate(folds):
         brush = () if fit is None else (fit.values, fit.edges, fit.ends)
         inputs = session.sha256, session.calibration_digest, digest, steps, LEARNING_RATE, fold, IMAGES, *brush
@@ -137,7 +144,7 @@ def tuned_by_cell(
             captures = folder / "captures.safetensors"
             if not captures.exists():
                 aligned = aligned or align_captures([session], generator)
-                write_captures(_with_images(aligned, session, fit, generator), captures, fold)
+                write_captures(aligned, captures, fold, fit)
             what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
             steps_done = _TrainingProgress(progress, what, number * steps, len(folds) * steps)
             _tune(folder, captures, generator, str(session.header.source), steps, steps_done)
@@ -176,27 +183,6 @@ def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int
         checkpoint_every=max(1, steps // 4),
     )
     run_training(config, folder, progress, lambda: False, files)
-
-
-def _with_images(
-    aligned: AlignedStrokes, session: OpenSession, fit: FittedPress | None, generator: Path
-) -> AlignedStrokes:
-    """Add images of the fitted brush, if there is one."""
-    from brushloop.model.fitted import fitted_model
-    from brushloop.model.generator.stroke import load_generator
-
-    brush = brush_of(session.header)
-    target = load_generator(generator, brush).target
-    if fit is None:
-        return aligned
-    fitted = fitted_model(fit)
-    inputs = target.draw(IMAGES, (0,))
-    return replace(
-        aligned,
-        images=[*aligned.images, *target.images(inputs, fitted)],
-        inputs=[*aligned.inputs, *(dict(zip(INPUTS, row, strict=True)) for row in inputs.tolist())],
-        cells=[*aligned.cells, *[NO_CELL] * IMAGES],
-    )
 
 
 def _placed(prepared: Prepared, target: Target) -> Image:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import Alignment, Tone
-from brushloop.calibrate.validate.inputs import FittedSession
+from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.validate.report import NORMAL, load_report
 from brushloop.calibrate.validate.tuning import align_captures
 from brushloop.model.generator import SHIPPED_GENERATOR
@@ -150,5 +150,5 @@ def test_captures_of_a_described_brush_keep_its_remark() -> None:
     brush = "soft (twin of monday, simulated)"
     header = SimpleNamespace(source=Source.LOOPBACK, brush=brush, brush_radius_mm=None, brush_length_mm=None)
     empty = SimpleNamespace(header=header, recording=SimpleNamespace(captures=lambda: iter(())))
-    found = align_captures([cast(FittedSession, empty)], SHIPPED_GENERATOR)
+    found = align_captures([cast(OpenSession, empty)], SHIPPED_GENERATOR)
     assert found.source == "loopback rig, brush twin of monday, simulated"

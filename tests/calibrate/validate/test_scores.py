@@ -14,7 +14,7 @@ from brushloop.calibrate.pool import threads
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.calibrate.scores import Row, Scores, similarities
 from brushloop.calibrate.stroke.measure import Measured
-from brushloop.calibrate.validate.inputs import open_session
+from brushloop.calibrate.validate.command import open_session
 from brushloop.calibrate.validate.models import ANOTHER, REPEATED
 from brushloop.calibrate.validate.run import Options, ScoreJob, score_job, validate_presses
 from brushloop.model.ccdbsm import Brush
@@ -124,7 +124,7 @@ def test_the_repetition_is_scored_against_its_original_only(
         return [s.model_copy(update={"again_of": s.stroke_id, "stroke_id": f"again-{s.stroke_id}"}) for s in strokes]
 
     monkeypatch.setattr(Recording, "stroke_records", repeating)
-    sessions = [open_session(str(place), tmp_path, None, None) for place in (session, again)]
+    sessions = [open_session(str(place), None, None) for place in (session, again)]
     with threads(1) as pool:
         scores = validate_presses(sessions, Options(held_out=False), pool, tmp_path).scores
     repeated = scores.of(REPEATED)[:, :, 0]

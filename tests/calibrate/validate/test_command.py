@@ -1,4 +1,4 @@
-"""Killed in the middle and run again: finished work is not done again, and the result is that of an unbroken run."""
+"""`brushloop validate` killed and run again, twice at a time, and on a damaged session."""
 
 from __future__ import annotations
 
@@ -16,6 +16,11 @@ from brushloop.__main__ import app
 from brushloop.calibrate import presses
 from brushloop.calibrate.fit import heldout
 from brushloop.calibrate.validate import run
+from brushloop.calibrate.validate.command import open_session
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import Closed, Open
+from brushloop.sessions.journal import Journal
+from brushloop.sessions.recording import Recording
 from tests.command import brushloop
 from tests.waiting import wait_until
 
@@ -72,3 +77,17 @@ def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) 
     with FileLock(tmp_path / "work" / "lock"):
         ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path)])
     assert "another validation is writing there" in str(ran.exception)
+
+
+def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "presses"
+    folder.mkdir()
+    (folder / "presses.mcap").write_bytes((session / "presses.mcap").read_bytes())
+    header = Recording(session).header.model_copy(update={"session_id": "presses"})
+    closed = Closed(t_ns=1, file="presses.mcap", sha256="0" * 64, counts={})
+    journal = Journal(folder / "journal.jsonl", "presses")
+    for event in (Open(t_ns=1, header=header), closed):
+        journal.append(event)
+    journal.close()
+    with pytest.raises(SessionDamaged, match="SHA-256 differs"):
+        open_session(str(folder), None, None)
