@@ -167,7 +167,9 @@ class Reading:
     faults: list[str] = field(default_factory=list[str])
     """All problems, such as `line 5 does not match its CRC`; every command uses this list. Empty without damage."""
     missing: int = 0
-    """Number of lines that are gone from between others, or cannot be read."""
+    """Number of lines that are gone from between others."""
+    unread: int = 0
+    """Number of lines behind the last one that can be read."""
     torn: bytes = b""
     """Last line, cut off by a crash: the next process removes it."""
     next_seq: int = 1
@@ -270,7 +272,7 @@ def _decoded(reading: Reading, data: bytes) -> list[Entry]:
                 reading.torn = tail
             else:
                 reading.faults.append(f"line {number} {error}")
-    reading.missing = len(lines) - bool(reading.torn) - (entries[-1].number if entries else 0)
+    reading.unread = len(lines) - bool(reading.torn) - (entries[-1].number if entries else 0)
     return entries
 
 
@@ -287,7 +289,7 @@ def _in_order(reading: Reading, entries: list[Entry], session: str) -> list[Entr
     by_seq = {entry.seq: entry for entry in own}
     last = max(by_seq, default=0)
     reading.next_seq = last + 1
-    reading.missing += last - len(by_seq)
+    reading.missing = last - len(by_seq)
     return [by_seq[seq] for seq in sorted(by_seq)]
 
 

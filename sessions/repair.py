@@ -121,7 +121,7 @@ class _FolderRepair:
     def run(self) -> Report:
         """Repair journal, configuration, steps and merged file."""
         report, state = self._report, self._state
-        if self._evidence.reading.faults or self._evidence.rebuilt:
+        if self._evidence.reading.faults or self._evidence.reading.torn or self._evidence.rebuilt:
             self._rewrite_journal()
         self._journal = Journal(self._folder / JOURNAL_NAME, self._header.session_id)
         try:
@@ -148,8 +148,7 @@ class _FolderRepair:
         report.did.append(f"wrote {JOURNAL_NAME} again: {what}{kept}")
         report.did += [f"  {JOURNAL_NAME}: {fault}" for fault in evidence.reading.faults]
         if evidence.lost:
-            count = "1 line" if evidence.lost == 1 else f"{evidence.lost} lines"
-            report.lost.append(f"{count} of {JOURNAL_NAME} that no file holds")
+            report.lost.append(f"lines of {JOURNAL_NAME} that no file holds: {evidence.lost}")
 
     def _put_strays_aside(self) -> None:
         sheet = self._state.sheet

@@ -62,7 +62,9 @@ class Evidence:
     @property
     def lost(self) -> int:
         """Number of damaged or missing lines, as far as their numbers show it, for which nothing was rebuilt."""
-        return max(0, self.reading.missing - len(self.rebuilt))
+        last = max((_place(event) for event in self.reading.events), default=0.0)
+        behind = sum(_place(event) > last for event in self.rebuilt)
+        return max(0, self.reading.missing + behind - len(self.rebuilt)) + max(0, self.reading.unread - behind)
 
     def events(self) -> list[Event]:
         """Events of the journal as it must have been, with the rebuilt ones in their places."""
@@ -318,10 +320,8 @@ def _judge_journal(verdict: Verdict, evidence: Evidence) -> None:
     verdict.find(JOURNAL_NAME, *reading.faults)
     if evidence.lost:
         verdict.notes.append(f"{JOURNAL_NAME}: {evidence.lost} of its lines cannot be rebuilt")
-    elif reading.faults:
-        verdict.notes.append(f"{JOURNAL_NAME}: all of it can be rebuilt from the files")
     if reading.torn:
-        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process removes it")
+        verdict.notes.append(f"{JOURNAL_NAME}: its last line was cut off; the next process or a repair removes it")
     for event in evidence.rebuilt:
         match event:
             case Begin(file=file):
