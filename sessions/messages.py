@@ -79,10 +79,10 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
                 what = f"image of {image.width} x {image.height} pixels exceeds {MAX_IMAGE_PIXELS}"
                 raise SessionDamaged(where, what)
             image.draft("L", image.size)
-            upright = ImageOps.exif_transpose(image)
-            if upright.mode.startswith("I"):
-                return (np.asarray(upright) >> 8).astype(np.uint8)  # 16 bits
-            return np.asarray(upright.convert("L"))
+            ImageOps.exif_transpose(image, in_place=True)
+            if image.mode.startswith("I"):
+                return (np.asarray(image) >> 8).astype(np.uint8)  # 16 bits
+            return np.asarray(image if image.mode == "L" else image.convert("L"))
     except (Warning, Image.DecompressionBombError) as error:
         raise SessionDamaged(where, f"image too large: {in_one_line(error)}") from None
     except (OSError, SyntaxError, ValueError, struct.error):
