@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 
 import brushloop.calibrate.cli
 import brushloop.calibrate.cli_camera
-import brushloop.calibrate.fit.cli
 import brushloop.calibrate.validate.cli
 import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
@@ -109,7 +108,7 @@ app.add_typer(brushloop.collect.cli_rig.app, name="rig")
 app.add_typer(brushloop.calibrate.cli.app, name="calibrate")
 app.add_typer(brushloop.calibrate.cli_camera.app, name="camera")
 app.add_typer(brushloop.calibrate.validate.cli.app, name="validate")
-app.command("fit")(brushloop.calibrate.fit.cli.fit)
+app.command("fit")(brushloop.calibrate.cli.fit)
 app.command("twin")(brushloop.twin.cli.twin)
 app.command("invert")(brushloop.calibrate.cli.invert)
 loop = typer.Typer(

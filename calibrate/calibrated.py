@@ -7,7 +7,7 @@ from pathlib import Path
 
 from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.pages.calibration import write_calibration_page
+from brushloop.calibrate.pages.camera import write_calibration_page
 from brushloop.calibrate.report import framed
 from brushloop.calibrate.session import calibrate_session as calibrate
 from brushloop.sessions.recording import Recording

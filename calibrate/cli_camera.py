@@ -61,7 +61,7 @@ def intrinsics(
     from brushloop.calibrate.board.spec import describe
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
-    from brushloop.calibrate.pages.lens import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
+    from brushloop.calibrate.pages.camera import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
     from brushloop.sessions.terminal import counted, shown
 
     made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)

@@ -20,7 +20,7 @@ from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
 from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts
 from brushloop.calibrate.loop.report import write_loop
-from brushloop.calibrate.pages.lens import thumbnail, write_lens_page
+from brushloop.calibrate.pages.camera import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.stroke.measure import Measured
 from brushloop.calibrate.validate.page import pages_beside
