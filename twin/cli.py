@@ -47,8 +47,8 @@ def twin(
         raise CalibrationError(str(target), "exists: give --out FILE or --replace")
     with shown() as progress:
         captures = read_presses(session, Field(), calibration, progress)
-        used = captures.calibration.digest if captures.calibration else ""
-        notes = Notes(target, captures.recording_sha256, used, f"{MM_PER_PX:g} mm/px", made_by())
+        opened = captures.session
+        notes = Notes(target, opened.sha256, opened.calibration_digest, f"{MM_PER_PX:g} mm/px", made_by())
         brush = captures.radius_mm, captures.length_mm
         with workers() as pool:
             try:
@@ -56,7 +56,7 @@ def twin(
             except ValueError as error:
                 raise CalibrationError(str(recording.path), str(error)) from None
     noise = noise_gray(recording)
-    write_whole(target, twin_toml(fitted, captures.header.session_id, noise))
+    write_whole(target, twin_toml(fitted, captures.session.header.session_id, noise))
     notes.path.unlink(missing_ok=True)
     say(*_tables(captures, fitted, noise), f"Twin: {target}", f"next: brushloop sim --brush {quote(str(target))}")
 
@@ -66,7 +66,8 @@ def _tables(captures: Captures, fitted: Twin, noise: float | None) -> Iterator[o
 
     from brushloop.calibrate.report import source_note
 
-    yield f"{source_note(captures.header.source, captures.header.brush)}; twin of {len(captures.strokes)} presses"
+    header = captures.session.header
+    yield f"{source_note(header.source, header.brush)}; twin of {len(captures.strokes)} presses"
     for name, why in captures.refused:
         yield f"left out: {name}: {why}"
     out = Table("constant", "unit", "default", "twin", "95 %", title="simulated brush")

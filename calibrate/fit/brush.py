@@ -121,7 +121,7 @@ class Fitted:
         """What the command prints: lines and tables."""
         from rich.table import Table
 
-        header, strokes = self.captures.header, self.captures.strokes
+        header, strokes = self.captures.session.header, self.captures.strokes
         label = source_label(header.source, [header.brush])
         yield f"{source_note(header.source, header.brush)}; {len(strokes)} presses fitted"
         for name, why in self.captures.refused:
@@ -186,12 +186,12 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
     grid, strokes = captures.grid, captures.strokes
     brush = captures.radius_mm, captures.length_mm
     press = fit_parameters(strokes, grid, *brush)
-    held_out, errors = leave_cell_out(strokes, grid, *brush, progress=progress, store=captures.store)
+    held_out, errors = leave_cell_out(strokes, grid, *brush, progress=progress, store=captures.session.store)
     fit = BrushFit(
-        session_id=captures.header.session_id,
-        source=captures.header.source,
-        recording_sha256=captures.recording_sha256,
-        calibration=captures.calibration.digest if captures.calibration else "",
+        session_id=captures.session.header.session_id,
+        source=captures.session.header.source,
+        recording_sha256=captures.session.sha256,
+        calibration=captures.session.calibration_digest,
         software=made_by(),
         radius_mm=captures.radius_mm,
         length_mm=captures.length_mm,

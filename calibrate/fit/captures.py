@@ -9,22 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate import presses
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import SIZE_PX, Field, brush_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.presses import Refused, cut, uncommanded
-from brushloop.calibrate.session import open_session
+from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import student_95
-from brushloop.calibrate.store import Store
 from brushloop.model.strokes import fit_plane
-from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
@@ -73,20 +70,14 @@ def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
 class Captures:
     """The presses that a fit uses, and where they come from."""
 
-    header: Header
-    recording_sha256: str
-    calibration: Calibration | None
+    session: OpenSession
     radius_mm: float
     length_mm: float
-    rows: slice
-    """Rows of the field that ink reaches, and 2 mm more; the grid and the strokes are cut to them."""
     grid: Grid
+    """Cut to the rows that ink reaches, and 2 mm more, as the strokes are."""
     strokes: list[Pressed]
-    stroke_ids: list[str]
-    refused: list[tuple[str, str]]
-    """(stroke, reason) of captures that cannot be used or are cut by the edge of their photograph."""
-    store: Store
-    """Finished work of the session."""
+    refused: list[Refused]
+    """Captures that cannot be used or are cut by the edge of their photograph."""
 
 
 def grid_of(view: Field) -> Grid:
@@ -101,22 +92,18 @@ def read_presses(
 ) -> Captures:
     """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
     opened = open_session(session, calibration_path, "press")
-    pressed: list[Pressed] = []
-    names: list[str] = []
+    strokes: list[Pressed] = []
     refused: list[Refused] = []
     for press in presses.read_presses(opened, view, refused, uncommanded, cut, progress=progress):
         depth_mm, tilt_deg, _ = astuple(press.condition)
-        pressed.append(Pressed(depth_mm, tilt_deg, np.asarray(press.coverage, np.float64)))
-        names.append(press.stroke.stroke_id)
-    if not pressed:
+        strokes.append(Pressed(depth_mm, tilt_deg, np.asarray(press.coverage, np.float64)))
+    if not strokes:
         raise CalibrationError(str(opened.recording.path), "holds no press that can be used for a fit")
-    brush = brush_of(opened.header)
-    radius, length = float(brush.radius_mm), float(brush.length_mm)
-    grid, rows = grid_of(view), inked_rows([one.ink for one in pressed], view.mm_per_px)
+    brush, grid = brush_of(opened.header), grid_of(view)
+    rows = inked_rows([stroke.ink for stroke in strokes], view.mm_per_px)
     grid = Grid(grid.x_mm, grid.y_mm[rows])
-    pressed = [Pressed(one.depth_mm, one.tilt_deg, one.ink[rows]) for one in pressed]
-    about = opened.header, opened.sha256, opened.calibration, radius, length
-    return Captures(*about, rows, grid, pressed, names, refused, opened.store)
+    strokes = [replace(stroke, ink=stroke.ink[rows]) for stroke in strokes]
+    return Captures(opened, float(brush.radius_mm), float(brush.length_mm), grid, strokes, refused)
 
 
 def inked_rows(images: Sequence[NDArray[np.floating]], px_mm: float) -> slice:

@@ -31,6 +31,7 @@ from brushloop.calibrate.report import (
     ink_uri,
     plot,
     plot_uri,
+    recording_facts,
     source_point,
     write_page,
 )
@@ -51,7 +52,8 @@ def write_fit_page(
     captures: Captures, press: FittedPress, sizes: Sequence[Size], held_out: Sequence[HeldOut], path: Path
 ) -> Path:
     """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
-    header = captures.header
+    session = captures.session
+    header = session.header
     frame = about(header)
     cells = by_cell(captures.strokes)
     published = FittedPress(captures.radius_mm, captures.length_mm)
@@ -71,7 +73,12 @@ def write_fit_page(
         middle="{:g} mm, {:g}°".format(*middle(captures.strokes)),
         held_out=held_out,
         refused=captures.refused,
-        facts=[(name, text) for name, text in _facts(captures, path) if text],
+        facts=[
+            *recording_facts(header, session.recording.path.name, session.sha256, session.calibration),
+            ("images", f"{captures.grid.px_mm:g} mm per pixel"),
+            ("fitted with", made_by()),
+            ("artefact", path.name),
+        ],
     )
 
 
@@ -168,7 +175,7 @@ def _fitted_sizes(press: FittedPress, depth_mm: float, tilt_deg: float, x_mm: Fl
 
 
 def _verdict(captures: Captures, held_out: Sequence[HeldOut]) -> Iterator[str]:
-    brush = captures.header.brush or "a brush without a name"
+    brush = captures.session.header.brush or "a brush without a name"
     presses, cells = len(captures.strokes), len(by_cell(captures.strokes))
     yield f"The stroke model was fitted to {presses} presses at {cells} combinations of H and α: {brush}."
     scores = {row.model: row.csim for row in held_out}
@@ -197,16 +204,3 @@ def _trust(captures: Captures, held_out: Sequence[HeldOut]) -> Iterator[Point]:
     else:
         yield Point(True, "Every press was used.")
     yield Point(None, "The pictures above show presses that were fitted; judge the fit by the held-out scores.")
-
-
-def _facts(captures: Captures, path: Path) -> Iterator[tuple[str, str]]:
-    header = captures.header
-    yield "session", header.session_id
-    yield "source", str(header.source)
-    yield "recording", f"sha256 {captures.recording_sha256}"
-    yield "brush", f"{header.brush or 'not named'}, R {captures.radius_mm:g} mm, L {captures.length_mm:g} mm"
-    yield "ink, paper", ", ".join(part for part in (header.ink, header.paper) if part)
-    yield "calibration", captures.calibration.named if captures.calibration else "the import's own scale"
-    yield "images", f"{captures.grid.px_mm:g} mm per pixel"
-    yield "fitted with", made_by()
-    yield "artefact", path.name
