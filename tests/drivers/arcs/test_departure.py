@@ -133,12 +133,6 @@ async def test_a_return_code_is_no_proof_that_the_tool_was_set(sleeping_arm: Aub
     assert cabinet.cabinet.power.mode == "PowerOff"
 
 
-async def test_ignored_is_fine_where_it_is_set_already(sleeping_arm: AuboArcs, cabinet: ArcsServer):
-    cabinet.cabinet.tcp_offset = [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
-    cabinet._methods["rob1.RobotConfig.setTcpOffset"] = lambda _: 13
-    await sleeping_arm.enable()
-
-
 @pytest.mark.parametrize(
     ("wanted_deg", "found_deg"),
     [((180.0, 0.0, 0.0), (-180.0, 0.0, 0.0)), ((180.0, 0.0, 30.0), (0.0, 180.0, -150.0))],

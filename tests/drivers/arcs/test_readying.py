@@ -148,13 +148,6 @@ async def test_without_a_message_it_is_just_a_failed_motion(make_arm: MakeArm, c
     assert type(caught.value) is MotionFailed
 
 
-async def test_a_controller_without_messages_still_fails_plainly(make_arm: MakeArm, cabinet: ArcsServer):
-    del cabinet._methods["rob1.Trace.peek"]
-    arm = await enabled(make_arm)
-    with pytest.raises(MotionFailed, match="from the target"):
-        await arm.move(BEYOND, **QUICK)
-
-
 async def test_the_watchdog_is_armed_while_enabled_and_fed(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
     arm = make_arm(watchdog_s=0.3)
     await arm.connect()
@@ -179,11 +172,6 @@ async def test_a_host_that_dies_leaves_a_protective_stop_and_no_motion(make_arm:
     await asyncio.sleep(0.5)
     assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
     assert cabinet.cabinet.world.motion.steady(cabinet.cabinet.now_s())
-
-
-async def test_no_watchdog_where_none_is_wanted(make_arm: MakeArm, cabinet: ArcsServer):
-    await enabled(make_arm, watchdog_s=None)
-    assert cabinet.cabinet.watchdogs == {}
 
 
 async def test_a_controller_that_knows_no_watchdog_is_reported_and_used(

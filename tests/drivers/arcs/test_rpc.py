@@ -106,18 +106,6 @@ async def test_a_reply_that_makes_no_sense_is_a_violation_and_the_next_call_work
     assert await client.call("second") == 2
 
 
-async def test_a_reply_may_arrive_byte_by_byte(controller: Controller, client: RpcConnection):
-    async def dribble(ident: str, writer: asyncio.StreamWriter) -> None:
-        whole = reply(ident, result="ok")
-        for at in [slice(0, 8), *(slice(i, i + 1) for i in range(8, len(whole)))]:
-            writer.write(whole[at])
-            await writer.drain()
-            await asyncio.sleep(0.0002)
-
-    controller.script = [("getRobotNames", None, dribble)]
-    assert await client.call("getRobotNames") == "ok"
-
-
 async def test_the_first_of_two_replies_in_one_segment_counts(controller: Controller, client: RpcConnection):
     controller.script = [("first", None, sends(lambda i: reply(i, result=1) + reply(i, result=99)))]
     assert await client.call("first") == 1
@@ -167,10 +155,3 @@ async def test_closing_wakes_the_caller_that_still_waits(controller: Controller,
     await client.close()
     with pytest.raises(NotConnected, match="closed while waiting"):
         await waiting
-
-
-async def test_a_refused_port_is_a_lost_connection(unused_tcp_port: int):
-    connection = RpcConnection("127.0.0.1", unused_tcp_port, timeout_s=TIMEOUT_S)
-    with pytest.raises(ConnectionLost, match=str(unused_tcp_port)):
-        await connection.open()
-    await connection.close()

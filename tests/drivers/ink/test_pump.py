@@ -21,7 +21,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import InkRefused
-from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig
+from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig, exception, seal, write_register
 from brushloop.drivers.sim.instruments.ink import PtyLine, PumpFirmware
 from tests.drivers.failing import fail_requests
 
@@ -265,8 +265,26 @@ def test_a_pump_that_cannot_run_like_that_is_refused(ml_per_revolution: float, r
         table("port", ml_per_revolution, rpm=rpm)
 
 
-async def test_other_line_settings_work_too(firmware: PumpFirmware, line: PtyLine):
-    firmware.unit = 17
-    pump = ModbusPump(table(line.path, unit=17, baud=19200), HostClock())
-    assert (await pump.connect()).model == "Modbus RTU pump, unit 17"
-    await pump.close()
+@pytest.mark.parametrize(
+    ("request_", "code"),
+    [
+        (seal(bytes.fromhex("01 03 00 01 00 01")), 1),
+        (write_register(1, 2, 1), 2),
+        (write_register(1, 4, 3), 3),
+        (write_register(1, 1, 60001), 3),
+    ],
+)
+def test_the_simulated_pump_answers_with_exceptions(request_: bytes, code: int):
+    assert PumpFirmware().answer(request_) == exception(1, request_[1], code)
+
+
+def test_the_simulated_pump_pumps_by_the_clock():
+    now_s = 0.0
+    firmware = PumpFirmware(ml_per_revolution=0.5, now_s=lambda: now_s)
+    firmware.answer(write_register(1, 1, 6000))
+    firmware.answer(write_register(1, 4, 1))
+    now_s = 10.0
+    assert firmware.pumped_ml == pytest.approx(5.0)
+    firmware.answer(write_register(1, 4, 0))
+    now_s = 20.0
+    assert firmware.pumped_ml == pytest.approx(5.0)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncIterator
-from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -20,7 +18,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import InkRefused
-from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal, unseal
+from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
 from brushloop.drivers.sim.instruments.ink import PtyLine, StationFirmware
 from tests.drivers.failing import fail_requests
 
@@ -86,14 +84,6 @@ async def test_a_session_reads_like_the_documented_one(expected_protocol):
         await station.close()
 
 
-def test_the_documented_transcript_has_the_checksums_of_its_lines():
-    text = (Path(__file__).parents[3] / "docs" / "ink-station.md").read_text()
-    lines = [line[6:] for line in text.splitlines() if line.startswith(("    > ", "    < "))]
-    assert len(lines) >= 10
-    for line in lines:
-        unseal(line.encode())
-
-
 async def test_a_lost_reply_is_asked_for_again_with_the_same_line(expected_protocol):
     dose = b"001 dose 0.500*7A5F\n"
     with expected_protocol([HELLO, (dose, b""), (dose, b"001 ok 0.500*41C5\n")]) as path:
@@ -156,13 +146,6 @@ async def test_another_device_is_refused_and_the_port_closed(expected_protocol, 
             await station.connect()
         with pytest.raises(NotConnected):
             await station.level()
-
-
-async def test_the_loopback_station_says_that_it_is_one(line: PtyLine):
-    station = station_at(line.path)
-    assert isinstance(station, Ink)
-    assert (await station.connect()).simulated
-    await station.close()
 
 
 @pytest.mark.parametrize(
@@ -271,11 +254,6 @@ async def test_a_cancelled_request_does_not_disturb_the_next(line: PtyLine, stat
         async with asyncio.timeout(0.03):
             await station.light(1.0)
     assert await station.level() == 0.5
-
-
-async def test_requests_at_the_same_time_take_turns(firmware: StationFirmware, station: InkStation):
-    await asyncio.gather(*(station.dose(0.25) for _ in range(8)), *(station.level() for _ in range(8)))
-    assert firmware.well.ml == 12.0
 
 
 async def test_a_thousand_and_one_requests_wrap_the_number(station: InkStation):

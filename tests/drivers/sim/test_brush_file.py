@@ -14,10 +14,9 @@ import brushloop.__main__
 from bench.brushes import FROZEN
 from brushloop.collect.rig.config_quality import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
-from brushloop.drivers.sim.brush.spec import LOOPBACK, PAPER, SimFileError, load_brush
+from brushloop.drivers.sim.brush.spec import PAPER, SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
-from brushloop.drivers.sim.serve import LabRefused
 
 PRESSED = (
     (3986.908, 3129.639, 3100.391),
@@ -61,12 +60,6 @@ def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Pat
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["", "two\\nlines", 'a \\"quote\\"', "x" * 121])
-def test_a_name_that_would_not_fit_in_a_rig_toml_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(SimFileError, match="name: "):
-        load_brush(written(tmp_path, f'name = "{name}"\n[brush]\n'))
-
-
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SimFileError, match="no such file"):
         load_brush(tmp_path / "brush.toml")
@@ -106,11 +99,6 @@ def test_settings_of_quality_out_of_range_are_refused(tmp_path: Path) -> None:
         load_brush(written(tmp_path, text))
 
 
-def test_the_loopback_brush_is_an_individual_of_the_rig_s_seed() -> None:
-    found = load_brush(Path(LOOPBACK), 7)
-    assert found.spec == BrushSpec(seed=7)
-
-
 def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:
     path = written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nradius_mm = 5.0\nlength_mm = 45.0\n')
     rig = tmp_path / "rig.toml"
@@ -118,11 +106,6 @@ def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -
     assert CliRunner().invoke(brushloop.__main__.app, words).exit_code == 0
     brush = tomllib.loads(rig.read_text())["brush"]
     assert (brush["name"], brush["radius_mm"], brush["length_mm"]) == ("our goat-hair brush", 5.0, 45.0)
-
-
-def test_a_lab_that_nobody_has_measured_has_a_brush_of_its_own(tmp_path: Path) -> None:
-    ran = CliRunner().invoke(brushloop.__main__.app, ["sim", "--unknown", "1", "--brush", str(tmp_path / "brush.toml")])
-    assert isinstance(ran.exception, LabRefused)
 
 
 def test_the_frozen_brushes_and_the_papers_press_and_draw_what_they_always_did() -> None:

@@ -1,22 +1,31 @@
+"""The loopback rig as a whole: its servers, and that none of them is reached from another machine."""
+
 from __future__ import annotations
 
 import asyncio
-import json
+import itertools
+import time
 import tomllib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.arcs.wire import FrameDecoder, encode
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Stamp
+from brushloop.drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim import rig as rig_module
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.control import ControlServer
+from brushloop.drivers.sim.instruments.force_board import FRAME_S, ForceBoard, SocketcandServer
+from brushloop.drivers.sim.lab.lab import OlderSoftware
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from brushloop.drivers.sim.serve import serve
+from brushloop.drivers.sim.server import LoopbackServer, NotLoopback
+from brushloop.drivers.sim.world import World
 
 
 @pytest.fixture
@@ -28,17 +37,6 @@ def config(small_view: View) -> SimConfig:
 async def rig(config: SimConfig) -> AsyncIterator[LoopbackRig]:
     async with LoopbackRig(config) as it:
         yield it
-
-
-async def ask(cabinet: ArcsServer, payload: bytes) -> bytes:
-    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
-    writer.write(encode(payload))
-    decoder = FrameDecoder()
-    while not (replies := decoder.feed(await reader.read(4096))):
-        pass
-    writer.close()
-    await writer.wait_closed()
-    return replies[0]
 
 
 async def test_both_servers_listen_on_loopback_and_nowhere_else(rig: LoopbackRig):
@@ -82,35 +80,6 @@ async def test_a_rig_with_a_client_is_not_idle(rig: LoopbackRig):
         await idle
 
 
-@pytest.mark.parametrize(
-    ("payload", "code"),
-    [
-        (b"hello", -32700),
-        (b'{"id":"a","method":"Nonsense"}', -32601),
-        (b'{"id":"a","method":"rob1.MotionControl.stopLine"}', -32602),
-        (b'{"id":"a","method":"rob1.MotionControl.moveLine","params":{"pose":[1],"a":1,"v":1}}', -32602),
-        (b"[]", -32602),
-    ],
-)
-async def test_the_controller_answers_nonsense_with_the_codes_of_json_rpc(
-    cabinet: ArcsServer, payload: bytes, code: int
-):
-    assert json.loads(await ask(cabinet, payload))["error"]["code"] == code
-
-
-async def test_the_controller_takes_any_login_and_echoes_ids(cabinet: ArcsServer):
-    assert await ask(cabinet, b"__login__\nanyone\n00\n0.24.0\n") == b"SUCCEED"
-    assert json.loads(await ask(cabinet, b'{"id":"abc","method":"getRobotNames"}'))["id"] == "abc"
-
-
-async def test_the_controller_hangs_up_on_a_client_that_does_not_speak_sof(cabinet: ArcsServer):
-    reader, writer = await asyncio.open_connection(HOST, cabinet.port)
-    writer.write(b"GET / HTTP/1.0\r\n\r\n")
-    assert await reader.read() == b""
-    writer.close()
-    await writer.wait_closed()
-
-
 async def test_the_motion_queue_belongs_to_the_event_loops_thread(rig: LoopbackRig, monkeypatch: pytest.MonkeyPatch):
     import threading
 
@@ -141,3 +110,61 @@ async def test_a_late_camera_notices_that_its_client_has_gone():
         async with asyncio.timeout(10.0):
             while rig.camera.clients:
                 await asyncio.sleep(0.02)
+
+
+ELSEWHERE = ["0.0.0.0", "::", "", "192.168.1.10", "10.0.0.1", "8.8.8.8", "example.org", "localhost", "fe80::1"]
+
+
+def without_a_network(kind: type[LoopbackServer]) -> LoopbackServer:
+    server = kind.__new__(kind)
+    LoopbackServer.__init__(server)
+    return server
+
+
+def test_these_are_all_the_servers_there_are():
+    def below(kind: type[LoopbackServer]) -> set[type[LoopbackServer]]:
+        return {kind, *(b for k in kind.__subclasses__() for b in below(k))}
+
+    ours = {k for k in below(LoopbackServer) if k.__module__.startswith("brushloop.drivers.")} - {LoopbackServer}
+    assert ours == {ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer, OlderSoftware}
+    assert all(k.start is LoopbackServer.start for k in ours), "a server that listens in its own way must refuse too"
+
+
+@pytest.mark.parametrize("kind", [ArcsServer, RtdeServer, MjpegServer, ControlServer, SocketcandServer])
+@pytest.mark.parametrize("host", ELSEWHERE)
+async def test_a_server_refuses_any_address_that_is_not_loopback(kind: type[LoopbackServer], host: str):
+    server = without_a_network(kind)
+    with pytest.raises(NotLoopback) as caught:
+        await server.start(host, 0)
+    assert caught.value.host == host
+    assert caught.value.exit_code == 2
+    assert server._server is None
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"])
+async def test_a_loopback_address_is_served(host: str):
+    server = ArcsServer(World(SimConfig()))
+    await server.start(host, 0)
+    _, writer = await asyncio.open_connection(host, server.port)
+    writer.close()
+    await writer.wait_closed()
+    await server.stop()
+
+
+async def test_the_frames_of_a_round_are_one_burst_on_a_busy_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    late_s = itertools.count(1000.0, 0.05)
+    monkeypatch.setattr(time, "time", lambda: next(late_s))
+    server = SocketcandServer(ForceBoard(lambda _: (0.0,) * 6), lambda: 0.0, rate_hz=100.0)
+    await server.start("127.0.0.1", 0)
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    command = f"< send {COMMAND_ID:03X} {len(START):x} {' '.join(f'{byte:02X}' for byte in START)} >"
+    writer.write(f"< open {LOOPBACK_CHANNEL} >< rawmode >{command}".encode())
+    times_s: list[float] = []
+    while len(times_s) < 3:
+        words = (await reader.readuntil(b">")).decode().split()
+        if words[1] == "frame":
+            times_s.append(float(words[3]))
+    writer.close()
+    await writer.wait_closed()
+    await server.stop()
+    assert [b - a for a, b in itertools.pairwise(times_s)] == pytest.approx([FRAME_S, FRAME_S], abs=1e-6)

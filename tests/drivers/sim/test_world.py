@@ -1,17 +1,20 @@
-"""What the world keeps of a path: presses, ink, marks; whoever looks on changes nothing."""
+"""Presses, drags and ink of the simulated world, on a level and on a leaning sheet."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.brush.drag import INK_PER_MM
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.contact import bent_toward
 from brushloop.drivers.sim.brush.footprint import Flaw
+from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
 from brushloop.drivers.sim.config import SimConfig, Table
 from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World
 
@@ -79,23 +82,6 @@ def test_a_press_takes_ink_and_a_dip_fills_the_brush(pressed: World):
     assert run([*SCRIPT, *dip()]).ink_load == 1.0
 
 
-def test_a_dry_brush_leaves_a_press_but_less_ink(pressed: World):
-    dry = run(SCRIPT[3:6])
-    assert dry.presses[0].ink_load == 0.0
-    wet = run(SCRIPT[:6])
-    assert dry.paper.density.sum() < wet.paper.density.sum()
-
-
-def test_a_path_above_the_paper_leaves_nothing():
-    world = run([on_paper(x, 40.0, 0.0) for x in (30.0, 60.0)])
-    assert world.presses == []
-    assert not world.paper.density.any()
-
-
-def test_a_press_beside_the_sheet_leaves_nothing():
-    assert run(press(-20.0, 40.0, 10.0)).presses == []
-
-
 @pytest.mark.parametrize(("step_s", "rate"), [(0.003, 1.0), (0.05, 50.0), (0.71, 1000.0)])
 def test_the_result_depends_neither_on_who_looks_nor_on_the_rate(pressed: World, step_s: float, rate: float):
     watched = run(SCRIPT, np.arange(0.0, 12.0, step_s).tolist(), rate)
@@ -119,15 +105,6 @@ def test_a_brush_that_was_stopped_on_the_paper_leaves_its_mark_when_it_lifts():
     assert 8.0 < mark.depth_mm < 12.0
 
 
-def test_equal_seeds_give_equal_sheets_and_another_seed_another(pressed: World):
-    assert np.array_equal(run(SCRIPT).paper.density, pressed.paper.density)
-    other = World(SimConfig(seed=2))
-    for pose in SCRIPT:
-        other.motion.add(pose, 200.0, 800.0, 0.0)
-    other.motion.advance(1e4)
-    assert not np.array_equal(other.paper.density, pressed.paper.density)
-
-
 def test_a_contact_that_travels_is_one_drag_and_no_press():
     world = run(STROKES)
     assert len(world.presses) == 2
@@ -141,41 +118,12 @@ def test_a_contact_that_travels_is_one_drag_and_no_press():
     assert (world.paper.density[rows, 420:560] > 0.3).mean() > 0.9
 
 
-@pytest.mark.parametrize(("step_s", "rate"), [(0.003, 1.0), (0.05, 50.0), (0.71, 1000.0)])
-def test_a_drag_depends_neither_on_who_looks_nor_on_the_rate(step_s: float, rate: float):
-    alone = run(STROKES)
-    watched = run(STROKES, np.arange(0.0, 12.0, step_s).tolist(), rate)
-    assert (watched.drags, watched.presses) == (alone.drags, alone.presses)
-    assert np.array_equal(watched.paper.density, alone.paper.density)
-
-
-def test_a_drag_takes_ink_for_landing_and_for_each_mm():
-    world = run([*dip(), *drag(*L_CORNER)])
-    assert world.drags[0].ink_load == 1.0
-    assert world.ink_load == pytest.approx(1.0 - INK_PER_PRESS - INK_PER_MM * 50.0)
-
-
-@pytest.mark.parametrize(("sideways_mm", "drags"), [(0.4, 0), (0.6, 1)])
-def test_a_hair_of_travel_is_still_a_press(sideways_mm: float, drags: int):
-    world = run([*dip(), *drag((40.0, 60.0), (40.0 + sideways_mm, 60.0))])
-    assert (len(world.presses), len(world.drags)) == (1 - drags, drags)
-
-
 def test_withdrawing_a_tilted_brush_along_its_own_axis_is_no_drag():
     tilt = math.radians(10.0)
     down = on_paper(40.0, 60.0, -15.0, tilt_deg=10.0)
     out = on_paper(40.0 + 60.0 * math.sin(tilt), 60.0, -15.0 + 60.0 * math.cos(tilt), tilt_deg=10.0)
     world = run([*dip(), on_paper(40.0, 60.0, 40.0, tilt_deg=10.0), down, out])
     assert (len(world.presses), world.drags) == (1, [])
-
-
-def test_a_drag_that_leaves_the_sheet_is_cut_and_one_beside_it_leaves_nothing():
-    world = run([*dip(), *drag((200.0, 60.0), (280.0, 60.0))])
-    assert len(world.drags) == 1
-    assert world.paper.density[:, -1].any()
-    beside = run([*dip(), *drag((270.0, 80.0), (290.0, 80.0))])
-    assert beside.drags == []
-    assert not beside.paper.density.any()
 
 
 def test_a_drag_stopped_on_the_way_leaves_its_mark_when_it_lifts():
@@ -225,3 +173,116 @@ def test_pressing_on_without_a_dip_goes_wrong_by_itself_and_by_the_seed():
     assert Flaw.FAINT in first + second
     assert first[-1] == second[-1] == Flaw.BLANK
     assert named(1) == first != second
+
+
+LEANING = replace(Table(), slope_deg=(0.6, -0.8))
+
+
+def world_after(table: Table, *poses: Pose) -> World:
+    world = World(SimConfig(table=table))
+    for pose in poses:
+        world.motion.add(pose, 200.0, 800.0, now_s=0.0)
+    world.motion.advance(1e4)
+    return world
+
+
+def over(table: Table, x_mm: float, y_mm: float, z_mm: float) -> Pose:
+    yaw = math.radians(table.yaw_deg)
+    x0, y0 = table.origin_mm
+    base_x, base_y = x0 + math.cos(yaw) * x_mm - math.sin(yaw) * y_mm, y0 + math.sin(yaw) * x_mm + math.cos(yaw) * y_mm
+    return brush_pose(base_x, base_y, z_mm, heading_deg=table.yaw_deg)
+
+
+def test_the_far_edge_rises_about_x_and_the_right_edge_falls_about_y() -> None:
+    table = Table(slope_deg=(1.0, 0.0))
+    assert table.surface_z_mm(0.0, 100.0) == pytest.approx(120.0 + 100.0 * math.tan(math.radians(1.0)))
+    assert table.surface_z_mm(100.0, 0.0) == 120.0
+    assert Table(slope_deg=(0.0, 1.0)).surface_z_mm(100.0, 0.0) == pytest.approx(118.2545, abs=1e-4)
+    assert np.linalg.norm(LEANING.normal) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("beyond_mm", [-0.01, 0.01])
+def test_the_brush_touches_exactly_at_the_plane(beyond_mm: float) -> None:
+    z_mm = LEANING.surface_z_mm(200.0, 40.0) - beyond_mm
+    up = over(LEANING, 200.0, 40.0, 160.0)
+    world = world_after(LEANING, up, over(LEANING, 200.0, 40.0, z_mm), up)
+    assert len(world.presses) == (1 if beyond_mm > 0.0 else 0)
+
+
+def test_depth_place_and_tilt_of_a_press_are_the_sheets() -> None:
+    up = over(LEANING, 120.0, 80.0, 180.0)
+    world = world_after(LEANING, up, over(LEANING, 120.0, 80.0, LEANING.surface_z_mm(120.0, 80.0) - 10.0), up)
+    [press] = world.presses
+    nx, ny, nz = LEANING.normal
+    assert press.depth_mm == pytest.approx(10.0 * nz)
+    assert (press.x_mm, press.y_mm) == pytest.approx((120.0 + 10.0 * nz * nx, 80.0 + 10.0 * nz * ny))
+    assert press.tilt_deg == pytest.approx(math.degrees(math.acos(nz)), abs=1e-6)  # the brush was vertical
+
+
+def test_the_push_is_along_the_normal() -> None:
+    tip = over(LEANING, 120.0, 80.0, LEANING.surface_z_mm(120.0, 80.0) - 8.0)
+    world = world_after(LEANING, tip)
+    world.clock._start -= 1e5  # pyright: ignore[reportPrivateUsage]
+    pressed = np.array(world.wrench()[:3])
+    in_the_air = np.array([0.0, 0.0, SimConfig().hanging_kg * 9.81])
+    push = pressed - in_the_air
+    nx, ny, nz = LEANING.normal
+    assert np.linalg.norm(push) > 0.05
+    # seen by a tool that points straight down, its x along the paper's
+    assert push / np.linalg.norm(push) == pytest.approx([nx, -ny, -nz], abs=1e-9)
+
+
+def test_a_lean_across_the_set_turns_the_bend_by_45_deg_where_both_carry_the_tip_equally_far() -> None:
+    set_deg = Brush(BrushSpec(set_deg=9.0)).set_lean_deg
+    assert set_deg == pytest.approx(9.0 / 6.0, rel=0.06), "cut into links, a little more"
+    upright = brush_pose(0.0, 0.0, 0.0)
+    wrist_deg = bent_toward(upright, 0.0, 90.0, set_deg)
+    assert bent_toward(upright, set_deg, wrist_deg + 90.0, set_deg) == pytest.approx(wrist_deg + 45.0)
+    assert bent_toward(upright, 20.0 * set_deg, wrist_deg + 90.0, set_deg) == pytest.approx(wrist_deg + 90.0, abs=3.0)
+
+
+REACH_MM = (6.0, 2.0)
+"""Where the middle of the test mark lies in the footprint's own frame."""
+
+
+def mark(px_per_mm: float = 10.0) -> Footprint:
+    """A small disc of ink off the zero-touch point, so that a wrong turn or flip moves it."""
+    height, width = round(20 * px_per_mm), round(30 * px_per_mm)
+    origin = (10.0 * px_per_mm, 12.0 * px_per_mm)
+    x = (np.arange(width) + 0.5 - origin[0]) / px_per_mm
+    y = (origin[1] - np.arange(height) - 0.5) / px_per_mm
+    inside = (x[None, :] - REACH_MM[0]) ** 2 + (y[:, None] - REACH_MM[1]) ** 2 <= 2.0**2
+    return Footprint(inside.astype(np.float32), px_per_mm, origin)
+
+
+def centroid_mm(paper: Paper) -> tuple[float, float]:
+    """In the paper frame, y up."""
+    rows, columns = np.indices(paper.density.shape)
+    weight = paper.density / paper.density.sum()
+    column, row = float((weight * columns).sum()), float((weight * rows).sum())
+    return (column + 0.5) / PX_PER_MM, paper.size_y_mm - (row + 0.5) / PX_PER_MM
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 33.0, 90.0, 180.0, -90.0])
+@pytest.mark.parametrize("px_per_mm", [10.0, 16.0, 5.0])
+def test_a_footprint_lands_where_the_brush_touched_turned_to_its_heading(heading_deg: float, px_per_mm: float):
+    paper = Paper(80.0, 60.0)
+    paper.lay(mark(px_per_mm), 35.0, 25.0, heading_deg)
+    cos, sin = math.cos(math.radians(heading_deg)), math.sin(math.radians(heading_deg))
+    u, v = REACH_MM
+    expected = 35.0 + cos * u - sin * v, 25.0 + sin * u + cos * v
+    assert math.dist(centroid_mm(paper), expected) < 0.1
+
+
+def test_ink_only_adds_up_and_never_beyond_full():
+    paper = Paper(60.0, 40.0)
+    half = mark()
+    half = Footprint(0.5 * half.density, half.px_per_mm, half.origin_px)
+    before = paper.density
+    for x_mm in (20.0, 20.0, 22.0):
+        paper.lay(half, x_mm, 20.0, 0.0)
+        assert (paper.density >= before - 1e-6).all()
+        assert paper.density.max() <= 1.0
+        before = paper.density
+    assert before.max() == pytest.approx(0.875)
+    assert paper.presses == 3

@@ -1,8 +1,9 @@
-"""What the cabinet does when asked, on a clock that the test turns."""
+"""The loopback cabinet on a clock that the test turns: motion, tool, power, safety, watchdogs."""
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 from typing import Any
 
@@ -10,30 +11,11 @@ import pytest
 
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
+from brushloop.drivers.sim.arcs.cabinet import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
 from brushloop.drivers.sim.arm.kinematics import HOME
 
 START = brush_pose(250.0, -230.0, 260.0)
 NEAR = brush_pose(350.0, -230.0, 260.0)
-
-
-def test_power_comes_in_steps_that_take_time(off: Any):
-    assert (off.mode, off.ask("RobotState.isPowerOn")) == ("PowerOff", False)
-    assert off.ask("RobotManage.startup") == 1
-    assert off.ask("RobotManage.poweron") == 0
-    seen = [off.mode]
-    for _ in range(30):
-        off.clock.s += 0.05
-        seen.append(off.mode)
-    assert off.ask("RobotManage.startup") == 0
-    for _ in range(30):
-        off.clock.s += 0.05
-        seen.append(off.mode)
-    assert list(dict.fromkeys(seen)) == ["Booting", "PowerOn", "Idle", "BrakeReleasing", "Running"]
-    assert off.ask("RobotState.isPowerOn") is True
-    assert off.ask("RobotManage.poweroff") == 0
-    assert off.mode == "PowerOffing"
-    off.clock.s += 1.0
-    assert off.mode == "PowerOff"
 
 
 def test_motion_is_refused_until_running_and_in_a_safety_stop(off: Any):
@@ -149,14 +131,6 @@ def test_an_abort_ends_a_hold_and_forgets_the_path(on: Any):
     assert on.off_mm(START) == pytest.approx(0.0)
 
 
-def test_stopping_a_program_does_not_stop_motion(on: Any):
-    on.line(NEAR)
-    on.clock.s += 0.5
-    assert on.ask("RuntimeMachine.stop") == 0
-    on.clock.s += 5.0
-    assert on.off_mm(NEAR) == 0.0
-
-
 def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
@@ -172,28 +146,6 @@ def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_res
     on.ask("RuntimeMachine.resume")
     on.clock.s += 5.0
     assert on.off_mm(NEAR) == 0.0
-
-
-def test_a_safeguard_stop_drops_the_path_and_is_not_unlocked_over_the_wire(on: Any):
-    on.line(NEAR)
-    on.clock.s += 0.5
-    on.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
-    on.clock.s += 1.0
-    assert on.exec_id == -1
-    assert on.ask("RobotManage.setUnlockProtectiveStop") == 1
-    assert on.safety == "SafeguardStop"
-
-
-def test_after_an_emergency_stop_a_person_the_board_and_the_power_come_in_that_order(on: Any):
-    on.cabinet.emergency_stop()
-    assert (on.mode, on.safety) == ("PowerOff", "RobotEmergencyStop")
-    assert on.ask("RobotManage.setUnlockProtectiveStop") == 1
-    assert on.ask("RobotManage.restartInterfaceBoard") == 1
-    on.cabinet.power.button_down = False
-    assert on.ask("RobotManage.poweron") == 1
-    assert on.ask("RobotManage.restartInterfaceBoard") == 0
-    on.run()
-    assert (on.mode, on.safety) == ("Running", "Normal")
 
 
 def test_joints_and_pose_agree_with_the_tool_on(on: Any):
@@ -223,19 +175,6 @@ def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Any):
     assert on.line(START) == 0
 
 
-def test_a_joint_move_can_be_stopped_and_another_started(on: Any):
-    on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5)
-    on.clock.s += 0.8
-    assert on.ask("MotionControl.stopJoint", acc=5.0) == 0
-    on.clock.s += 0.5
-    rest = on.ask("RobotState.getJointPositions")
-    assert on.exec_id == -1
-    assert rest != pytest.approx(HOME, abs=0.01)
-    on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5)
-    on.clock.s += 20.0
-    assert on.ask("RobotState.getJointPositions") == pytest.approx(HOME, abs=1e-5)
-
-
 def test_what_is_out_of_reach_is_accepted_and_reported_by_a_message(on: Any):
     assert on.ask("Trace.peek", num=10, last_time=0) == []
     on.line(NEAR)
@@ -249,33 +188,6 @@ def test_what_is_out_of_reach_is_accepted_and_reported_by_a_message(on: Any):
     assert on.ask("MotionControl.moveJoint", q=[4.0, 0.0, 0.0, 0.0, 0.0, 0.0], a=1.0, v=1.0) == 0
     (second,) = on.ask("Trace.peek", num=10, last_time=first["timestamp"])
     assert second["timestamp"] > first["timestamp"]
-
-
-def test_what_is_set_is_what_is_got(on: Any):
-    payload = {"m": 0.5, "cog": [0.0, 0.0, 0.05], "aom": [0.0] * 3, "inertia": [0.0] * 6}
-    assert on.ask("RobotConfig.setPayload", **payload) == 0
-    assert on.ask("RobotConfig.getPayload") == [0.5, [0.0, 0.0, 0.05], [0.0] * 3, [0.0] * 6]
-    assert on.ask("RobotConfig.setPayload", **{**payload, "m": 7.0}) == -5
-    assert on.ask("RobotConfig.setCollisionLevel", level=8) == 0
-    assert on.ask("RobotConfig.setCollisionLevel", level=10) == -5
-    assert on.ask("RobotConfig.getCollisionLevel") == 8
-    assert on.ask("RobotManage.setOperationalMode", mode="Manual") == 0
-    assert on.ask("RobotManage.setOperationalMode", mode="Sideways") == -5
-    assert on.ask("RobotManage.getOperationalMode") == "Manual"
-    assert on.ask("RobotConfig.setTcpOffset", offset=[0.0] * 5) == -5
-
-
-def test_the_brush_pushes_back_only_while_it_is_on_the_paper(on: Any):
-    table = on.world.config.table
-    air_n = on.world.wrench()[2]
-    x, y = table.origin_mm[0] - 80.0, table.origin_mm[1] + 100.0
-    on.line(brush_pose(x, y, table.paper_z_mm - 10.0), v=1.0)
-    on.clock.s += 20.0
-    fx, fy, fz, mx, my, mz = on.world.wrench()
-    push_n = on.world.reaction.push_n(10.0, 0.0)
-    assert push_n > 0.05
-    assert [fx, fy, fz] == pytest.approx([0.0, 0.0, air_n - push_n])
-    assert [mx, my, mz] == pytest.approx([0.0] * 3)
 
 
 async def bitten(on: Any) -> None:
@@ -314,3 +226,139 @@ async def test_a_watchdog_can_be_disarmed_and_its_actions_differ(on: Any):
         assert on.cabinet.motion.held is held
         on.ask("RuntimeMachine.resume")
     on.cabinet.close()
+
+
+def test_every_transition_takes_its_time(off: Any):
+    off.ask("RobotManage.poweron")
+    begun = (("Booting", 0.0), ("PowerOn", BOOT_S), ("Idle", POWER_ON_S))
+    for (mode, from_s), (_, until_s) in itertools.pairwise((*begun, ("", 2.0 * POWER_ON_S))):
+        for off.clock.s in (from_s, until_s - 1e-3):
+            assert off.mode == mode
+    off.clock.s = POWER_ON_S
+    assert off.ask("RobotState.getJointState") == ["Idle"] * 6
+    begun_s = off.clock.s
+    off.ask("RobotManage.startup")
+    off.clock.s = begun_s + BRAKE_RELEASE_S - 1e-3
+    assert (off.mode, off.line(NEAR)) == ("BrakeReleasing", -1)
+    off.clock.s = begun_s + BRAKE_RELEASE_S
+    assert (off.mode, off.line(NEAR)) == ("Running", 0)
+    off.ask("RobotManage.poweroff")
+    assert off.mode == "PowerOffing"
+    off.clock.s += POWER_OFF_S
+    assert off.mode == "PowerOff"
+
+
+def test_nothing_less_takes_the_place_of_an_emergency_stop(on: Any):
+    on.cabinet.emergency_stop()
+    for mode in (SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP):
+        on.cabinet.safety_stop(mode)
+        assert on.safety == "RobotEmergencyStop"
+    on.cabinet.power.reduce(True)
+    on.cabinet.power.reset_safeguard()
+    assert on.safety == "RobotEmergencyStop"
+
+
+@pytest.mark.parametrize("asked", ["RobotManage.restartInterfaceBoard", "RobotManage.poweron", "RobotManage.startup"])
+def test_no_method_brings_an_arm_back_while_the_button_is_down(on: Any, asked: str):
+    on.cabinet.emergency_stop()
+    for method in (asked, "RobotManage.setUnlockProtectiveStop", "RuntimeMachine.resume"):
+        assert on.ask(method) != 0
+        on.clock.s += 5.0
+    assert (on.safety, on.mode) == ("RobotEmergencyStop", "PowerOff")
+    on.cabinet.power.release_emergency_stop()
+    on.clock.s += 5.0
+    assert on.safety == "RobotEmergencyStop", "releasing the button alone brings nothing back"
+    assert on.ask("RobotManage.restartInterfaceBoard") == 0
+    on.run()
+    assert (on.mode, on.line(NEAR)) == ("Running", 0)
+
+
+def test_a_safeguard_is_reset_by_a_person_and_the_path_is_gone(on: Any):
+    on.line(NEAR)
+    on.clock.s += 0.5
+    on.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
+    assert on.ask("RobotState.isPowerOn") is True
+    for method in ("RobotManage.setUnlockProtectiveStop", "RuntimeMachine.resume", "RobotManage.restartInterfaceBoard"):
+        assert on.ask(method) == 1
+    on.cabinet.power.reset_safeguard()
+    on.clock.s += 5.0
+    assert (on.safety, on.exec_id) == ("Normal", -1)
+    assert on.off_mm(NEAR) > 10.0
+    assert on.line(NEAR) == 0
+
+
+def test_reduced_mode_comes_and_goes_with_its_input_and_moves_are_slow_meanwhile(on: Any):
+    on.cabinet.power.reduce(True)
+    assert on.safety == "ReducedMode"
+    on.line(brush_pose(600.0, -230.0, 260.0), v=1.0)
+    on.clock.s += 0.8
+    assert on.speed_m_s() == pytest.approx(0.25)
+    on.clock.s += 10.0
+    on.cabinet.power.reduce(False)
+    assert on.safety == "Normal"
+    on.line(NEAR, v=1.0)
+    on.clock.s += 0.48
+    assert on.speed_m_s() > 0.4
+
+
+SHEET = brush_pose(460.0 - 80.0, -110.0 + 100.0, 160.0)
+
+
+def tool(length_mm: float, x_mm: float = 0.0) -> list[float]:
+    return [x_mm / 1e3, 0.0, length_mm / 1e3, 0.0, 0.0, 0.0]
+
+
+def press(on: Any, depth_mm: float) -> None:
+    """As an operator would teach it: down to the paper and `depth_mm` deeper, by the configured tool."""
+    z_mm = on.world.config.table.paper_z_mm
+    for z in (SHEET.z_mm, z_mm - depth_mm, SHEET.z_mm):
+        on.line(brush_pose(SHEET.x_mm, SHEET.y_mm, z), v=0.2)
+        on.clock.s += 10.0
+    on.world.tool()  # the world goes on when someone looks
+
+
+@pytest.mark.parametrize(("configured_mm", "depth_mm"), [(180.0, 10.0), (175.0, 15.0), (185.0, 5.0)])
+def test_an_offset_that_is_too_short_presses_deeper_by_as_much(on: Any, configured_mm: float, depth_mm: float):
+    assert on.ask("RobotConfig.setTcpOffset", offset=tool(configured_mm)) == 0
+    press(on, 10.0)
+    [pressed] = on.world.presses
+    assert pressed.depth_mm == pytest.approx(depth_mm, abs=1e-6)
+
+
+def test_with_a_forgotten_offset_the_controller_speaks_of_the_flange(on: Any):
+    on.ask("RobotConfig.setTcpOffset", offset=[0.0] * 6)
+    tip, reported = on.world.tool(), from_wire(on.ask("RobotState.getTcpPose"))
+    assert reported.z_mm - tip.z_mm == pytest.approx(180.0)
+    flange, _ = on.ask("RobotAlgorithm.forwardKinematics", q=on.ask("RobotState.getJointPositions"))
+    assert flange[:3] == pytest.approx(on.ask("RobotState.getTcpPose")[:3], abs=1e-6)
+
+
+def test_the_tip_goes_round_a_wrong_tool_centre_point(on: Any):
+    """A turn about the configured point swings a tip that is elsewhere."""
+    on.ask("RobotConfig.setTcpOffset", offset=tool(180.0, x_mm=10.0))
+    here = from_wire(on.ask("RobotState.getTcpPose"))
+    before = on.world.tool()
+    assert on.line(brush_pose(*here.position_mm, heading_deg=90.0), v=1.0) == 0
+    on.clock.s += 20.0
+    assert distance(from_wire(on.ask("RobotState.getTcpPose")), here)[0] < 1e-6
+    assert distance(on.world.tool(), before)[0] == pytest.approx(10.0 * math.sqrt(2.0))
+
+
+def test_joints_mean_the_steel_whatever_is_configured(on: Any):
+    ends: list[Any] = []
+    for length_mm in (180.0, 120.0):
+        on.ask("RobotConfig.setTcpOffset", offset=tool(length_mm))
+        on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5)
+        on.clock.s += 20.0
+        ends.append(on.world.tool())
+        on.ask("MotionControl.moveJoint", q=[0.1, *HOME[1:]], a=1.0, v=0.5)
+        on.clock.s += 20.0
+    assert distance(ends[0], ends[1])[0] < 1e-3
+
+
+def test_a_move_that_is_under_way_keeps_the_offset_that_it_was_given(on: Any):
+    on.line(SHEET)
+    on.clock.s += 0.5
+    on.ask("RobotConfig.setTcpOffset", offset=tool(100.0))
+    on.clock.s += 20.0
+    assert on.off_mm(SHEET) == 0.0

@@ -1,16 +1,66 @@
+"""What the loopback camera sees, and when its pictures are sent."""
+
 from __future__ import annotations
 
-import itertools
+import asyncio
+from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.camera.scene import NOISE_FIELDS, PAPER_GRAY, TOOL_GRAY, Scene, board, homography, read_strip
+from brushloop.drivers.sim.camera.mjpeg_server import _Line
+from brushloop.drivers.sim.camera.scene import NOISE_FIELDS, TOOL_GRAY, Optics, Scene, board, homography, read_strip
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.world import World
+
+BENT = View(k1=-0.08)
+
+
+def test_a_perfect_lens_is_the_homography_alone() -> None:
+    optics = Optics(View(), 1)
+    points = np.array([[0.0, 0.0], [122.0, 86.0], [244.0, 172.0]])
+    mapped = np.column_stack([points, np.ones(3)]) @ optics.homography.T
+    assert optics.image_of(points) == pytest.approx(mapped[:, :2] / mapped[:, 2:], abs=1e-9)
+
+
+def test_distortion_leaves_the_middle_and_pulls_the_corners_in() -> None:
+    undistorted, distorted = Optics(replace(BENT, k1=0.0), 1), Optics(BENT, 1)
+    points = np.array([[122.0, 86.0], [0.0, 0.0]])
+    moved = np.linalg.norm(distorted.image_of(points) - undistorted.image_of(points), axis=1)
+    assert moved[0] < 0.05
+    assert 3.0 < moved[1] < 40.0
+
+
+def test_corners_of_the_rendered_board_lie_where_the_optics_say() -> None:
+    config = SimConfig(view=BENT)
+    scene = Scene(World(config))
+    detector = cv2.aruco.CharucoDetector(board(config.table))
+    corners, ids, _, _ = detector.detectBoard(scene.render())
+    on_board = np.asarray(board(config.table).getChessboardCorners())[ids.ravel(), :2]
+    table = config.table
+    paper = np.column_stack(
+        [
+            table.board_origin_mm[0] + on_board[:, 0],
+            table.board_origin_mm[1] + table.board_squares[1] * table.board_square_mm - on_board[:, 1],
+        ]
+    )
+    off = np.linalg.norm(corners.reshape(-1, 2) - scene.optics.image_of(paper.astype(np.float64)), axis=1)
+    assert len(ids) > 100
+    assert np.median(off) < 0.3
+    assert np.quantile(off, 0.95) < 0.8
+
+
+def test_a_shadow_takes_light_from_a_part_of_the_sheet_only() -> None:
+    lit, shaded = Optics(View(), 1).light, Optics(View(shadow=0.4), 1).light
+    ratio = shaded / lit
+    assert ratio.min() == pytest.approx(0.6, abs=0.01)
+    assert ratio.max() == pytest.approx(1.0, abs=0.01)
+    assert 0.2 < float((ratio < 0.8).mean()) < 0.8
+
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
 
@@ -36,17 +86,6 @@ def gray_at(image: np.ndarray, x_mm: float, y_mm: float) -> float:
     return float(image[row - 3 : row + 4, column - 3 : column + 4].mean())
 
 
-def test_an_image_has_the_size_of_the_view(image: np.ndarray):
-    assert image.shape == (768, 1024)
-    assert image.dtype == np.uint8
-
-
-def test_the_sheet_is_bright_in_all_its_corners(image: np.ndarray):
-    size_x_mm, size_y_mm = CONFIG.table.sheet_mm
-    for corner in itertools.product((3.0, size_x_mm - 3.0), (3.0, size_y_mm - 3.0)):
-        assert gray_at(image, *corner) > 0.7 * PAPER_GRAY
-
-
 def beside_the_sheet(x_mm: float, y_mm: float, by_mm: float) -> bool:
     size_x_mm, size_y_mm = CONFIG.table.sheet_mm
     return not (-by_mm < x_mm < size_x_mm + by_mm and -by_mm < y_mm < size_y_mm + by_mm)
@@ -70,13 +109,6 @@ def test_every_corner_of_the_board_that_the_sheet_leaves_bare_is_found_where_it_
     # Blur rounds the corners of black squares, by turns to either side; the mean shows a wrong half pixel.
     assert np.abs(off_px).max() < 0.8
     assert np.abs(np.mean(off_px, axis=0)).max() < 0.05
-
-
-def test_one_millimetre_is_as_many_pixels_as_the_view_says():
-    x, y = CONFIG.view.centre_mm
-    h = homography(CONFIG.view)
-    a, b = (h @ np.array([x + d, y, 1.0]) for d in (-0.5, 0.5))
-    assert np.hypot(*(b / b[2] - a / a[2])[:2]) == pytest.approx(CONFIG.view.px_per_mm, rel=1e-3)
 
 
 def test_noise_is_new_in_every_frame(scene: Scene):
@@ -129,3 +161,55 @@ def test_a_frame_rendered_for_a_known_tool_leaves_the_world_alone(scene: Scene, 
 
     monkeypatch.setattr(World, "tool", nobody_may_ask)
     scene.render(0, tool)
+
+
+class Loop:
+    """A clock that stands still, and what is due on it."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+        self.due_s: list[float] = []
+
+    def time(self) -> float:
+        return self.now_s
+
+    def call_at(self, when_s: float, _call: Callable[..., None], _data: bytes) -> None:
+        self.due_s.append(when_s)
+
+
+class Open:
+    """A connection; its client has taken everything once `taken` is set."""
+
+    def __init__(self) -> None:
+        self.taken = asyncio.Event()
+        self.taken.set()
+
+    def is_closing(self) -> bool:
+        return False
+
+    async def drain(self) -> None:
+        await self.taken.wait()
+
+
+async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_overtakes_another() -> None:
+    loop, line = Loop(), _Line(View(delay_s=0.3, delay_jitter_s=0.0), cast("asyncio.StreamWriter", Open()))
+    line._loop = cast("asyncio.AbstractEventLoop", loop)
+    line._last_s = line._began_s = loop.now_s
+    for drawn_s in (0.05, 0.0, 2.0, 0.0):
+        line.exposed()
+        loop.now_s += drawn_s
+        await line.send(b"picture")
+    assert loop.due_s == pytest.approx([100.3, 100.35, 100.35, 102.35], abs=1e-3)
+    assert loop.due_s == sorted(set(loop.due_s))
+
+
+async def test_a_client_that_reads_too_slowly_is_sent_no_further_picture_until_it_has_taken_the_earlier_ones() -> None:
+    client = Open()
+    client.taken.clear()
+    line = _Line(View(delay_s=0.3), cast("asyncio.StreamWriter", client))
+    line.exposed()
+    sending = asyncio.create_task(line.send(b"picture"))
+    await asyncio.sleep(0)
+    assert not sending.done()
+    client.taken.set()
+    await sending

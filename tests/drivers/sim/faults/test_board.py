@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass, field
 
 import pytest
 
-from brushloop.drivers.sim.faults import KINDS, MOST, REPLIES, STOPS, Device, Fault, FaultBoard, Phase
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.sim.config import SimConfig, Table
+from brushloop.drivers.sim.faults import KINDS, MOST, REPLIES, Device, Fault, FaultBoard, Phase, Truth, fault_of
+from brushloop.drivers.sim.world import World
 
 
 @dataclass
@@ -92,13 +98,6 @@ def test_of_two_that_match_the_first_strikes(world: Scripted):
     assert [fault.kind if fault else None for fault in kinds] == ["mute", "drop", None]
 
 
-def test_faults_of_other_devices_and_kinds_wait(world: Scripted):
-    world.board.hang(Fault(device=Device.TELEMETRY, kind="mute"))
-    world.board.hang(Fault(device=Device.ROBOT, kind="deaf"))
-    assert world.strikes("x") == [False]
-    assert len(world.board.hanging) == 2
-
-
 @pytest.mark.parametrize(
     "fault",
     [
@@ -139,23 +138,113 @@ def test_clearing_ends_a_fault_that_has_begun(world: Scripted, device: Device):
     assert world.board.meet(device, "", KINDS[device]) is None
 
 
-def test_a_stop_on_a_method_waits_for_it(world: Scripted):
-    world.board.hang(Fault(device=Device.ROBOT, kind="emergency-stop", on="moveLine"))
-    assert world.board.due() == []
-    assert world.board.meet(Device.ROBOT, "rob1.MotionControl.moveLine", STOPS) is not None
-
-
-def test_faults_are_taken_down_one_by_one_or_all_at_once(world: Scripted):
-    first, second = world.board.hang(mute()), world.board.hang(mute())
-    assert world.board.take(first)
-    assert not world.board.take(first)
-    assert world.board.clear() == 1
-    assert world.strikes("x") == [False]
-    assert second > first
-
-
 def test_a_board_is_not_filled_without_end(world: Scripted):
     for _ in range(MOST):
         world.board.hang(mute(after_s=1e6))
     with pytest.raises(ValueError, match="already 1000 faults"):
         world.board.hang(mute())
+
+
+def test_a_fault_has_what_its_request_says() -> None:
+    fault = fault_of({"device": "camera", "kind": "black", "press": 2, "phase": "parked", "for_s": 4})
+    assert (fault.device, fault.press, fault.phase, fault.for_s) == (Device.CAMERA, 2, "parked", 4.0)
+    assert fault.strikes is None
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"kind": "loud"}, "kind = 'loud' is not one of robot's: deaf, drop,"),
+        ({"device": "coffee"}, "device: Input should be 'robot', 'telemetry'"),
+        ({"device": "camera"}, "is not one of camera's: black, drop, frozen, stale, torn"),
+        ({"nht": 3}, "nht: Extra inputs are not permitted"),
+        ({"nth": 0}, "nth: Input should be greater than or equal to 1 (given: '0')"),
+        ({"after_s": -1}, "after_s: Input should be greater than or equal to 0"),
+        ({"after_s": math.nan}, "after_s: Input should be"),
+        ({"for_s": math.inf}, "for_s: Input should be"),
+        ({"on": "a b"}, "on: String should match pattern"),
+        ({"phase": "flying"}, "phase: Input should be 'dipping'"),
+        ({"count": 1, "for_s": 1.0}, "count and for_s exclude each other"),
+        ({"device": "telemetry", "on": "moveLine"}, "only the robot has methods"),
+        ({"kind": "protective-stop", "count": 2}, "happens once"),
+        ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),
+        ({"device": "ink", "kind": "mute", "nth": 2}, "counts nothing here"),
+        ({"late_s": 1.0}, "late_s goes with kind = 'late' of robot and telemetry only"),
+        ({"a\nb\x1b[31m": 1}, "Extra inputs are not permitted"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_one_printable_line(fields: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        fault_of({"device": "robot", "kind": "mute"} | fields)
+    assert str(caught.value).isprintable()
+
+
+TABLE = Table()
+OVER, NEAR, ON, IN = ((100.0, 80.0, h) for h in (60.0, 8.0, 0.03, -15.0))
+WELL, INK = (*TABLE.well_mm, 60.0), (*TABLE.well_mm, 2.0)
+HOME = None
+"""Where the tip rests when the rig starts."""
+
+
+def base(spot: tuple[float, float, float] | None) -> Pose:
+    """The pose of a place in the paper frame, in mm above the sheet; the table's yaw is 90 deg."""
+    if spot is HOME:
+        return brush_pose(*SimConfig().home_mm)
+    x, y, above = spot
+    return brush_pose(TABLE.origin_mm[0] - y, TABLE.origin_mm[1] + x, TABLE.paper_z_mm + above)
+
+
+@pytest.mark.parametrize(
+    ("here", "to", "phase"),
+    [
+        (HOME, HOME, Phase.PARKED),
+        (OVER, OVER, Phase.RESTING),
+        (HOME, OVER, Phase.TRAVELLING),
+        (OVER, NEAR, Phase.TRAVELLING),  # the fast approach ends above the paper
+        (NEAR, ON, Phase.DESCENDING),
+        (ON, IN, Phase.DESCENDING),
+        (ON, ON, Phase.PRESSED),
+        (IN, IN, Phase.PRESSED),
+        (IN, NEAR, Phase.LIFTING),
+        (NEAR, OVER, Phase.LIFTING),
+        (OVER, HOME, Phase.TRAVELLING),
+        (HOME, WELL, Phase.TRAVELLING),
+        (WELL, INK, Phase.DIPPING),
+        (INK, INK, Phase.DIPPING),
+        (INK, WELL, Phase.DIPPING),
+        (WELL, HOME, Phase.TRAVELLING),
+    ],
+)
+def test_each_piece_of_a_press_and_of_a_dip_has_its_phase(
+    here: tuple[float, float, float] | None, to: tuple[float, float, float] | None, phase: Phase
+):
+    world = World(SimConfig())
+    world.clock = clock = StoppedClock()  # type: ignore[assignment]
+    world.motion.add(base(here), 200.0, 1000.0, clock.s)
+    clock.s = 100.0
+    world.motion.add(base(to), 200.0, 1000.0, clock.s)
+    assert Truth(world).phase() is phase
+
+
+class StoppedClock:
+    def __init__(self) -> None:
+        self.s = 0.0
+
+    def now_s(self) -> float:
+        return self.s
+
+
+@pytest.mark.parametrize(
+    ("above_mm", "phase"), [(3.0, Phase.RESTING), (0.05, Phase.PRESSED), (-2.0, Phase.PRESSED), (60.0, Phase.RESTING)]
+)
+@pytest.mark.parametrize("corner_mm", [(10.0, 10.0), (230.0, 10.0), (10.0, 160.0)])
+def test_on_a_sloping_sheet_heights_count_from_the_paper_under_the_tip(
+    corner_mm: tuple[float, float], above_mm: float, phase: Phase
+):
+    table = Table(yaw_deg=0.0, slope_deg=(1.0, -1.0))
+    (x, y), (left, front) = corner_mm, table.origin_mm
+    world = World(SimConfig(table=table))
+    world.clock = clock = StoppedClock()  # type: ignore[assignment]
+    world.motion.add(brush_pose(left + x, front + y, table.surface_z_mm(x, y) + above_mm), 100.0, 1000.0, clock.s)
+    clock.s = 60.0
+    assert Truth(world).phase() is phase

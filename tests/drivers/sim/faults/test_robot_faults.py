@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 
 import pytest
 
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import ArcsOptions
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -19,11 +18,9 @@ from brushloop.drivers.errors import (
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.host import HostClock
-from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.sim.rig import LoopbackRig
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}  # two real seconds
@@ -107,43 +104,6 @@ async def test_replies_in_pieces_twice_or_a_little_late_change_nothing(
     await arm.stop()
 
 
-@pytest.fixture
-async def bare_arm(cabinet: ArcsServer, limits: Limits) -> AsyncIterator[AuboArcs]:
-    options = ArcsOptions(HOST, cabinet.port, (0.0, 0.0, 180.0), power_timeout_s=5.0, framing="bare")
-    arm = AuboArcs(options, limits, HostClock())
-    await arm.connect()
-    await arm.enable()
-    yield arm
-    await arm.close()
-
-
-@pytest.mark.parametrize(
-    ("kind", "error"),
-    [
-        ("mute", DeviceTimeout),
-        ("wrong-id", DeviceTimeout),
-        ("malformed", DeviceTimeout),  # half a document: without frames nobody knows that no more will come
-        ("garbage", ConnectionLost),
-        ("drop", ConnectionLost),
-    ],
-)
-async def test_without_frames_a_bad_reply_ends_the_move_too(
-    bare_arm: AuboArcs, cabinet: ArcsServer, kind: str, error: type[DeviceError]
-):
-    cabinet.faults.hang(robot(kind, on=POLL, nth=5))
-    with pytest.raises(error):
-        await bare_arm.move(FAR, **SLOW)
-    assert at_rest(cabinet)
-    assert to_go_mm(cabinet) > 50.0
-
-
-@pytest.mark.parametrize("kind", ["split", "duplicate"])
-async def test_without_frames_pieces_and_doubles_change_nothing(bare_arm: AuboArcs, cabinet: ArcsServer, kind: str):
-    cabinet.faults.hang(robot(kind, count=ALWAYS))
-    await bare_arm.move(FAR, **QUICK)
-    assert to_go_mm(cabinet) <= 0.05
-
-
 @pytest.mark.parametrize(
     ("kind", "mode", "condition", "power"),
     [
@@ -189,23 +149,3 @@ async def test_a_stop_that_a_request_triggers_strikes_with_that_request(arm: Aub
     with pytest.raises(RobotNotSafe, match="ProtectiveStop"):
         await arm.move(FAR, **SLOW)
     assert to_go_mm(cabinet) > 150.0, "stopped at the beginning; 100 mm pass in a real second"
-
-
-@pytest.mark.parametrize("kind", ["mute", "deaf", "drop"])
-async def test_a_stop_that_nobody_confirms_is_reported_in_time_however_many_calls_hang(
-    arm: AuboArcs, cabinet: ArcsServer, kind: str
-):
-    cabinet.faults.hang(robot(kind, count=ALWAYS))
-    with pytest.raises(MotionFailed, match=r"within 1\.5 s: (no reply|the controller closed|it was not opened again)"):
-        await arm.stop()
-
-
-async def test_a_stop_gets_through_on_connections_that_come_back(arm: AuboArcs, cabinet: ArcsServer):
-    move = asyncio.create_task(arm.move(FAR, **SLOW))
-    await asyncio.sleep(0.2)
-    cabinet.faults.hang(robot("drop", for_s=0.5))  # whoever asks meanwhile is hung up on
-    with pytest.raises(ConnectionLost) as caught:
-        await move
-    assert not getattr(caught.value, "__notes__", [])
-    assert at_rest(cabinet)
-    assert to_go_mm(cabinet) > 50.0

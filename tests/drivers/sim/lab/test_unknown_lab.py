@@ -1,28 +1,29 @@
-"""A lab that nobody has measured: drawn from a seed, the same on the wire as in truth, with a person's hand in it."""
+"""A lab drawn from a seed, its person, and the commands that serve it."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 from collections.abc import AsyncIterator
-from dataclasses import replace
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+import brushloop.__main__
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
-from brushloop.drivers.geometry import from_wire, lean
+from brushloop.drivers.geometry import from_wire
+from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.arm.kinematics import forward, inverted, matrix_of, pose_of
-from brushloop.drivers.sim.camera.scene import board
-from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.control import live_control
 from brushloop.drivers.sim.lab.facts import CORNERS, corner, draw, in_picture
 from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab
 from brushloop.drivers.sim.lab.seen import truth
-from brushloop.drivers.sim.rig import _at_sensor
+from brushloop.drivers.sim.serve import LabRefused
 from brushloop.drivers.sim.world import tool_of
 
 SMALL_PX = (640, 480)
@@ -67,13 +68,6 @@ def test_every_lab_is_one_that_could_be(seed: int):
     assert max(abs(v) for v in table.slope_deg) <= 1.0
 
 
-def test_the_known_rig_has_its_tool_and_its_sensor_as_before():
-    config = SimConfig()
-    wrench = (0.1, -0.2, -1.5, 0.01, 0.02, 0.0)
-    assert np.array_equal(tool_of(config), [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.18], [0, 0, 0, 1]])
-    assert _at_sensor(config, wrench) is wrench
-
-
 async def test_the_hand_brings_the_true_tip_to_the_thing():
     lab, off_mm = lab_of(4), list[float]()
     for index in range(12):
@@ -85,29 +79,6 @@ async def test_the_hand_brings_the_true_tip_to_the_thing():
     assert 0.2 < float(np.std(off_mm)) < 0.4
     assert max(map(abs, off_mm)) < 0.8
     assert lab.world.presses == []
-
-
-async def test_the_pin_is_met_from_directions_that_tell_the_tool():
-    """Least squares over the flange's poses, without the noise of the hand, would find the tool exactly."""
-    lab, rows, sides = lab_of(9), list[np.ndarray](), list[np.ndarray]()
-    for index in range(8):
-        await lab.bring("pin", index)
-        flange = forward(lab.cabinet.joints())
-        rows.append(np.hstack([flange[:3, :3], -np.eye(3)]))
-        sides.append(-flange[:3, 3])
-    found, _, rank, singular = np.linalg.lstsq(np.vstack(rows), np.concatenate(sides), rcond=None)
-    assert rank == 6
-    assert singular[0] / singular[-1] < 8.0
-    assert 1e3 * found[:3] == pytest.approx(truth(lab.facts, None)["tool"]["tcp_offset_mm"], abs=0.6)
-
-
-async def test_upright_by_a_set_square_gives_the_brushs_axis():
-    lab, axes = lab_of(3), list[np.ndarray]()
-    for index in range(4):
-        await lab.bring("upright", index)
-        assert lean(lab.world.tool())[0] < 0.6
-        axes.append(forward(lab.cabinet.joints())[:3, :3].T @ [0.0, 0.0, -1.0])
-    assert np.mean(axes, axis=0) == pytest.approx(truth(lab.facts, None)["tool"]["brush_axis"], abs=math.radians(0.3))
 
 
 async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, controller: Controller):
@@ -122,74 +93,6 @@ async def test_what_a_client_reads_agrees_with_the_truth(lab: UnknownLab, contro
     assert tip.position_mm == pytest.approx(lab.world.tool().position_mm, abs=1e-3)
     assert (await controller.ask("RobotConfig.getPayload"))[0] == lab.facts.payload_kg
     assert await controller.ask("RobotState.isSteady")
-
-
-async def test_the_camera_shows_the_arm_where_it_was_guided(lab: UnknownLab):
-    scene = lab.rig.scene
-    await lab.bring("clear-view")
-    empty = scene.render().astype(int)
-    await lab.bring("sheet-corner", 0, "lower left")
-    assert (np.abs(scene.render().astype(int) - empty) > 40).mean() > 0.02
-    await lab.bring("park")
-    assert (np.abs(scene.render().astype(int) - empty) > 40).mean() < 0.001
-
-
-async def test_the_other_stream_shows_the_arm_and_no_board(lab: UnknownLab):
-    room = lab._room._scene
-    room.tool()
-    before = room.render().astype(int)
-    await lab.bring("well")
-    room.tool()
-    after = room.render()
-    assert (np.abs(after.astype(int) - before) > 40).mean() > 0.003
-    _, ids, _, _ = cv2.aruco.CharucoDetector(board(lab.facts.config.table)).detectBoard(after)
-    assert ids is None
-
-
-async def test_a_held_board_is_seen_slanted_and_gives_the_lens():
-    lab, objects, images = UnknownLab(4, rate=FAST, picture_px=(1280, 960)), [], []
-    made = board(lab.facts.config.table)
-    detector = cv2.aruco.CharucoDetector(made)
-    for index in range(6):
-        await lab.bring("hold-board", index)
-        picture = lab.rig.scene.render()
-        corners, ids, _, _ = detector.detectBoard(picture)
-        assert len(ids) > 60
-        on_board, in_image = made.matchImagePoints(corners, ids)
-        objects.append(on_board)
-        images.append(in_image)
-    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-    rms_px, matrix, distortion, _, _ = cv2.calibrateCamera(objects, images, (1280, 960), np.eye(3), None, flags=flags)
-    known = truth(lab.facts, None)["camera"]
-    assert rms_px < 0.4
-    assert matrix[0, 0] == pytest.approx(known["matrix"][0][0], rel=0.02)
-    assert float(np.ravel(distortion)[0]) == pytest.approx(known["k1"], abs=0.02)
-    await lab.bring("clear-view")
-    assert lab.rig.scene.held is None
-
-
-def test_a_push_is_felt_in_the_sensors_axes():
-    facts = draw(2)
-    config = replace(facts.config, sensor_turn_deg=90.0, sensor_sign=1, tool_lean_deg=(0.0, 0.0))
-    fx, fy, fz, *_ = _at_sensor(config, (2.0, 0.0, 1.0, 0.0, 0.0, 0.0))
-    assert (fx, fy, fz) == pytest.approx((0.0, -2.0, 1.0))
-    fx, fy, fz, *_ = _at_sensor(replace(config, sensor_sign=-1), (2.0, 0.0, 1.0, 0.0, 0.0, 0.0))
-    assert (fx, fy, fz) == pytest.approx((0.0, 2.0, -1.0))
-
-
-async def test_a_finger_pushes_for_a_second(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("brushloop.drivers.sim.lab.hand.PUSH_S", 0.0)
-    lab, felt = lab_of(2), list[tuple[float, ...]]()
-    before = np.array(lab.world.wrench()[:3])
-    monkeypatch.setattr("asyncio.sleep", lambda _s: _now(felt, lab))
-    await lab.bring("push-sensor", 0)
-    upright = Rotation.from_quat(lab.world.tool().quaternion)
-    assert upright.apply(np.array(felt[0]) - before) == pytest.approx([0.0, 0.0, 2.0], abs=1e-6)
-    assert lab.world.wrench()[:3] == pytest.approx(before)
-
-
-async def _now(felt: list[tuple[float, ...]], lab: UnknownLab) -> None:
-    felt.append(lab.world.wrench()[:3])
 
 
 def test_what_is_seen_names_no_truth(lab: UnknownLab):
@@ -218,3 +121,46 @@ def test_the_truth_is_json_with_what_a_first_day_finds():
 async def test_what_a_person_cannot_do_is_named(request_: dict[str, object], words: str):
     with pytest.raises(ValueError, match=words):
         await lab_of(4).obey(request_)
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(brushloop.__main__.app, arguments, catch_exceptions=False)
+    return result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--unknown", "3", "--trap", "loud"), r"--trap is 'loud', allowed: swapped-corner, .*cable-pulled"),
+        (("--unknown", "3", "--write-rig", "rig.toml"), "--unknown: can only be combined with --trap"),
+        (("--trap", "force-sign"), "--trap and --truth: need --unknown SEED"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...], words: str):
+    with pytest.raises(LabRefused, match=words) as refused:
+        run("sim", *arguments)
+    assert refused.value.exit_code == 2
+
+
+def test_another_file_is_not_overwritten_by_the_truth(tmp_path: Path):
+    mine = tmp_path / "notes.json"
+    mine.write_text("mine")
+    with pytest.raises(LabRefused, match="it is not overwritten"):
+        run("sim", "--unknown", "3", "--truth", str(mine))
+    assert mine.read_text() == "mine"
+
+
+async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
+    lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "lab.sock"
+    async with live_control(lab.rig.faults, socket, lab.obey):
+        said = await asyncio.to_thread(run, "hand", str(socket), "bring", "board-corner", "--corner", "lower left")
+        assert said == "The tip is at the board-corner, lower left.\n"
+        with pytest.raises(FaultRefused, match="to = 'moon' is not one of pin"):
+            await asyncio.to_thread(run, "hand", str(socket), "bring", "moon")
+
+
+async def test_nobody_is_in_a_known_rig(tmp_path: Path):
+    lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "rig.sock"
+    async with live_control(lab.rig.faults, socket):
+        with pytest.raises(FaultRefused, match="there is no person here"):
+            await asyncio.to_thread(run, "hand", str(socket), "bring", "pin")

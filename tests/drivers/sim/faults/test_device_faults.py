@@ -1,11 +1,9 @@
-"""What becomes of the pose when its stream fails: polling takes over, which is reported once.
-
-What the bytes may be is in tests/drivers/arcs/test_rtde.py.
-"""
+"""What the drivers of telemetry and instruments do while a fault lasts."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
 
 import pytest
 
@@ -13,10 +11,12 @@ from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsOptions
 from brushloop.drivers.devices import PoseSample
 from brushloop.drivers.errors import Stale
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.sim.rig import HOST, Faults, LoopbackRig
 
 
 @pytest.mark.parametrize(
@@ -49,3 +49,33 @@ async def test_a_stream_that_fails_is_reported_once_and_poses_go_on(
     with pytest.raises(Stale):
         arm.latest()
     await arm.close()
+
+
+@pytest.fixture
+async def sensor(rig: LoopbackRig) -> AsyncIterator[SriM8123]:
+    assert rig.force is not None
+    options = SriOptions(
+        "socketcand", LOOPBACK_CHANNEL, host=HOST, port=rig.force.port, stale_after_ms=5000.0, round_ms=500.0
+    )
+    sensor = SriM8123(options, HostClock())
+    await sensor.connect()
+    yield sensor
+    await sensor.close()
+
+
+async def test_a_sensor_that_was_silent_is_heard_again_as_soon_as_the_fault_is_cleared(
+    rig: LoopbackRig, sensor: SriM8123
+):
+    rig.faults.hang(Fault(device=Device.FORCE, kind="silence", count=1_000_000))
+    await asyncio.sleep(0.3)
+    assert rig.faults.board.clear() == 1
+    cleared = sensor.latest().stamp.seq
+    async with asyncio.timeout(4.0):
+        while sensor.latest().stamp.seq == cleared:
+            await asyncio.sleep(0.005)
+
+
+async def test_a_rig_without_the_instrument_refuses_its_faults(rig: LoopbackRig):
+    bare = Faults(rig.world, rig.arcs, rig.rtde, rig.camera)
+    with pytest.raises(ValueError, match="device = 'ink': this rig has none"):
+        bare.hang(Fault(device=Device.INK, kind="garbage"))
