@@ -3,22 +3,42 @@
 from __future__ import annotations
 
 import errno
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from brushloop.calibrate import presses, store
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.fit import heldout
+from brushloop.calibrate.fit.brush import FitRequest, fit_presses
 from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
-from brushloop.calibrate.session import open_session
+from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.calibrate.validate import run as validation
+from brushloop.calibrate.validate.command import Request, validate
 from brushloop.sessions.recording import Recording, mark_bad_or_good
-from tests.photographed import imported_presses
+from tests.calibrate.given import CALIBRATION
+from tests.photographed import imported, imported_presses
 
 CELLS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
+READ = """
+import sys
+from pathlib import Path
+from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.presses import read_presses
+from brushloop.calibrate.session import open_session
+print([float(press.coverage.sum()) for press in read_presses(open_session(Path(sys.argv[1])), Field(), [])])
+"""
 
 
 @pytest.fixture
@@ -28,22 +48,30 @@ def session(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def prepared(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the presses that were prepared, in the order in which they were."""
-    names: list[str] = []
-    prepare = presses.prepare_job
+def work(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each kind of work was done, by the name of its function."""
+    counts: Counter[str] = Counter()
 
-    def counting(job: presses.PrepareJob) -> store.Arrays:
-        names.append(job.capture.stroke.stroke_id)
-        return prepare(job)
+    def count(module: ModuleType, name: str) -> None:
+        do: Callable[[Any], store.Arrays] = getattr(module, name)
 
-    monkeypatch.setattr(presses, "prepare_job", counting)
-    return names
+        def counting(job: object) -> store.Arrays:
+            counts[name] += 1
+            return do(job)
+
+        monkeypatch.setattr(module, name, counting)
+
+    for module, name in ((presses, "prepare_job"), (heldout, "refit"), (validation, "score_job")):
+        count(module, name)
+    return counts
 
 
-def read(session: Path, view: Field | None = None, refused: list[tuple[str, str]] | None = None) -> list[Press]:
+def read(
+    session: Path | OpenSession, view: Field | None = None, refused: list[tuple[str, str]] | None = None
+) -> list[Press]:
     refused = [] if refused is None else refused
-    return list(presses.read_presses(open_session(session), view or Field(), refused, uncommanded, cut, too_thin))
+    opened = open_session(session) if isinstance(session, Path) else session
+    return list(presses.read_presses(opened, view or Field(), refused, uncommanded, cut, too_thin))
 
 
 def same(one: Press, other: Press) -> bool:
@@ -51,18 +79,46 @@ def same(one: Press, other: Press) -> bool:
     return images and np.array_equal(one.coverage, other.coverage) and one.measured == other.measured
 
 
-def test_a_press_is_prepared_once_for_each_scale(session: Path, prepared: list[str]) -> None:
+def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, work: Counter[str]) -> None:
+    request = Request(places=(str(session),), out=tmp_path / "report", parquet=False)
+    fit_presses(FitRequest(session))
+    validate(request)
+    assert (work["prepare_job"], work["refit"], work["score_job"]) == (3, 3, 3)
+    fit_presses(FitRequest(session))
+    validate(request)
+    assert work.total() == 9
+
+
+def test_what_a_press_depends_on_makes_it_anew(
+    session: Path, tmp_path: Path, work: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = read(session)
     assert [press.stroke.depth_mm for press in first] == [11.0, 15.0, 20.0]
-    again = read(session)
-    assert len(prepared) == 3
-    assert all(map(same, first, again))
+    assert all(map(same, first, read(session)))
+    assert work["prepare_job"] == 3
+
     read(session, Field(mm_per_px=0.4))
-    assert len(prepared) == 6
+    assert work["prepare_job"] == 6, "another scale"
+    params = CALIBRATION.model_copy(update={"preprocess": {"contrast_gate": 0.3}})
+    for calibration in (CALIBRATION, params):
+        read(replace(open_session(session), calibration=calibration))
+    assert work["prepare_job"] == 12, "other parameters"
+    monkeypatch.setattr(store, "VERSION", "of tomorrow")
+    read(session)
+    assert work["prepare_job"] == 15, "other software"
+
+    photograph = tmp_path / "photos" / "0.png"
+    image = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(photograph), np.roll(image, 10, axis=1))
+    lines = (tmp_path / "photos" / "strokes.csv").read_text().splitlines()
+    other = imported(tmp_path / "photos", lines, tmp_path / "other", "press")
+    shutil.copytree(session / store.FOLDER, other / store.FOLDER)
+    assert not same(first[0], read(other)[0])
+    assert work["prepare_job"] == 18, "another photograph"
 
 
 def test_damaged_large_and_lost_entries_are_prepared_again(
-    session: Path, prepared: list[str], monkeypatch: pytest.MonkeyPatch
+    session: Path, work: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = read(session)
     flipped, truncated, lost = sorted((session / store.FOLDER).iterdir())
@@ -71,13 +127,23 @@ def test_damaged_large_and_lost_entries_are_prepared_again(
     flipped.write_bytes(data)
     truncated.write_bytes(truncated.read_bytes()[:100])
     lost.unlink()
-    assert all(map(same, first, read(session)))
-    assert len(prepared) == 6
-    assert all(map(same, first, read(session)))
-    assert len(prepared) == 6
+    for _ in range(2):
+        assert all(map(same, first, read(session)))
+        assert work["prepare_job"] == 6
     monkeypatch.setattr(store, "MAX_ENTRY_BYTES", 1000)
     key = flipped.name.removesuffix(".npz.gz")
     assert store.Store(session / store.FOLDER).get(key) is None, "more than may be unpacked"
+
+
+def test_two_processes_at_once_do_no_harm(session: Path, work: Counter[str]) -> None:
+    command = [sys.executable, "-c", READ, str(session)]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    one, other = (process.communicate()[0] for process in both)
+    assert [process.returncode for process in both] == [0, 0]
+    assert one == other != ""
+    assert str([float(press.coverage.sum()) for press in read(session)]) == one.strip()
+    assert work["prepare_job"] == 0
+    assert len(list((session / store.FOLDER).iterdir())) == 3, "no half-written file is left"
 
 
 def test_the_oldest_entries_make_room(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,9 +153,7 @@ def test_the_oldest_entries_make_room(session: Path, monkeypatch: pytest.MonkeyP
     assert list((session / store.FOLDER).iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_written_does_not_stop_the_work(
-    session: Path, prepared: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "no space left")
 
@@ -98,7 +162,7 @@ def test_a_folder_that_cannot_be_written_does_not_stop_the_work(
     assert not (session / store.FOLDER).exists()
 
 
-def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(session: Path, prepared: list[str]) -> None:
+def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(session: Path, work: Counter[str]) -> None:
     [name, *_] = [press.stroke.stroke_id for press in read(session)]
     mark_bad_or_good(session, 0, name, 1)
     refused: list[tuple[str, str]] = []
@@ -106,7 +170,7 @@ def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(sessi
     assert refused == [(name, "was marked bad")]
     mark_bad_or_good(session, 0, name, 2)
     assert len(read(session)) == 3
-    assert len(prepared) == 3
+    assert work["prepare_job"] == 3
 
 
 def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Path, tmp_path: Path) -> None:

@@ -14,10 +14,6 @@ def test_the_corners_of_a_line_come_before_its_middle() -> None:
     assert farthest_first(places, 2, 3) == [2, 0, 4]
 
 
-def test_equal_points_come_once_each() -> None:
-    assert sorted(farthest_first(np.zeros((4, 2)), 1, 4)) == [0, 1, 2, 3]
-
-
 @pytest.mark.parametrize("count", [0, 3])
 def test_more_points_than_there_are_cannot_be_chosen(count: int) -> None:
     with pytest.raises(ValueError, match="allowed 1 to 2"):

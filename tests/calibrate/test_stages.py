@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from brushloop.calibrate.cli import app
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import Field
-from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stages import Trace, trace_scaled
 from brushloop.calibrate.stroke.params import Params
 
@@ -52,18 +51,7 @@ def test_a_stroke_comes_out_at_the_scale_of_the_validation_with_its_anchor() -> 
     assert found.flags == ()
 
 
-def test_without_an_anchor_the_stroke_lies_in_the_middle() -> None:
-    found = trace(photograph((200, 150)))
-    rows, columns = np.nonzero(inked(found))
-    assert (columns.mean(), rows.mean()) == pytest.approx((63.5, 63.5), abs=1.0)
-    assert "crop.anchor_x_px" not in found.log
-
-
-def test_an_anchor_far_from_the_stroke_is_refused() -> None:
-    with pytest.raises(CaptureRefused, match="none of it is in the field"):
-        trace(photograph((200, 150)), (700.0, 500.0))
-
-
+LONG = cv2.line(photograph(), (100, 300), (700, 300), 25, 30)
 EIGHT = [(150 + 165 * (k % 4), 150 + 250 * (k // 4)) for k in range(8)]
 
 
@@ -74,17 +62,12 @@ EIGHT = [(150 + 165 * (k % 4), 150 + 250 * (k // 4)) for k in range(8)]
         (photograph((400, 300), paper=300), "saturated"),
         (photograph((400, 300), glare=(400, 318), paper=170), "glare"),
         (photograph((790, 300)), "cut"),
+        (LONG, "too long"),
     ],
-    ids=["neighbours", "too bright", "glare", "at the edge"],
+    ids=["neighbours", "too bright", "glare", "at the edge", "long"],
 )
 def test_a_defect_is_flagged(image: np.ndarray, flag: str) -> None:
     assert any(one.startswith(flag) for one in trace(image).flags)
-
-
-def test_a_stroke_longer_than_the_field_is_flagged() -> None:
-    image = photograph()
-    cv2.line(image, (100, 300), (700, 300), 25, 30)
-    assert any(flag.startswith("too long") for flag in trace(image).flags)
 
 
 def test_holes_of_glare_are_filled_where_that_is_asked_for() -> None:

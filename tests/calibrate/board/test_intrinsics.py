@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.artefact import load_artefact
 from brushloop.calibrate.board.detect import BoardView, find_board
 from brushloop.calibrate.board.intrinsics import LensFile, guidance
 from brushloop.calibrate.board.intrinsics import fit_lens as fit
@@ -91,19 +90,6 @@ def test_a_real_charuco_board_is_seen_whole() -> None:
     assert len(find_board(cv2.imread(str(DATA / "choriginal.jpg"), 0), CHARUCO, "photograph").ids) == 24
 
 
-@pytest.mark.parametrize("times", [1, 3], ids=["each once", "each three times"])
-def test_a_photograph_that_is_given_again_counts_once(times: int) -> None:
-    seen = views(2)
-    given = [jogged(view, f"{k}-{view.name}", 0.0 if k < 2 else 0.1) for view in seen for k in range(times)]
-    with pytest.raises(CalibrationError) as refused:
-        fit_lens(given)
-    message = str(refused.value)
-    assert message.startswith(f"{len(given)} photographs: 2 usable views of the board, at least 4 needed")
-    if times > 1:
-        assert "1-0.png, 2-0.png: shows the board where 0-0.png does: they count once" in message
-    assert "\n" not in message
-
-
 def test_views_given_again_do_not_make_a_lens_surer() -> None:
     seen = views(8)
     again = [*seen, *(jogged(view, f"again-{view.name}") for view in seen)]
@@ -137,6 +123,11 @@ def test_an_interval_is_given_where_the_views_allow_it_and_then_holds_the_truth(
         assert fitted.focal_reach_px is not None
         held += abs(fitted.lens.matrix[0] - TRUE.matrix[0]) <= fitted.focal_reach_px[0]
     assert held >= 5
+    assert fitted.warnings == ()
+    assert fitted.rms_px == pytest.approx(0.1 * 2**0.5, rel=0.1)
+    corners = np.array([[10.0, 10.0], [630.0, 10.0], [320.0, 470.0]])
+    assert fitted.lens.undistorted(corners) == pytest.approx(TRUE.undistorted(corners), abs=1.5)
+    assert TRUE.distorted(TRUE.undistorted(corners)) == pytest.approx(corners, abs=1e-6)
 
 
 def other_camera(f: float, x_px: float, y_px: float) -> Lens:
@@ -152,17 +143,6 @@ def test_photographs_of_two_cameras_that_differ_much_leave_a_residual_that_says_
     assert "of one camera" in warning
 
 
-def test_a_known_lens_is_found_within_its_standard_errors() -> None:
-    fitted = fit_lens(views(12))
-    assert fitted.focal_se_px is not None
-    for k in (0, 1):
-        assert abs(fitted.lens.matrix[k] - TRUE.matrix[k]) < 4 * fitted.focal_se_px[k]
-    assert fitted.rms_px == pytest.approx(0.1 * 2**0.5, rel=0.1)
-    corners = np.array([[10.0, 10.0], [630.0, 10.0], [320.0, 470.0]])
-    assert fitted.lens.undistorted(corners) == pytest.approx(TRUE.undistorted(corners), abs=1.5)
-    assert TRUE.distorted(TRUE.undistorted(corners)) == pytest.approx(corners, abs=1e-6)
-
-
 def test_a_view_that_does_not_fit_is_dropped_by_name() -> None:
     seen = views(10)
     bent = seen[4].pixels + np.random.default_rng(1).normal(0, 2.0, seen[4].pixels.shape)
@@ -171,12 +151,6 @@ def test_a_view_that_does_not_fit_is_dropped_by_name() -> None:
     assert list(fitted.dropped) == ["bent.png"]
     assert "bent.png" not in fitted.residuals_px
     assert fitted.lens.matrix[0] == pytest.approx(800.0, rel=0.005)
-
-
-def test_bad_residuals_warn_before_a_session_begins() -> None:
-    assert fit_lens(views(12)).warnings == ()
-    [warning] = fit_lens(views(12, noise_px=0.8)).warnings
-    assert "exceeds 0.5 px" in warning
 
 
 def test_it_says_what_else_to_photograph() -> None:
@@ -228,11 +202,3 @@ def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
     assert "partly hidden" in find_board(half, CHARUCO, "half").flags[0]
     bright = np.where(charuco() > 100, 255, 40).astype(np.uint8)
     assert "saturated" in find_board(bright, CHARUCO, "bright").flags[0]
-
-
-def test_a_lens_file_cannot_be_edited(tmp_path: Path) -> None:
-    path = fit_lens(views(8)).save(tmp_path)
-    assert load_artefact(path, LensFile).lens.matrix[0] == pytest.approx(800.0, rel=0.01)
-    path.write_text(path.read_text().replace('"a board"', '"another"'))
-    with pytest.raises(CalibrationError, match="was edited"):
-        load_artefact(path, LensFile)

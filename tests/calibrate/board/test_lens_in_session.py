@@ -137,17 +137,6 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
         calibrate_session(session, tmp_path / "nosuch.json")
 
 
-def test_lens_a_then_b_then_a_leaves_a_in_use(
-    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
-) -> None:
-    session, other = collected(photographed, tmp_path / "s", shot), rig_lens(tmp_path, CAMERAS[BARREL].k1 + 0.004)
-    made = [calibrate_session(session, one) for one in (lens, other, lens)]
-    assert made[0] == made[2] != made[1]
-    assert current(session) == made[0]
-    shown = CliRunner().invoke(app, ["calibrate", "show", str(session)])
-    assert f'lens.source = "lens file {lens.stem}"' in shown.output
-
-
 def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:
     straight = sheet(0, 1)
     made = load_artefact(calibrate_session(collected(photographed, tmp_path / "straight", straight)), Calibration)

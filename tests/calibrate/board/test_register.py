@@ -50,8 +50,6 @@ def test_a_board_printed_too_small_shows_in_the_residuals() -> None:
 
 
 def test_too_little_to_go_by_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="at least 3 are needed"):
-        register(NAMES[:2], ROBOT[:2], seen()[:2])
     with pytest.raises(CalibrationError, match="within 1 mm"):
         register(NAMES, ROBOT * 0.001, seen())
     with pytest.raises(CalibrationError, match="mixed up"):
@@ -67,12 +65,3 @@ def test_the_table_of_points_is_read_and_its_faults_are_named(tmp_path: Path) ->
     table.write_text("name,robot_x_mm,robot_y_mm,image_x_px,image_y_px\na,1,nan,3,4\n")
     with pytest.raises(CalibrationError, match="line 2, column `robot_y_mm`: 'nan' is not a finite number"):
         read_points(table)
-    table.write_text("name,x\na,1\n")
-    with pytest.raises(CalibrationError, match="missing: robot_x_mm"):
-        read_points(table)
-
-
-def test_a_registration_becomes_a_file_named_after_its_contents(tmp_path: Path) -> None:
-    file = register(NAMES, ROBOT, seen())
-    assert file.save(tmp_path).stem == file.digest
-    assert file.robot_to_paper[2] == pytest.approx(110.0, abs=0.5)

@@ -34,15 +34,11 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-@pytest.mark.parametrize("shade", [0.0, 0.3, 0.6])
-def test_the_stroke_is_found_whatever_the_light_does(shade: float) -> None:
-    truth = stroke()
+@pytest.mark.parametrize(("shade", "length_mm", "width_mm"), [(0.0, 20.0, 8.0), (0.6, 20.0, 8.0), (0.0, 34.0, 20.0)])
+def test_the_stroke_is_found_whatever_the_light_does(shade: float, length_mm: float, width_mm: float) -> None:
+    """A thick stroke is not taken for shadow."""
+    truth = stroke(length_mm, width_mm)
     assert iou(prepare(page(truth, shade=shade), None, "page", PARAMS).mask, truth) > 0.98
-
-
-def test_a_thick_stroke_is_not_taken_for_shadow() -> None:
-    truth = stroke(34.0, 20.0)
-    assert iou(prepare(page(truth), None, "page", PARAMS).mask, truth) > 0.98
 
 
 @pytest.mark.parametrize("shade", [0.0, 0.5])
@@ -143,8 +139,5 @@ def test_a_point_of_little_weight_moves_a_line_little() -> None:
     assert less is not None
     assert even.slope > 2.0
     assert less.slope == pytest.approx(1.0, abs=0.2)
-
-
-def test_a_line_needs_three_points_and_some_spread() -> None:
     assert fit_line([1.0, 2.0], [1.0, 2.0]) is None
     assert fit_line([1.0, 1.0, 1.0], [1.0, 2.0, 3.0]) is None
