@@ -12,6 +12,9 @@ from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import apply
 from brushloop.calibrate.board.spec import BoardSpec
 
+FITTED = "k1 fitted on the board"
+"""Source of a lens where no lens file was given and none was needed."""
+
 
 class Foreign(Frozen):
     """Origin of a calibration that was made for another session and applied by force, and its error here."""

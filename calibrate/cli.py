@@ -73,8 +73,8 @@ def apply_to(
 ) -> None:
     """Use a calibration for a session from now on; another session's needs --force."""
     from brushloop.calibrate.artefact import load_artefact
+    from brushloop.calibrate.calibrated import apply_calibration
     from brushloop.calibrate.calibration import Calibration
-    from brushloop.calibrate.session import apply_calibration
 
     path = apply_calibration(calibration, session, force=force)
     if label := load_artefact(path, Calibration).label:

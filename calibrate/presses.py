@@ -30,9 +30,8 @@ from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.pool import Scheduler, threads
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.store import Arrays, key_of
-from brushloop.calibrate.stroke.measure import Measured, measure
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask
-from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Condition, Stroke

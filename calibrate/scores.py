@@ -19,7 +19,7 @@ from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.stats import CEILING, Floats, Integers, Summary, average, summarise
-from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.sessions.records import Condition, Header, Stroke
 
 Cell = tuple[float, float]

@@ -28,9 +28,17 @@ from brushloop.calibrate.compare.place import prepare_cell
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import Line, fit_line
-from brushloop.calibrate.stroke.measure import Measured, measure, outline
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params
-from brushloop.calibrate.stroke.preprocess import Prepared, components, fill_holes, preprocess, touches_edge
+from brushloop.calibrate.stroke.preprocess import (
+    Measured,
+    Prepared,
+    components,
+    fill_holes,
+    measure,
+    outline,
+    preprocess,
+    touches_edge,
+)
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.model.drag import Drawings, Floats
 from brushloop.sessions.errors import SessionDamaged

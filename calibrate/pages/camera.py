@@ -23,7 +23,7 @@ from brushloop.calibrate.board.lens import Floats, Gray, Lens, rms
 from brushloop.calibrate.board.pix2len import local_scale
 from brushloop.calibrate.board.spec import describe
 from brushloop.calibrate.board.view import LEAST_PX_PER_MM, NO_BOARD, WORST_INTERVAL, paper_mm, rig_of
-from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.calibration import FITTED, Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import (
     BLUE,
@@ -38,7 +38,6 @@ from brushloop.calibrate.report import (
     source_point,
     write_page,
 )
-from brushloop.calibrate.session import FITTED
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke.params import Floats, Gray, Mask, Soft
-from brushloop.calibrate.stroke.preprocess import LIGHT_ROUNDS, parts_near
+from brushloop.calibrate.stroke.preprocess import LIGHT_ROUNDS, parts_near, quadratic, touches_edge
 
 DARK_SHARE = 0.6
 """A pixel darker than this share of the paper held ink before: new ink on top of it cannot be seen."""
@@ -128,9 +128,7 @@ def _paper(first: Soft) -> Soft:
 
 def _gain(first: Soft, second: Soft, clean: Mask) -> Soft:
     """Change of the light: a quadratic surface fitted to second / first where the paper stayed clean."""
-    height, width = first.shape
-    y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
-    basis = np.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1), np.float64)
+    basis = quadratic(first.shape)
     thin = (slice(None, None, 4), slice(None, None, 4))
     terms, ratio = basis[thin].reshape(-1, 6), (second / np.maximum(first, 1.0))[thin].ravel().astype(np.float64)
     use = clean[thin].ravel()
@@ -191,6 +189,6 @@ def _flags(mask: Mask, clean: Mask, shift: tuple[float, float], px_per_mm: float
         flags.append(f"crosses: {touching_mm:.1f} mm of its edge lie on older ink, where new ink cannot be seen")
     if max(map(abs, shift)) > 1.0:
         flags.append(f"moved: the page lay {np.hypot(*shift):.1f} px from where it was")
-    if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():
+    if touches_edge(mask):
         flags.append("cut: the stroke reaches the edge of the photograph")
     return tuple(flags)

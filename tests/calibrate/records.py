@@ -10,7 +10,7 @@ import numpy as np
 from brushloop.calibrate.compare.place import KEYS
 from brushloop.calibrate.loop.compare import AGAIN, ANOTHER, SIMULATED, LoopRecord, table_1, verdicts
 from brushloop.calibrate.scores import Row, Scores
-from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.scores import PAIRS, PLANNED, Table3Row, WrittenRecord, WrittenScore, table_3
 from brushloop.sessions.records import Condition, Source, Stroke

@@ -14,9 +14,10 @@ from typer.testing import CliRunner, Result
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
+from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.session import calibrate_session, calibration_of
+from brushloop.calibrate.session import calibration_of
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
@@ -46,7 +47,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory, photographed: Photographe
         photographed(root / name, board_of(Table()), [image], [(stroke, image)])
         for name, image in (("one", sheet(VIEW)), ("other", sheet(moved)))
     )
-    calibrate_session(one)
+    calibrate_session(CalibrateRequest(one))
     return one, other
 
 
@@ -84,7 +85,7 @@ def test_show_shows_every_value_of_an_artefact_or_of_the_one_a_session_uses(pair
 def test_diff_says_what_changed_and_what_it_means_on_the_paper(pair: tuple[Path, Path, Path]) -> None:
     one, other, made = pair
     assert run("diff", one, made).output == "they are equal\n"
-    calibrate_session(other)
+    calibrate_session(CalibrateRequest(other))
     printed = run("diff", one, other).output
     assert 'session_id: "one" -> "other"' in printed
     assert "preprocess" not in printed
@@ -119,7 +120,7 @@ def test_another_sessions_calibration_is_refused_unless_forced_and_then_labelled
     assert applied.named.startswith(applied.digest + ", foreign calibration")
     assert run("show", other).output.splitlines()[1].startswith("foreign calibration")
 
-    calibrate_session(other)
+    calibrate_session(CalibrateRequest(other))
     run("apply", made, other, "--force")
     assert used(other) == applied, "what was applied last is used"
 

@@ -13,8 +13,8 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
+from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
 from brushloop.calibrate.compare.place import Field
-from brushloop.calibrate.session import calibrate_session
 from brushloop.sessions.records import Stroke
 from tests.calibrate.simulated_rigs import Shot, sheet, true_mask
 
@@ -51,7 +51,7 @@ def exported(session: Path) -> Path:
     refused = run("sessions", "export", session, session.parent / "early", "--crops")
     assert f"is not calibrated: run `brushloop calibrate {session}`" in str(refused.exception)
     assert not (session.parent / "early").exists()
-    calibrate_session(session)
+    calibrate_session(CalibrateRequest(session))
     out = session.parent / "exported"
     ran = run("sessions", "export", session, out, "--crops")
     assert ran.exit_code == 0, ran.output

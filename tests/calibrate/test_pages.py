@@ -22,7 +22,7 @@ from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, Pair, sc
 from brushloop.calibrate.loop.report import write_loop
 from brushloop.calibrate.pages.camera import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.calibrate.writing.report import write_written

@@ -19,10 +19,11 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import fit_lens, read_lens
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.view import see_board
-from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.calibrated import CalibrateRequest
+from brushloop.calibrate.calibrated import calibrate_session as calibrate
+from brushloop.calibrate.calibration import FITTED, Calibration
 from brushloop.calibrate.compare.place import Field, Tone, captured_mm, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.session import FITTED, calibrate_session
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.recording import Recording
@@ -51,6 +52,10 @@ def shot() -> Shot:
 @pytest.fixture(scope="module")
 def lens(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return rig_lens(tmp_path_factory.mktemp("lens"), CAMERAS[BARREL].k1)
+
+
+def calibrate_session(session: Path, lens: Path | None = None) -> Calibration:
+    return calibrate(CalibrateRequest(session, lens)).calibration
 
 
 def collected(photographed: Photographed, folder: Path, shot: Shot, optics: Lens | None = None) -> Path:
@@ -124,9 +129,9 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
 ) -> None:
     session = collected(photographed, tmp_path / "own", shot, read_lens(lens))
     steps: list[int] = []
-    made = calibrate_session(session, progress=lambda _what, done, _of: steps.append(done))
+    made = calibrate(CalibrateRequest(session), lambda _what, done, _of: steps.append(done)).calibration
     assert steps == [0, 1, 2, 3]
-    holds(load_artefact(made, Calibration), shot)
+    holds(made, shot)
     wrong = rig_lens(tmp_path / "wrong", 0.08)
     with pytest.raises(CalibrationError, match=r"bent by .* of another camera, or of another focus"):
         calibrate_session(session, wrong)
@@ -139,7 +144,7 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
 
 def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:
     straight = sheet(0, 1)
-    made = load_artefact(calibrate_session(collected(photographed, tmp_path / "straight", straight)), Calibration)
+    made = calibrate_session(collected(photographed, tmp_path / "straight", straight))
     assert made.lens is not None
     assert made.lens.source == FITTED
     holds(made, straight)
@@ -201,7 +206,7 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     refused = CliRunner().invoke(app, command)
     assert "is not calibrated: run `brushloop calibrate" in str(refused.exception)
     assert not out.exists()
-    made = load_artefact(calibrate_session(session, lens), Calibration)
+    made = calibrate_session(session, lens)
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == 0, shown.output
     fields = dict(line.split() for line in shown.output.splitlines() if line.startswith("undistort."))
@@ -224,4 +229,4 @@ def test_a_lens_from_slanted_boards_carries_a_session(photographed: Photographed
     views = [find_board(image, sheet(rig, 1).board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
     lens = fit_lens(views, "a board", {}, {}).save(tmp_path)
     seen = sheet(rig, 15)
-    holds(load_artefact(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), Calibration), seen)
+    holds(calibrate_session(collected(photographed, tmp_path / "s", seen), lens), seen)

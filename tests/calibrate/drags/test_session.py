@@ -25,8 +25,8 @@ from brushloop.calibrate.drags.captures import (
 )
 from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke.measure import measure
 from brushloop.calibrate.stroke.params import Params
+from brushloop.calibrate.stroke.preprocess import measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Source

@@ -8,9 +8,8 @@ import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stats import fit_line
-from brushloop.calibrate.stroke.measure import measure
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
-from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.preprocess import measure, prepare
 from brushloop.calibrate.stroke.rectify import rectify, rescale
 
 PAGE = (800, 800)

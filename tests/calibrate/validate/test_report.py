@@ -24,7 +24,7 @@ from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Row, Scores
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.command import Request, validate
 from brushloop.calibrate.validate.findings import trust
 from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT

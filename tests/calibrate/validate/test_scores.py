@@ -13,7 +13,7 @@ from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, leve
 from brushloop.calibrate.pool import threads
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.calibrate.scores import Row, Scores, similarities
-from brushloop.calibrate.stroke.measure import Measured
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.command import open_session
 from brushloop.calibrate.validate.models import ANOTHER, REPEATED
 from brushloop.calibrate.validate.run import Options, ScoreJob, score_job, validate_presses

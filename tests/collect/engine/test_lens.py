@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
-from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.session import calibrate_session
+from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
@@ -62,7 +60,7 @@ def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> No
     assert looked.binary is not None
     assert looked.binary.any()
 
-    made = load_artefact(calibrate_session(folder), Calibration)
+    made = calibrate_session(CalibrateRequest(folder)).calibration
     assert made.lens is not None
     assert made.lens.source == f"lens file {lens.stem}"
 
