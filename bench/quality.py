@@ -31,8 +31,8 @@ from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec, Flaw
 from brushloop.drivers.sim.brush.drag import Waypoint
 from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint
-from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 
 GOAL, FALSE_ALARMS_GOAL, SECONDS_GOAL = 0.95, 0.02, 0.06

@@ -25,7 +25,7 @@ from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Ink, Stamp
 from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.camera import mjpeg_server
+from brushloop.drivers.sim import mjpeg_server
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
 from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml

@@ -27,10 +27,10 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.faults import Hung, fault_of
-from brushloop.drivers.sim.rig import Faults
-from brushloop.drivers.sim.server import LoopbackServer
+from brushloop.drivers.sim.rig import LoopbackRig
 
 Person = Callable[[Mapping[str, object]], Awaitable[dict[str, Any]]]
 """Carries out a `hand` request. Raises ValueError, with a one-line message, for an invalid request."""
@@ -57,9 +57,9 @@ USAGE = (
 class ControlServer(LoopbackServer):
     """Live control of the faults of one rig, and of the person in its lab if there is one."""
 
-    def __init__(self, faults: Faults, person: Person | None = None) -> None:
+    def __init__(self, rig: LoopbackRig, person: Person | None = None) -> None:
         super().__init__()
-        self._faults = faults
+        self._rig = rig
         self._person = person
         self._path: Path | None = None
         self._made = (0, 0)
@@ -111,10 +111,10 @@ class ControlServer(LoopbackServer):
         do = str(request.get("do"))
         if do not in FIELDS or not set(request) <= {"do", *FIELDS[do]}:
             raise ValueError(USAGE)
-        board = self._faults.board
+        board = self._rig.faults
         match do, request.get("fault"), request.get("id"):
             case "add", dict(values), _:  # pyright: ignore[reportUnknownVariableType]
-                return {"id": self._faults.hang(fault_of(values))}  # pyright: ignore[reportUnknownArgumentType]
+                return {"id": board.hang(fault_of(values))}  # pyright: ignore[reportUnknownArgumentType]
             case "list", _, _:
                 return {"hanging": [_as_json(h) for h in board.hanging], "over": [_as_json(h) for h in board.over]}
             case "clear", _, None:
@@ -122,11 +122,11 @@ class ControlServer(LoopbackServer):
             case "clear", _, int(ident) if not isinstance(ident, bool):
                 return {"taken": int(board.take(ident))}
             case "state", _, _:
-                return self._faults.state()
+                return self._rig.state()
             case "release", _, _:
-                return {"was": self._faults.release()}
+                return {"was": self._rig.arcs.cabinet.release()}
             case "fresh-sheet", _, _:
-                self._faults.fresh_sheet()
+                self._rig.world.fresh_sheet()
                 return {}
             case "hand", _, _ if self._person is not None:
                 return await self._person(request)
@@ -137,9 +137,9 @@ class ControlServer(LoopbackServer):
 
 
 @contextlib.asynccontextmanager
-async def live_control(faults: Faults, path: Path | None, person: Person | None = None) -> AsyncGenerator[None]:
+async def live_control(rig: LoopbackRig, path: Path | None, person: Person | None = None) -> AsyncGenerator[None]:
     """A control socket at `path` until the block ends; none if `path` is None. Raises `SimFileError`."""
-    server = ControlServer(faults, person)
+    server = ControlServer(rig, person)
     if path is not None:
         await server.open(path)
     try:

@@ -6,11 +6,12 @@ each phase is in the table of docs/faults.md, "Ten faults in ten phases"; tests/
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any
@@ -196,6 +197,7 @@ def fault_of(values: dict[str, Any]) -> Fault:
         raise ValueError(f"{field}: {what}" if field else what) from None
 
 
+TICK_S, IDLE_TICK_S = 0.002, 0.02
 KEPT = 100
 """Finished faults that are still listed."""
 MOST = 1000
@@ -219,8 +221,12 @@ class Hung:
 class FaultBoard:
     """Faults in the order in which they were added; of several that match one request the first strikes it."""
 
-    def __init__(self, truth: Truth, real_s: Callable[[], float] = time.monotonic) -> None:
-        self._truth = truth
+    def __init__(
+        self, truth: Truth, missing: Sequence[Device] = (), real_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`missing`: devices that the rig does not have."""
+        self.truth = truth
+        self._missing = missing
         self._real_s = real_s
         self._idents = itertools.count(1)
         self._hanging: dict[int, Hung] = {}
@@ -228,7 +234,9 @@ class FaultBoard:
         """The newest finished faults."""
 
     def hang(self, fault: Fault) -> int:
-        """Add a fault; return the number by which it can be removed. Raises ValueError above `MOST`."""
+        """Add a fault; return the number by which it can be removed. Raises ValueError where it can never strike."""
+        if fault.device in self._missing:
+            raise ValueError(f"device = {fault.device.value!r}: this rig has none")
         if len(self._hanging) >= MOST:
             raise ValueError(f"there are already {MOST} faults on the board")
         hung = Hung(next(self._idents), fault)
@@ -262,6 +270,19 @@ class FaultBoard:
             if fault.device is device and fault.kind in kinds and self._strikes(hung, op):
                 return fault
         return None
+
+    def kind(self, device: Device) -> str | None:
+        """The kind of the fault that strikes this request to a device, or its round; None for a sound one."""
+        fault = self.meet(device, "", KINDS[device])
+        return None if fault is None else fault.kind
+
+    async def watch(self, stop: Callable[[str], None]) -> None:
+        """Begin faults that no request triggers, until cancelled; `stop` gets the kind of each safety stop."""
+        while True:
+            waits = self.waits_by_itself
+            for fault in self.due() if waits else ():
+                stop(fault.kind)
+            await asyncio.sleep(TICK_S if waits else IDLE_TICK_S)
 
     def due(self) -> list[Fault]:
         """Begin the faults that are due now without a request; return the stops among them, which are finished."""
@@ -297,7 +318,7 @@ class FaultBoard:
             hung.until_s = self._real_s() + hung.fault.for_s
 
     def _holds(self, fault: Fault) -> bool:
-        truth = self._truth
+        truth = self.truth
         return (
             truth.now_s() >= fault.after_s
             and (fault.press is None or truth.presses == fault.press)

@@ -8,17 +8,15 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL, Wrench
+from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.geometry import columns, inverse, of_angles, product
-from brushloop.drivers.sim.arcs.cabinet import EMERGENCY_STOPS
+from brushloop.drivers.ink.simulator import Instrument, PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
-from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
-from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.faults import KINDS, Device, Fault, FaultBoard, Truth
-from brushloop.drivers.sim.instruments.force_board import ForceBoard, SocketcandServer
-from brushloop.drivers.sim.instruments.ink import Instrument, PtyLine, PumpFirmware, StationFirmware
+from brushloop.drivers.sim.faults import Device, FaultBoard, Truth
+from brushloop.drivers.sim.mjpeg_server import MjpegServer
+from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 
 LOOPBACK_HEAD = "# The loopback rig"
@@ -158,102 +156,6 @@ misplaced_mm = {config.head.misplaced_mm}
 
 HOST = "127.0.0.1"
 """Not configurable: no other machine may drive or watch a simulated arm by mistake."""
-TICK_S = 0.002
-IDLE_TICK_S = 0.02
-
-
-class Faults:
-    """The faults of a rig: a board that all servers share, a task that starts due faults, and the release of stops.
-
-    `ink` and `force` are None in a rig without these devices; their faults are then refused.
-    """
-
-    def __init__(
-        self,
-        world: World,
-        arcs: ArcsServer,
-        rtde: RtdeServer,
-        camera: MjpegServer,
-        *,
-        ink: PtyLine | None = None,
-        force: ForceBoard | None = None,
-    ) -> None:
-        self.truth = Truth(world)
-        self.board = FaultBoard(self.truth)
-        self._world = world
-        self._arcs = arcs
-        arcs.faults = rtde.faults = camera.faults = self.board
-        self._ink, self._force = ink, force
-        if ink is not None:
-            ink.next_fault = lambda: self._kind(Device.INK)
-        if force is not None:
-            force.next_fault = lambda: self._kind(Device.FORCE)
-        self._watching: asyncio.Task[None] | None = None
-
-    def hang(self, fault: Fault) -> int:
-        """Put a fault on the board; return its number. Raises ValueError for a device that the rig does not have."""
-        if {Device.INK: self._ink, Device.FORCE: self._force}.get(fault.device, self) is None:
-            raise ValueError(f"device = {fault.device.value!r}: this rig has none")
-        return self.board.hang(fault)
-
-    def start(self) -> None:
-        """Start the watching task in the running event loop."""
-        self._watching = asyncio.create_task(self._watch(), name="faults")
-
-    async def stop(self) -> None:
-        """Stop the watching task; faults stay on the board."""
-        task, self._watching = self._watching, None
-        if task is not None:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-
-    def release(self) -> str:
-        """End a safety stop as a person at the arm would; return the previous safety mode.
-
-        A protective stop is unlocked at the pendant, and a safeguard stop is reset at its input. For an emergency stop,
-        the button is released and the interface board restarted, which leaves the arm without power.
-        """
-        cabinet = self._arcs.cabinet
-        before = cabinet.power.safety
-        if before == SafetyMode.PROTECTIVE_STOP:
-            cabinet.power.unlock()
-        elif before == SafetyMode.SAFEGUARD_STOP:
-            cabinet.power.reset_safeguard()
-        elif before in EMERGENCY_STOPS:
-            cabinet.power.release_emergency_stop()
-            cabinet.power.restart_interface_board()
-        return before.value
-
-    def fresh_sheet(self) -> None:
-        """Replace the sheet by a blank one."""
-        self._world.fresh_sheet()
-
-    def state(self) -> dict[str, Any]:
-        """Current state of the world, as JSON."""
-        cabinet = self._arcs.cabinet
-        x_mm, y_mm, z_mm = self._world.tool().position_mm
-        return {
-            "now_s": round(self.truth.now_s(), 3),
-            "phase": self.truth.phase().value,
-            "moving": self.truth.target() is not None,
-            "tip_mm": [round(x_mm, 3), round(y_mm, 3), round(z_mm, 3)],
-            "presses": self.truth.presses,
-            "ink_load": round(self._world.ink_load, 3),
-            "robot_mode": cabinet.power.mode.value,
-            "safety_mode": cabinet.power.safety.value,
-            "faults": len(self.board.hanging),
-        }
-
-    async def _watch(self) -> None:
-        while True:
-            waits = self.board.waits_by_itself
-            for stop in self.board.due() if waits else ():
-                self._arcs.stop_as(stop.kind)
-            await asyncio.sleep(TICK_S if waits else IDLE_TICK_S)
-
-    def _kind(self, device: Device) -> str | None:
-        fault = self.board.meet(device, "", KINDS[device])
-        return None if fault is None else fault.kind
 
 
 class LoopbackRig:
@@ -271,8 +173,15 @@ class LoopbackRig:
         self.camera = MjpegServer(self.scene, config.view)
         self.force = _force(self.world) if config.force_sensor else None
         self.ink = None if config.ink_device == "none" else PtyLine(_ink(self.world, config.ink_device))
-        board = None if self.force is None else self.force.board
-        self.faults = Faults(self.world, self.arcs, self.rtde, self.camera, ink=self.ink, force=board)
+        missing = {Device.INK: self.ink, Device.FORCE: self.force}
+        self.faults = FaultBoard(Truth(self.world), [device for device, server in missing.items() if server is None])
+        """One board for all servers."""
+        self.arcs.faults = self.rtde.faults = self.camera.faults = self.faults
+        if self.ink is not None:
+            self.ink.next_fault = lambda: self.faults.kind(Device.INK)
+        if self.force is not None:
+            self.force.board.next_fault = lambda: self.faults.kind(Device.FORCE)
+        self._watching: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> LoopbackRig:
         try:
@@ -284,14 +193,16 @@ class LoopbackRig:
                 await self.force.start(self._host, self.config.force_port)
             if self.ink is not None:
                 self.ink.__enter__()
-            self.faults.start()
+            self._watching = asyncio.create_task(self.faults.watch(self.arcs.stop_as), name="faults")
         except BaseException:
             await self.__aexit__()
             raise
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self.faults.stop()
+        if self._watching is not None:
+            self._watching.cancel()
+            await asyncio.gather(self._watching, return_exceptions=True)
         if self.ink is not None:
             self.ink.close()
         if self.force is not None:
@@ -317,6 +228,21 @@ class LoopbackRig:
         if self.ink is not None:
             places.append(f"ink on {self.ink.path}")
         return ", ".join(places)
+
+    def state(self) -> dict[str, Any]:
+        """Current state of the world, as JSON."""
+        power, truth = self.arcs.cabinet.power, self.faults.truth
+        return {
+            "now_s": round(truth.now_s(), 3),
+            "phase": truth.phase().value,
+            "moving": truth.target() is not None,
+            "tip_mm": [round(v, 3) for v in self.world.tool().position_mm],
+            "presses": truth.presses,
+            "ink_load": round(self.world.ink_load, 3),
+            "robot_mode": power.mode.value,
+            "safety_mode": power.safety.value,
+            "faults": len(self.faults.hanging),
+        }
 
     def reconfigure(self, config: SimConfig) -> None:
         """Change table, view or sensor while serving, as a person in the lab would; tool and brush stay."""

@@ -33,7 +33,7 @@ def serve(
         over = _signalled()
         if write_rig is not None:
             _refuse_to_overwrite(write_rig)
-        async with LoopbackRig(config) as rig, live_control(rig.faults, control):
+        async with LoopbackRig(config) as rig, live_control(rig, control):
             if write_rig is not None:
                 _write_whole(write_rig, rig.toml())
             tell(f"{rig.where()}; Ctrl-C ends")
@@ -56,9 +56,9 @@ def serve_unknown(
 
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
     """
+    from brushloop.drivers.sim.lab.facts import Trap
     from brushloop.drivers.sim.lab.lab import UnknownLab
-    from brushloop.drivers.sim.lab.seen import truth as truth_of
-    from brushloop.drivers.sim.lab.traps import Trap
+    from brushloop.drivers.sim.lab.lab import truth as truth_of
 
     if trap is not None and trap not in [*Trap]:
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
@@ -77,7 +77,7 @@ def serve_unknown(
 
     async def served() -> None:
         over = _signalled()
-        async with lab, live_control(lab.rig.faults, control, obey):
+        async with lab, live_control(lab.rig, control, obey):
             write_truth()
             how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
             tell(*lab.seen().lines(), *how, "Ctrl-C ends")

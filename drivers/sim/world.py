@@ -1,4 +1,4 @@
-"""The simulated world: where the tool is, whether it touches paper or ink, and the marks it leaves."""
+"""The simulated world: where the tool is, its contacts with paper and ink, the force on it, and its marks."""
 
 from __future__ import annotations
 
@@ -6,21 +6,161 @@ import functools
 import itertools
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.rounds import Wrench
-from brushloop.drivers.geometry import brush_pose, from_wire, lean
+from brushloop.drivers.geometry import brush_pose, columns, from_wire, interpolate, lean, of_vector, product, unit
+from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim.arm.kinematics import Matrix, matrix_of
 from brushloop.drivers.sim.arm.motion import MotionQueue
-from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush
-from brushloop.drivers.sim.brush.contact import Contact, ContactWatch, Reaction, bent_toward, leaning_with
+from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush, BrushSpec
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
 from brushloop.drivers.sim.brush.footprint import Flaw, flaw_of_load, natural_split
 from brushloop.drivers.sim.brush.paper import Paper
 from brushloop.drivers.sim.config import SimConfig
+
+SIDEWAYS_MM = 0.5
+"""A contact that travels less far sideways is a press."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """The path of the tip at and below the paper plane; straight lines between poses."""
+
+    poses: tuple[Pose, ...]
+    deepest: Pose
+    """The pose farthest below the plane; the first if there are several."""
+
+    @property
+    def dragged(self) -> bool:
+        """False for a press. Withdrawing along the brush's own axis is not a drag, even if it is tilted."""
+        return sum(_sideways_mm(a, b) for a, b in itertools.pairwise(self.poses)) > SIDEWAYS_MM
+
+
+class ContactWatch:
+    """Collects finished stretches of the path until the brush lifts off the paper.
+
+    `above_mm` is the distance of a pose from the paper plane, negative below; it is linear in the position.
+    """
+
+    def __init__(self, above_mm: Callable[[Pose], float]) -> None:
+        self._above_mm = above_mm
+        self._poses: list[Pose] = []
+
+    def travelled(self, start: Pose, end: Pose) -> Contact | None:
+        """Add one straight stretch; return the contact that it ended, or None."""
+        high, low = self._above_mm(start), self._above_mm(end)
+        if high < 0.0 or low < 0.0:
+            if not self._poses:
+                self._poses.append(start if high < 0.0 else interpolate(start, end, high / (high - low)))
+            self._poses.append(end if low < 0.0 else interpolate(start, end, high / (high - low)))
+        if low < 0.0 or not self._poses:
+            return None
+        contact = Contact(tuple(self._poses), min(self._poses, key=self._above_mm))
+        self._poses = []
+        return contact
+
+
+def _sideways_mm(a: Pose, b: Pose) -> float:
+    """Travel along the paper or across the brush's axis, whichever is shorter."""
+    way = np.subtract(b.position_mm, a.position_mm)
+    axis = np.array(columns(unit(b.quaternion))[2])
+    return min(math.hypot(way[0], way[1]), float(np.linalg.norm(way - (way @ axis) * axis)))
+
+
+TILTS_DEG = (0.0, 7.5, 15.0, 30.0)
+"""Tilts for which the push is solved; between them it is interpolated."""
+GRAVITY_M_S2 = 9.81
+ALONG_RAD = 1e-6
+LEVEL = (0.0, 0.0, 1.0)
+
+
+class Reaction:
+    """The wrench for a pose of the tip above or in the paper.
+
+    The push comes from the same spine as the ink, on the way down. Friction along the paper, the pull of the menisci
+    and the hysteresis on the way up are left out: only the normal force of a press remains.
+    """
+
+    def __init__(self, brush: Brush, *, sensor_to_tip_mm: float, hanging_kg: float) -> None:
+        self._brush = brush
+        self._arm_m = sensor_to_tip_mm / 1e3
+        self._weight_n = hanging_kg * GRAVITY_M_S2
+        self._table: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    def prepare(self) -> None:
+        """Solve the spines; takes some tenths of a second, so call it outside the event loop. Once is enough."""
+        if self._table is not None:
+            return
+        self._table = _pushes(self._brush.spec)
+
+    def push_n(self, depth_mm: float, tilt_deg: float) -> float:
+        """Normal force of the paper on the bundle; 0 in the air."""
+        if depth_mm <= 0.0:
+            return 0.0
+        self.prepare()
+        assert self._table is not None
+        steps_mm, rows = self._table
+        at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
+        return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
+
+    def wrench(
+        self,
+        tip: Pose,
+        depth_mm: float,
+        normal: tuple[float, float, float] = LEVEL,
+        finger_n: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> Wrench:
+        """Force in N and torque in Nm on the sensor, in the tool's frame: z along the tool, towards the tip.
+
+        `normal` is the unit vector out of the paper, `finger_n` a person's push on the tip, both in the base frame.
+        """
+        push_n = self.push_n(depth_mm, lean(leaning_with(tip, normal))[0])
+        push, weight_n = (push_n * part for part in normal), (0.0, 0.0, self._weight_n)
+        force_n = [a - b + c for a, b, c in zip(push, weight_n, finger_n, strict=True)]
+        axes = columns(unit(tip.quaternion))
+        fx, fy, fz = (x * force_n[0] + y * force_n[1] + z * force_n[2] for x, y, z in axes)
+        return fx, fy, fz, -self._arm_m * fy, self._arm_m * fx, 0.0
+
+
+def leaning_with(pose: Pose, normal: tuple[float, float, float]) -> Pose:
+    """The pose in a frame whose z is the paper's normal, rotated from the base frame by the least angle."""
+    if normal == LEVEL:
+        return pose
+    nx, ny, nz = normal
+    share = math.acos(nz) / math.hypot(nx, ny)  # of (ny, -nx, 0), the cross product of the normal and the level one
+    level = of_vector((share * ny, share * -nx, 0.0))
+    return Pose(*pose.position_mm, *product(level, unit(pose.quaternion)))
+
+
+def bent_toward(pose: Pose, tilt_deg: float, heading_deg: float, set_lean_deg: float) -> float:
+    """Direction into which the bundle bends: that of the lean, and for a brush almost upright that of its own set.
+
+    The paper pushes at the tip, so the bundle bends to where its tip lies beside the ferrule's axis. The lean carries
+    the tip toward `heading_deg`, and the set of hair that has been pressed carries it along the wrist's x as far as a
+    lean of `set_lean_deg` would. Without the set, a brush that leans by a tenth of a degree would bend into any
+    direction.
+    """
+    along, _, _ = columns(unit(pose.quaternion))
+    wrist_deg = math.degrees(math.atan2(along[1], along[0]))
+    off = math.radians(math.remainder(heading_deg - wrist_deg, 360.0))
+    if abs(off) < ALONG_RAD:
+        return heading_deg
+    return wrist_deg + math.degrees(math.atan2(tilt_deg * math.sin(off), tilt_deg * math.cos(off) + set_lean_deg))
+
+
+@functools.lru_cache(maxsize=8)
+def _pushes(spec: BrushSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depths (n,) in mm and the normal force (tilts, n) in N at each."""
+    brush = Brush(spec)
+    depth_mm = brush.deepest_mm(TILTS_DEG[-1])
+    rows = [brush.push_n(depth_mm, tilt_deg) for tilt_deg in TILTS_DEG]
+    return np.linspace(0.0, depth_mm, rows[0].size), np.asarray(rows)
 
 
 class SimClock:
@@ -35,45 +175,6 @@ class SimClock:
     def now_s(self) -> float:
         """Simulated seconds since this clock was created."""
         return (time.monotonic() - self._start) * self.rate
-
-
-BRUSH_ML = 0.5
-"""Volume of ink that a dry brush absorbs."""
-
-
-class Well:
-    """The ink well, a straight pot whose bottom is at height 0: dips lower its level, doses raise it."""
-
-    def __init__(self, ml: float, capacity_ml: float, ml_per_mm: float = 1.0) -> None:
-        self.ml = ml
-        self.capacity_ml = capacity_ml
-        self._ml_per_mm = ml_per_mm
-
-    @classmethod
-    def round(cls, radius_mm: float, level_mm: float, depth_mm: float) -> Well:
-        """A round pot that is `depth_mm` deep, filled to `level_mm`."""
-        ml_per_mm = math.pi * radius_mm**2 / 1e3
-        return cls(level_mm * ml_per_mm, depth_mm * ml_per_mm, ml_per_mm)
-
-    @property
-    def level_mm(self) -> float:
-        """Height of the ink above the bottom."""
-        return self.ml / self._ml_per_mm
-
-    @property
-    def share(self) -> float:
-        """Fill level, 0 to 1."""
-        return min(1.0, self.ml / self.capacity_ml)
-
-    def add(self, volume_ml: float) -> None:
-        """Add a dose; any excess is lost."""
-        self.ml = min(self.capacity_ml, self.ml + volume_ml)
-
-    def dip(self, ink_load: float) -> float:
-        """Fill a brush that holds `ink_load` (0 to 1); return its new load."""
-        taken_ml = min(self.ml, (1.0 - ink_load) * BRUSH_ML)
-        self.ml -= taken_ml
-        return ink_load + taken_ml / BRUSH_ML
 
 
 INK_PER_PRESS = 0.12

@@ -2,7 +2,7 @@
 
 A driver is a class that has the methods of its protocol in `drivers/devices.py` (here `Ink`). It goes into
 `drivers/ink/`, its options into the union of ink devices in `collect/rig/config_devices.py`, and its construction into
-`make_ink` in `collect/rig/devices.py`. Write its simulator into `drivers/sim/instruments/` in the same go: real wire
+`make_ink` in `collect/rig/devices.py`. Write its simulator beside it in the same go: real wire
 bytes from both sides are what the tests of the driver, of the faults and of the whole rig run on.
 """
 

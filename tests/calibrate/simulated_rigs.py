@@ -19,8 +19,8 @@ from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.brush.paper import PX_PER_MM as SHEET_PX_PER_MM
-from brushloop.drivers.sim.camera.scene import Optics, Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.scene import Optics, Scene
 from brushloop.drivers.sim.world import World
 
 Gray = NDArray[np.uint8]

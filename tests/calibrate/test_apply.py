@@ -19,8 +19,8 @@ from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.session import calibration_of
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Stroke

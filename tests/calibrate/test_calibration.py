@@ -16,8 +16,8 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 from tests.calibrate.simulated_rigs import board_of
 from tests.command import brushloop

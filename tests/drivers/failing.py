@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from brushloop.drivers.sim.instruments.force_board import ForceBoard
-from brushloop.drivers.sim.instruments.ink import PtyLine
+from brushloop.drivers.force.simulator import ForceBoard
+from brushloop.drivers.ink.simulator import PtyLine
 
 
 def fail_rounds(board: ForceBoard, *faults: str) -> None:

@@ -45,7 +45,7 @@ from brushloop.drivers.errors import DeviceError, MotionFailed, ProtocolViolatio
 from brushloop.drivers.force.rounds import FIRST_ID, RoundAssembler, Wrench, encode_round
 from brushloop.drivers.ink import pump, station
 from brushloop.drivers.ink.port import crc16
-from brushloop.drivers.sim.instruments.ink import PumpFirmware, StationFirmware
+from brushloop.drivers.ink.simulator import PumpFirmware, StationFirmware
 
 DOC = Path(__file__).parents[2] / "docs" / "ink-station.md"
 EXAMPLES = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -161,6 +161,22 @@ class Cabinet:
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
         self.power.press_emergency_stop(mode)
 
+    def release(self) -> str:
+        """End a safety stop as a person at the arm would; return the previous safety mode.
+
+        A protective stop is unlocked at the pendant, and a safeguard stop is reset at its input. For an emergency stop,
+        the button is released and the interface board restarted, which leaves the arm without power.
+        """
+        before = self.power.safety
+        if before == SafetyMode.PROTECTIVE_STOP:
+            self.power.unlock()
+        elif before == SafetyMode.SAFEGUARD_STOP:
+            self.power.reset_safeguard()
+        elif before in EMERGENCY_STOPS:
+            self.power.release_emergency_stop()
+            self.power.restart_interface_board()
+        return before.value
+
     def power_off(self) -> int:
         """Stop the arm, then switch its power off."""
         self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)

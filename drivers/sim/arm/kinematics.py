@@ -57,11 +57,6 @@ def forward(q: Sequence[float]) -> Matrix:
     return _frames(q)[-1]
 
 
-def skeleton(q: Sequence[float]) -> Matrix:
-    """(7, 3) in metres: the foot of the arm and the origins of its joints' frames, in the base frame."""
-    return np.vstack([np.zeros(3), *(frame[:3, 3] for frame in _frames(q))])
-
-
 def inverse(target: Matrix, near: Sequence[float]) -> Joints | None:
     """Joints that bring the flange to `target`, searched from `near`, then from home turned toward the target.
 

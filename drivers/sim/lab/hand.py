@@ -17,7 +17,6 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import interpolate
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
 from brushloop.drivers.sim.arm.kinematics import Joints, inverted
-from brushloop.drivers.sim.camera.scene import Floats, Held
 from brushloop.drivers.sim.lab.facts import (
     LIFT_MM,
     PIN_TILT_DEG,
@@ -33,6 +32,7 @@ from brushloop.drivers.sim.lab.facts import (
     shifted,
     withdrawn,
 )
+from brushloop.drivers.sim.scene import Floats, Held
 
 TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
 """Things that the tip touches; it is brought to the others by eye."""

@@ -17,27 +17,128 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import os
 import socket
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
-from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
-from brushloop.drivers.sim.camera.scene import Held, RoomScene
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.lab.facts import LIFT_MM, PICTURE_PX, draw
+from brushloop.drivers.sim.lab.facts import (
+    CORNERS,
+    LIFT_MM,
+    PICTURE_PX,
+    Facts,
+    Trap,
+    corner,
+    draw,
+    in_base,
+    mended,
+    spring,
+)
 from brushloop.drivers.sim.lab.hand import TOUCHED, Aims, Hand
-from brushloop.drivers.sim.lab.seen import PRESS_SHARE, Seen
-from brushloop.drivers.sim.lab.traps import Trap, mended, spring
+from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.server import LoopbackServer
-from brushloop.drivers.sim.world import World
+from brushloop.drivers.sim.scene import Held, Wall, camera_matrix
+from brushloop.drivers.sim.world import World, tool_of
+
+PRESS_SHARE = 0.45
+"""Deepest press, as a share of the free length, that the maker of the brush allows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Labels, plugs and print of one lab."""
+
+    host: str
+    """Address on the pendant's network page."""
+    streams: tuple[str, ...]
+    """Addresses on the stickers of the cameras."""
+    can: tuple[str, int, str]
+    """Host, port and bus of the CAN gateway with the force sensor."""
+    ink: tuple[str, str] | None
+    """Kind and serial line of the device at the well; None where a person pours."""
+    squares: tuple[int, int]
+    square_mm: float
+    marker_mm: float
+    dictionary: str
+    radius_mm: float
+    length_mm: float
+    max_depth_mm: float
+
+    def lines(self) -> list[str]:
+        """For a person to read."""
+        host, port, bus = self.can
+        ink = "none, a person pours" if self.ink is None else f"{self.ink[0]} on {self.ink[1]}"
+        return [
+            "an unknown lab; simulated: nothing measured in it is a result on paper",
+            f"robot     the pendant shows the address {self.host}",
+            *(f"camera    {stream}" for stream in self.streams),
+            f"force     SRI M8123 on the gateway {host}:{port}/{bus}",
+            f"ink       {ink}",
+            f"print     ChArUco, {self.squares[0]} x {self.squares[1]} squares of {self.square_mm:g} mm, "
+            f"markers of {self.marker_mm:g} mm, {self.dictionary}",
+            f"brush     radius R = {self.radius_mm:g} mm, length L = {self.length_mm:g} mm, "
+            f"press at most {self.max_depth_mm:g} mm",
+        ]
+
+
+def truth(facts: Facts, trap: Trap | None) -> dict[str, Any]:
+    """Everything that a first day should find, as JSON; lengths in mm, angles in deg, base frame unless named."""
+    config, table, view = facts.config, facts.config.table, facts.config.view
+    tool = tool_of(config)
+    return {
+        "seed": facts.seed,
+        "trap": None if trap is None else trap.value,
+        "tool": {
+            "tcp_offset_mm": (1e3 * tool[:3, 3]).tolist(),
+            "brush_axis": tool[:3, 2].tolist(),
+            "lean_deg": float(np.degrees(np.arccos(min(1.0, tool[2, 2])))),
+        },
+        "paper": {
+            "origin_mm": list(table.origin_mm),
+            "yaw_deg": table.yaw_deg,
+            "touch_z_mm": table.paper_z_mm,
+            "normal": list(table.normal),
+            "size_mm": list(table.sheet_mm),
+            "corners_mm": {name: list(corner(table, "sheet", name)) for name in CORNERS},
+        },
+        "board": {
+            "origin_mm": list(table.board_origin_mm),
+            "square_mm": table.board_square_mm,
+            "marker_mm": table.board_marker_mm,
+            "corners_mm": {name: list(corner(table, "board", name)) for name in CORNERS},
+        },
+        "well": {
+            "paper_mm": list(table.well_mm),
+            "rim_mm": list(in_base(table, *table.well_mm, table.well_depth_mm)),
+            "radius_mm": table.well_radius_mm,
+            "bottom_z_mm": table.surface_z_mm(*table.well_mm),
+        },
+        "wash": {"paper_mm": list(facts.wash_mm)},
+        "pin_mm": list(facts.pin_mm),
+        "park_mm": list(facts.park_mm),
+        "camera": {
+            "stream": facts.sheet_camera,
+            "delay_s": view.delay_s + 0.5 * view.delay_jitter_s,
+            "fps": view.fps,
+            "matrix": camera_matrix(view).tolist(),
+            "k1": view.k1,
+            "lens_mm": list(view.lens_mm or ()),
+            "mirrored": view.mirrored,
+        },
+        "force": {"turn_deg": config.sensor_turn_deg, "sign": config.sensor_sign, "hanging_kg": config.hanging_kg},
+        "brush": asdict(config.brush),
+        "cabinet": {"tcp_offset": list(facts.cabinet_tcp), "payload_kg": facts.payload_kg},
+    }
+
 
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 CAMERA_PORTS = (8080, 8081)
@@ -82,8 +183,7 @@ class UnknownLab:
         self.cabinet: Cabinet = self.rig.arcs.cabinet
         self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
-        towards_sheet = math.atan2(self.facts.pin_mm[1], self.facts.pin_mm[0])
-        self._room = MjpegServer(RoomScene(self.world, towards_sheet), View(fps=ROOM_FPS, jpeg_quality=80))
+        self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS, jpeg_quality=80))
         self._older = OlderSoftware()
         self._touches = 0
         self._pulled: list[int] = []
@@ -187,7 +287,7 @@ class UnknownLab:
         """Count another touched thing; with one trap, somebody then trips over the cable."""
         self._touches += 1
         if self._touches == self.facts.cable_after:
-            board = self.rig.faults.board
+            board = self.rig.faults
             self._pulled = [
                 board.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS)),
                 board.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS)),
@@ -197,7 +297,7 @@ class UnknownLab:
         """Put the cable back."""
         pulled, self._pulled = self._pulled, []
         for ident in pulled:
-            self.rig.faults.board.take(ident)
+            self.rig.faults.take(ident)
         return "The cable was out; it is in again." if pulled else "Every cable is in."
 
     async def mend(self) -> str:

@@ -9,8 +9,8 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import fit_lens
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.view import see_board_and_lens
-from brushloop.drivers.sim.camera.scene import Optics
 from brushloop.drivers.sim.config import Table
+from brushloop.drivers.sim.scene import Optics
 from tests.calibrate.simulated_rigs import CAMERAS, board_of, boards, lens_views, true_scale
 
 WORST = 2e-4

@@ -103,7 +103,7 @@ def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_d
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.voids > 0)
-    lab.rig.faults.board.clear()
+    lab.rig.faults.clear()
     wait_for_end(engine)
 
     now = engine.snapshot()

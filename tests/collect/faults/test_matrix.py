@@ -255,7 +255,7 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     engine.start()
     ended = end_of(engine)
 
-    board = stage.rig.faults.board
+    board = stage.rig.faults
     assert any(hung.struck for hung in (*board.hanging, *board.over)), "the fault has struck"
     now = engine.snapshot()
     assert now.state is (State.DONE if expected is DONE else State.FAILED), now.error
@@ -284,8 +284,8 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
 def assert_it_stays_at_rest(stage: Stage) -> None:
     """Not when the fault is over, not when a person has ended the stop, not when requests come late."""
     before = stage.rig.world.tool()
-    stage.rig.faults.board.clear()
-    stage.rig.faults.release()
+    stage.rig.faults.clear()
+    stage.rig.arcs.cabinet.release()
     stage.gears.shift(FAST)
     stage.ask("rob1.MotionControl.startMove", "RuntimeMachine.resume", "rob1.MotionControl.getExecId")
     time.sleep(0.1)  # half a minute of the arm's time
@@ -333,8 +333,8 @@ def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: s
     arm_the_fault(stage, engine, name, phase)
     engine.start()
     assert end_of(engine) is not None
-    stage.rig.faults.board.clear()
-    stage.rig.faults.release()
+    stage.rig.faults.clear()
+    stage.rig.arcs.cabinet.release()
     stage.gears.shift(FAST)
 
     again = stage.engine()

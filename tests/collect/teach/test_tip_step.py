@@ -17,7 +17,7 @@ from brushloop.collect.teach.steps.tip import TipStep
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.lab.seen import truth
+from brushloop.drivers.sim.lab.lab import truth
 from tests.collect.teach.person import leaning
 from tests.collect.teach.unknown import InLab, in_lab
 

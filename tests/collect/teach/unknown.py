@@ -22,9 +22,8 @@ from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.lab.lab import UnknownLab
-from brushloop.drivers.sim.lab.seen import Seen, truth
-from brushloop.drivers.sim.lab.traps import Trap
+from brushloop.drivers.sim.lab.facts import Trap
+from brushloop.drivers.sim.lab.lab import Seen, UnknownLab, truth
 from tests.waiting import PATIENCE_S
 
 KIND = {"ink-station": "i", "modbus-pump": "p"}

@@ -19,9 +19,9 @@ from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.touch.arm import ForceTap
 from brushloop.drivers.devices import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.camera.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 
 SMALL_TABLE = Table(

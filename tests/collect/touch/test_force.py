@@ -13,8 +13,8 @@ from brushloop.collect.rig.config_touch import ForceTouchConfig
 from brushloop.collect.touch.force import Contact, Reading, touch_by_force
 from brushloop.collect.touch.heights import SPAN_SIGMAS, Reach
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.drivers.sim.brush.contact import Reaction
 from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.world import Reaction
 
 NOISE_N = SimConfig().force_noise_n
 REACH = Reach(122.0, 120.0, 118.0)

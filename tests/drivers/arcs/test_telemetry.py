@@ -29,10 +29,10 @@ from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
-from brushloop.drivers.sim.server import LoopbackServer
 from tests.drivers.muting import mute
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'

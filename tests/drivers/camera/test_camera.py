@@ -14,10 +14,10 @@ from brushloop.drivers.camera import CameraOptions, OpenCvCamera, opencv
 from brushloop.drivers.devices import Camera, Frame, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
-from brushloop.drivers.sim.camera.scene import Scene, read_strip
 from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import HOST
+from brushloop.drivers.sim.scene import Scene, read_strip
 from brushloop.drivers.sim.world import World
 from tests.waiting import PATIENCE_S
 

@@ -15,7 +15,7 @@ from typing import Self
 import can
 
 from brushloop.drivers.force.rounds import Wrench
-from brushloop.drivers.sim.instruments.force_board import CanFrame, ForceBoard
+from brushloop.drivers.force.simulator import CanFrame, ForceBoard
 from tests.drivers.failing import fail_rounds
 
 

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import pytest
 
-from brushloop.drivers.sim.instruments.ink import PtyLine
+from brushloop.drivers.ink.simulator import PtyLine
 
 Transcript = Callable[[Sequence[tuple[bytes, bytes]]], AbstractContextManager[str]]
 

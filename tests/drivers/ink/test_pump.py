@@ -22,7 +22,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig, exception, seal, write_register
-from brushloop.drivers.sim.instruments.ink import PtyLine, PumpFirmware
+from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware
 from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3

@@ -18,8 +18,8 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.ink.simulator import PtyLine, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
-from brushloop.drivers.sim.instruments.ink import PtyLine, StationFirmware
 from tests.drivers.failing import fail_requests
 
 TIMEOUT_S = 0.3

@@ -14,17 +14,17 @@ import pytest
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START
+from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.host import HostClock
+from brushloop.drivers.server import LoopbackServer, NotLoopback
 from brushloop.drivers.sim import rig as rig_module
 from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
-from brushloop.drivers.sim.camera.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.control import ControlServer
-from brushloop.drivers.sim.instruments.force_board import FRAME_S, ForceBoard, SocketcandServer
 from brushloop.drivers.sim.lab.lab import OlderSoftware
+from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from brushloop.drivers.sim.serve import serve
-from brushloop.drivers.sim.server import LoopbackServer, NotLoopback
 from brushloop.drivers.sim.world import World
 
 

@@ -12,11 +12,10 @@ import pytest
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
-from brushloop.drivers.sim.brush.contact import bent_toward
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.brush.paper import PX_PER_MM, Footprint, Paper
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World
+from brushloop.drivers.sim.world import INK_PER_PRESS, Press, World, bent_toward
 
 TABLE = Table()
 SAFE_Z = TABLE.paper_z_mm + 40.0

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.camera.mjpeg_server import _Line
-from brushloop.drivers.sim.camera.scene import NOISE_FIELDS, TOOL_GRAY, Optics, Scene, board, homography, read_strip
 from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.mjpeg_server import _Line
+from brushloop.drivers.sim.scene import NOISE_FIELDS, TOOL_GRAY, Optics, Scene, board, homography, read_strip
 from brushloop.drivers.sim.world import World
 
 BENT = View(k1=-0.08)

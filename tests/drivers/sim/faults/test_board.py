@@ -26,7 +26,7 @@ class Scripted:
     board: FaultBoard = field(init=False)
 
     def __post_init__(self) -> None:
-        self.board = FaultBoard(self, lambda: self.real_s)
+        self.board = FaultBoard(self, real_s=lambda: self.real_s)
 
     def now_s(self) -> float:
         return self.sim_s

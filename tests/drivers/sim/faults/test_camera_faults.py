@@ -17,9 +17,9 @@ from brushloop.drivers.camera.opencv import FrameHealth
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.camera.scene import read_strip
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
+from brushloop.drivers.sim.scene import read_strip
 from tests.waiting import wait_until
 
 CLOCK = HostClock()
@@ -65,7 +65,7 @@ async def test_frames_that_are_no_picture_are_a_timeout_that_names_them_and_then
         await camera.fresh(Stamp(CLOCK.now_ns() + 10**9))
     # From the thread that reads the stream.
     await asyncio.to_thread(wait_until, lambda: any(kind in one for one in notices), f"a notice of {kind} frames")
-    rig.faults.board.take(ident)
+    rig.faults.take(ident)
     asked_ns = CLOCK.now_ns()
     assert await seen_after(camera, asked_ns) >= asked_ns
 

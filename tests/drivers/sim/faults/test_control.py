@@ -34,7 +34,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 async def control(rig: LoopbackRig, path: Path) -> AsyncIterator[ControlServer]:
-    server = ControlServer(rig.faults)
+    server = ControlServer(rig)
     await server.open(path)
     yield server
     await server.stop()
@@ -63,7 +63,7 @@ async def test_a_fault_is_hung_listed_and_taken_down(ask: Ask, rig: LoopbackRig)
     assert await ask({"do": "clear", "id": 1}) == {"ok": True, "taken": 1}
     await ask({"do": "add", "fault": fault})
     assert await ask({"do": "clear"}) == {"ok": True, "taken": 1}
-    assert not rig.faults.board.hanging
+    assert not rig.faults.hanging
 
 
 async def test_the_state_is_what_the_world_knows(ask: Ask):
@@ -148,7 +148,7 @@ json_values = st.recursive(
 @pytest.fixture(scope="module")
 def idle_control() -> ControlServer:
     """One that does not listen."""
-    return ControlServer(LoopbackRig(SimConfig(ink_device="none", force_sensor=False)).faults)
+    return ControlServer(LoopbackRig(SimConfig(ink_device="none", force_sensor=False)))
 
 
 @settings(deadline=None)
@@ -168,19 +168,19 @@ async def test_only_its_owner_can_open_it(control: ControlServer, path: Path):
 async def test_what_stands_at_the_path_is_not_overwritten(rig: LoopbackRig, path: Path):
     path.write_text("mine")
     with pytest.raises(SimFileError, match="exists and is not a socket"):
-        async with live_control(rig.faults, path):
+        async with live_control(rig, path):
             pass
     assert path.read_text() == "mine"
 
 
 async def test_two_rigs_do_not_share_a_socket_and_one_that_is_dead_is_replaced(rig: LoopbackRig, path: Path):
-    async with live_control(rig.faults, path):
+    async with live_control(rig, path):
         with pytest.raises(SimFileError, match="another rig listens here"):
-            await ControlServer(rig.faults).open(path)
+            await ControlServer(rig).open(path)
         path.rename(f"{path}.old")
     assert Path(f"{path}.old").exists()  # what it did not find at its path it left alone
     Path(f"{path}.old").rename(path)
-    async with live_control(rig.faults, path):
+    async with live_control(rig, path):
         _, writer = await asyncio.open_unix_connection(str(path))
         writer.close()
         await writer.wait_closed()
@@ -189,7 +189,7 @@ async def test_two_rigs_do_not_share_a_socket_and_one_that_is_dead_is_replaced(r
 async def test_a_path_that_the_system_would_cut_is_refused(rig: LoopbackRig, tmp_path: Path):
     for path, words in ((tmp_path / ("x" * 120), "at most"), (tmp_path / "no" / "where", "cannot listen here")):
         with pytest.raises(SimFileError, match=words) as caught:
-            await ControlServer(rig.faults).open(path)
+            await ControlServer(rig).open(path)
         assert caught.value.exit_code == 2
 
 

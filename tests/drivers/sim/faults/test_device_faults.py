@@ -15,8 +15,8 @@ from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.rig import HOST, Faults, LoopbackRig
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, FaultBoard
+from brushloop.drivers.sim.rig import HOST, LoopbackRig
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ async def test_a_sensor_that_was_silent_is_heard_again_as_soon_as_the_fault_is_c
 ):
     rig.faults.hang(Fault(device=Device.FORCE, kind="silence", count=1_000_000))
     await asyncio.sleep(0.3)
-    assert rig.faults.board.clear() == 1
+    assert rig.faults.clear() == 1
     cleared = sensor.latest().stamp.seq
     async with asyncio.timeout(4.0):
         while sensor.latest().stamp.seq == cleared:
@@ -76,6 +76,6 @@ async def test_a_sensor_that_was_silent_is_heard_again_as_soon_as_the_fault_is_c
 
 
 async def test_a_rig_without_the_instrument_refuses_its_faults(rig: LoopbackRig):
-    bare = Faults(rig.world, rig.arcs, rig.rtde, rig.camera)
+    bare = FaultBoard(rig.faults.truth, [Device.INK])
     with pytest.raises(ValueError, match="device = 'ink': this rig has none"):
         bare.hang(Fault(device=Device.INK, kind="garbage"))

@@ -134,7 +134,7 @@ async def test_a_safety_stop_in_mid_move_is_named_with_its_condition_and_stays_u
     assert 100.0 < left_mm < 200.0
     assert (rig.arcs.cabinet.power.safety, rig.arcs.cabinet.power.mode) == (mode, power)
 
-    assert rig.faults.release() == mode
+    assert rig.arcs.cabinet.release() == mode
     assert rig.arcs.cabinet.power.safety == SafetyMode.NORMAL
     rig.arcs.cabinet.resume()  # whoever resumes finds no path: the driver's own stop has dropped it
     await asyncio.sleep(0.1)

@@ -21,8 +21,7 @@ from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.arm.kinematics import forward, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.control import live_control
 from brushloop.drivers.sim.lab.facts import CORNERS, corner, draw, in_picture
-from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab
-from brushloop.drivers.sim.lab.seen import truth
+from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab, truth
 from brushloop.drivers.sim.serve import LabRefused
 from brushloop.drivers.sim.world import tool_of
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from brushloop.drivers.camera.source import LOOPBACK_SERVER
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.sim.camera.scene import NOISE_FIELDS
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import KINDS, Device, FaultBoard
-from brushloop.drivers.sim.server import LoopbackServer
+from brushloop.drivers.sim.scene import NOISE_FIELDS
 
 NOISE_LEVELS = 6
 """Number of gray levels of a covered sensor, which is not quite black."""
@@ -84,7 +84,7 @@ class _Line:
 
 
 class Picture(Protocol):
-    """What a camera looks at: `Scene`, `RoomScene`."""
+    """What a camera looks at: `Scene`, `Wall`."""
 
     def tool(self) -> Pose:
         """Pose of the tool now; called in the thread that owns the world."""

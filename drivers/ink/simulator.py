@@ -26,7 +26,6 @@ from brushloop.drivers.ink.pump import (
     read_write,
 )
 from brushloop.drivers.ink.station import number_of, seal, unseal
-from brushloop.drivers.sim.world import Well
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 BYTE_S = 0.001
@@ -134,6 +133,45 @@ class PtyLine:
                 self._write(request)
             case _:
                 self._write(reply)
+
+
+BRUSH_ML = 0.5
+"""Volume of ink that a dry brush absorbs."""
+
+
+class Well:
+    """The ink well, a straight pot whose bottom is at height 0: dips lower its level, doses raise it."""
+
+    def __init__(self, ml: float, capacity_ml: float, ml_per_mm: float = 1.0) -> None:
+        self.ml = ml
+        self.capacity_ml = capacity_ml
+        self._ml_per_mm = ml_per_mm
+
+    @classmethod
+    def round(cls, radius_mm: float, level_mm: float, depth_mm: float) -> Well:
+        """A round pot that is `depth_mm` deep, filled to `level_mm`."""
+        ml_per_mm = math.pi * radius_mm**2 / 1e3
+        return cls(level_mm * ml_per_mm, depth_mm * ml_per_mm, ml_per_mm)
+
+    @property
+    def level_mm(self) -> float:
+        """Height of the ink above the bottom."""
+        return self.ml / self._ml_per_mm
+
+    @property
+    def share(self) -> float:
+        """Fill level, 0 to 1."""
+        return min(1.0, self.ml / self.capacity_ml)
+
+    def add(self, volume_ml: float) -> None:
+        """Add a dose; any excess is lost."""
+        self.ml = min(self.capacity_ml, self.ml + volume_ml)
+
+    def dip(self, ink_load: float) -> float:
+        """Fill a brush that holds `ink_load` (0 to 1); return its new load."""
+        taken_ml = min(self.ml, (1.0 - ink_load) * BRUSH_ML)
+        self.ml -= taken_ml
+        return ink_load + taken_ml / BRUSH_ML
 
 
 class StationFirmware:

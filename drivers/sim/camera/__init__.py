@@ -1,1 +1,0 @@
-"""The loopback rig's camera: scene, optics, MJPEG stream."""

@@ -1,1 +1,0 @@
-"""The loopback rig's instruments: force sensor, ink station, pump."""
