@@ -1,1 +1,4 @@
-"""Hardware behind small protocols: samples, clock, errors, limits, and one module or folder per device."""
+"""Hardware behind small protocols (`devices`): one folder per device, and the loopback rig in `sim`.
+
+Only `collect` and the front door drive devices. Nothing here imports another folder of the project.
+"""

@@ -1,1 +1,1 @@
-"""The loopback rig's arm: kinematics, paths, and moves with trapezoidal speed."""
+"""The loopback rig's arm: kinematics, paths, and their timing. Used by `sim.world` and the simulated cabinet."""

@@ -22,7 +22,7 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from tests.drivers.muting import mute
+from tests.drivers.failing import mute
 from tests.waiting import PATIENCE_S
 
 HOME = brush_pose(250.0, -230.0, 260.0)

@@ -77,12 +77,6 @@ async def test_a_cabinet_without_operational_modes_is_reported(
     assert len(notices) == 2
 
 
-async def test_what_is_not_configured_stays_as_it_is(make_arm: MakeArm, cabinet: ArcsServer):
-    await enabled(make_arm)
-    box = cabinet.cabinet
-    assert (box.payload[0], box.collision_level, box.motion.fraction) == (0.0, 6, 1.0)
-
-
 async def test_what_is_configured_is_set_in_the_wires_units(make_arm: MakeArm, cabinet: ArcsServer):
     options = {"payload_kg": 0.4, "payload_cog_mm": (0.0, 1.0, 60.0), "collision_level": 8, "speed_fraction": 0.5}
     await enabled(make_arm, **options)
@@ -182,12 +176,6 @@ async def test_a_controller_that_knows_no_watchdog_is_reported_and_used(
     await arm.move(NEAR, **QUICK)
     assert len(notices) == 1
     assert "no watchdog" in notices[0]
-
-
-async def test_a_watchdog_that_is_refused_is_reported(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
-    cabinet._methods["RegisterControl.setWatchDog"] = lambda _: -6
-    await enabled(make_arm, watchdog_s=2.0)
-    assert "refused it with -6" in notices[0]
 
 
 async def test_an_arm_that_cannot_be_stopped_is_left_to_the_watchdog(make_arm: MakeArm, cabinet: ArcsServer):

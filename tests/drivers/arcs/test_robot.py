@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import math
 from collections.abc import Callable
 
@@ -11,7 +10,7 @@ from brushloop.drivers.arcs import robot as robot_module
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import planned_s
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.devices import Pose, PoseSample, Robot
+from brushloop.drivers.devices import Pose, Robot
 from brushloop.drivers.errors import (
     ConnectionLost,
     LimitExceeded,
@@ -23,7 +22,7 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs.server import ArcsServer
-from tests.drivers.muting import mute
+from tests.drivers.failing import mute
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
@@ -67,15 +66,6 @@ async def test_enabling_runs_the_arm_and_sets_the_tool_but_moves_nothing(sleepin
     assert distance(before, sleeping_arm.latest().pose)[0] < 1e-6, "with the tool set, it speaks of the tip"
 
 
-async def test_a_move_returns_when_the_arm_rests_at_the_target(arm: AuboArcs, cabinet: ArcsServer):
-    target = brush_pose(300.0, -200.0, 240.0, heading_deg=40.0, tilt_deg=10.0)
-    await arm.move(target, **QUICK)
-    off_mm, off_deg = distance(cabinet.cabinet.world.tool(), target)
-    assert off_mm <= 0.05
-    assert off_deg <= 0.1
-    assert cabinet.cabinet.world.motion.steady(cabinet.cabinet.now_s())
-
-
 async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs):
     home = arm.latest().pose
     x, y, z = home.position_mm
@@ -83,18 +73,6 @@ async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs)
     planned = planned_s(home, turn, 20.0, 800.0)
     assert planned >= math.radians(90.0) / 0.020  # 20 mm/s is read as 0.02 rad/s
     await arm.move(turn, **QUICK)
-
-
-async def test_the_listener_gets_samples_in_order_until_it_is_taken_off(arm: AuboArcs):
-    samples: list[PoseSample] = []
-    arm.listen(samples.append)
-    await asyncio.sleep(0.1)
-    arm.listen(None)
-    count = len(samples)
-    await asyncio.sleep(0.05)
-    assert count == len(samples) >= 3
-    assert [s.stamp.seq for s in samples] == list(range(samples[0].stamp.seq, samples[0].stamp.seq + count))
-    assert all(a.stamp.host_ns <= b.stamp.host_ns for a, b in itertools.pairwise(samples))
 
 
 BEYOND: list[tuple[str, Pose, dict[str, float]]] = [
@@ -209,10 +187,3 @@ async def test_closing_twice_is_fine_and_later_calls_say_that_it_is_closed(arm: 
         await arm.move(NEAR, **QUICK)
     with pytest.raises(NotConnected):
         await arm.stop()
-
-
-async def test_a_closed_arm_can_be_connected_again(arm: AuboArcs):
-    await arm.close()
-    await arm.connect()
-    await arm.enable()
-    await arm.move(NEAR, **QUICK)

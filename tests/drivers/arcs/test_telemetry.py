@@ -25,7 +25,7 @@ from brushloop.drivers.arcs.telemetry import (
 )
 from brushloop.drivers.arcs.wire import FrameDecoder, encode, encode_short
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
-from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, Stale
+from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
@@ -33,7 +33,7 @@ from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
-from tests.drivers.muting import mute
+from tests.drivers.failing import mute
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 POSE = ["R1_actual_TCP_pose"]
@@ -131,11 +131,6 @@ async def test_either_frame_is_taken(served: Any, frame: bytes):
 async def test_of_a_backlog_only_the_newest_is_handed_over(served: Any):
     backlog = b"".join(encode_sample(0, [k]) for k in range(100))
     assert await outcome(await served(says(GREETING, backlog))) == [99]
-
-
-async def test_a_stream_that_is_not_open_says_so():
-    with pytest.raises(NotConnected):
-        await RtdeStream(HOST, 1).newest()
 
 
 @pytest.fixture
@@ -325,10 +320,6 @@ def lag_ms(
 @pytest.mark.parametrize("lag_s", [0.0, 0.12, 0.8, 2.0])
 def test_the_lag_is_measured_to_a_few_milliseconds(path: Path, lag_s: float):
     assert lag_ms(path, lag_s) == pytest.approx(1e3 * lag_s, abs=15.0)
-
-
-def test_on_a_slow_network_it_is_known_to_half_of_the_time_of_an_answer():
-    assert lag_ms(press, 0.3, answer_s=0.04) == pytest.approx(300.0, abs=25.0)
 
 
 def test_a_computer_that_was_busy_for_a_while_does_not_count_as_a_lag():

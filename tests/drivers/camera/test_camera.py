@@ -12,7 +12,7 @@ import pytest
 
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera, opencv
 from brushloop.drivers.devices import Camera, Frame, Stamp
-from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
+from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
@@ -176,22 +176,6 @@ async def test_a_server_that_says_nothing_is_given_up_within_the_timeout():
             await camera.connect()
         assert grabbers() == 0
         over.set()
-
-
-async def test_closing_joins_the_grabber_and_may_be_repeated(camera: OpenCvCamera):
-    assert grabbers() == 1
-    await camera.close()
-    assert grabbers() == 0
-    await camera.close()
-    with pytest.raises(NotConnected):
-        await camera.fresh(Stamp(0))
-
-
-async def test_a_camera_opened_again_shows_nothing_from_before(camera: OpenCvCamera):
-    await camera.close()
-    closed_ns = time.time_ns()
-    await camera.connect()
-    assert read_strip((await camera.fresh(Stamp(0))).image) >= closed_ns
 
 
 class OneFrame:

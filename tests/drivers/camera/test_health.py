@@ -58,11 +58,6 @@ def test_the_fifth_equal_frame_is_frozen_and_a_new_one_thaws() -> None:
     assert judged.summary() == "2 frozen"
 
 
-def test_a_recording_may_show_equal_frames() -> None:
-    judged, image = health(live=False), page()
-    assert [judged.judge(image, k * PERIOD) for k in range(8)] == [None] * 8
-
-
 def test_a_camera_that_was_slow_at_first_is_not_late_for_ever_after_a_pause() -> None:
     """Its frames then come faster than half the period that was known, as those of a backlog do."""
     judged = health()

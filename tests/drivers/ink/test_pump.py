@@ -127,26 +127,11 @@ async def test_a_stop_without_a_reply_is_sent_three_times_and_closing_tries_agai
         await pump.close()
 
 
-async def test_a_device_failure_at_the_stop_is_tried_again(expected_protocol):
-    failed = (STOP, bytes.fromhex("01 86 04 43 A3"))
-    with expected_protocol([*HELLO, (SPEED, SPEED), (START, START), failed, (STOP, STOP), *BYE]) as path:
-        pump = pump_at(path)
-        await pump.connect()
-        await pump.dose(0.01)
-        await pump.close()
-
-
 async def test_a_dose_delivers_what_was_asked(firmware: PumpFirmware, pump: ModbusPump):
     await pump.dose(0.015)
     assert firmware.pumped_ml == pytest.approx(0.015, abs=0.008)
     assert firmware.rpm == 50.0
     assert not firmware.running
-
-
-async def test_doses_at_the_same_time_take_turns(firmware: PumpFirmware, pump: ModbusPump):
-    await asyncio.gather(pump.dose(0.01), pump.dose(0.01))
-    assert firmware.starts == 2
-    assert firmware.pumped_ml == pytest.approx(0.02, abs=0.01)
 
 
 @pytest.mark.parametrize("times", [1, 3])

@@ -117,14 +117,6 @@ def test_a_contact_that_travels_is_one_drag_and_no_press():
     assert (world.paper.density[rows, 420:560] > 0.3).mean() > 0.9
 
 
-def test_withdrawing_a_tilted_brush_along_its_own_axis_is_no_drag():
-    tilt = math.radians(10.0)
-    down = on_paper(40.0, 60.0, -15.0, tilt_deg=10.0)
-    out = on_paper(40.0 + 60.0 * math.sin(tilt), 60.0, -15.0 + 60.0 * math.cos(tilt), tilt_deg=10.0)
-    world = run([*dip(), on_paper(40.0, 60.0, 40.0, tilt_deg=10.0), down, out])
-    assert (len(world.presses), world.drags) == (1, [])
-
-
 def test_a_drag_stopped_on_the_way_leaves_its_mark_when_it_lifts():
     world = World(SimConfig())
     for pose in [*dip(), on_paper(40.0, 60.0, 40.0), on_paper(40.0, 60.0, -8.0)]:
@@ -198,14 +190,6 @@ def test_the_far_edge_rises_about_x_and_the_right_edge_falls_about_y() -> None:
     assert table.surface_z_mm(100.0, 0.0) == 120.0
     assert Table(slope_deg=(0.0, 1.0)).surface_z_mm(100.0, 0.0) == pytest.approx(118.2545, abs=1e-4)
     assert np.linalg.norm(LEANING.normal) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("beyond_mm", [-0.01, 0.01])
-def test_the_brush_touches_exactly_at_the_plane(beyond_mm: float) -> None:
-    z_mm = LEANING.surface_z_mm(200.0, 40.0) - beyond_mm
-    up = over(LEANING, 200.0, 40.0, 160.0)
-    world = world_after(LEANING, up, over(LEANING, 200.0, 40.0, z_mm), up)
-    assert len(world.presses) == (1 if beyond_mm > 0.0 else 0)
 
 
 def test_depth_place_and_tilt_of_a_press_are_the_sheets() -> None:

@@ -59,17 +59,6 @@ def test_the_speed_fraction_slows_down_what_has_not_begun(on: Any):
     assert on.ask("MotionControl.getSpeedFraction") == 0.5
 
 
-def test_a_duration_lengthens_a_move_and_never_shortens_it(on: Any):
-    on.line(NEAR, duration=4.0)
-    on.clock.s += 3.9
-    assert on.exec_id == 0
-    on.clock.s += 0.11
-    assert on.off_mm(NEAR) == 0.0
-    on.line(START, duration=0.1)
-    on.clock.s += 1.0
-    assert on.exec_id == 1
-
-
 @pytest.mark.parametrize(
     ("hold", "resume"),
     [
@@ -116,21 +105,6 @@ def test_a_path_can_be_held_again_and_again_even_before_the_arm_has_come_to_rest
     assert on.cabinet.motion.size == 0
 
 
-def test_an_abort_ends_a_hold_and_forgets_the_path(on: Any):
-    on.line(NEAR)
-    on.clock.s += 0.5
-    on.ask("RuntimeMachine.pause")
-    on.clock.s += 1.0
-    assert on.ask("RuntimeMachine.abort") == 0
-    assert on.exec_id == -1
-    on.ask("RuntimeMachine.resume")
-    on.clock.s += 5.0
-    assert on.off_mm(NEAR) > 40.0
-    assert on.line(START) == 0
-    on.clock.s += 5.0
-    assert on.off_mm(START) == pytest.approx(0.0)
-
-
 def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_resumes(on: Any):
     on.line(NEAR)
     on.clock.s += 0.5
@@ -146,19 +120,6 @@ def test_a_protective_stop_keeps_the_path_until_a_person_unlocks_and_someone_res
     on.ask("RuntimeMachine.resume")
     on.clock.s += 5.0
     assert on.off_mm(NEAR) == 0.0
-
-
-def test_joints_and_pose_agree_with_the_tool_on(on: Any):
-    on.ask("RobotConfig.setTcpOffset", offset=[0.0, 0.0, 0.18, 0.0, 0.0, 0.0])
-    joints = on.ask("RobotState.getJointPositions")
-    pose, code = on.ask("RobotAlgorithm.forwardKinematics", q=joints)
-    assert code == 0
-    assert distance(from_wire(pose), on.world.tool())[0] < 1e-3
-    back, code = on.ask("RobotAlgorithm.inverseKinematics", qnear=joints, pose=pose)
-    assert code == 0
-    assert back == pytest.approx(joints, abs=1e-5)
-    near, code = on.ask("RobotAlgorithm.inverseKinematics", qnear=joints, pose=[2.0, 0.0, 0.2, math.pi, 0.0, 0.0])
-    assert (near, code) == (list(joints), -23)
 
 
 def test_a_joint_move_is_straight_in_joints_and_ends_where_it_should(on: Any):
@@ -342,18 +303,6 @@ def test_the_tip_goes_round_a_wrong_tool_centre_point(on: Any):
     on.clock.s += 20.0
     assert distance(from_wire(on.ask("RobotState.getTcpPose")), here)[0] < 1e-6
     assert distance(on.world.tool(), before)[0] == pytest.approx(10.0 * math.sqrt(2.0))
-
-
-def test_joints_mean_the_steel_whatever_is_configured(on: Any):
-    ends: list[Any] = []
-    for length_mm in (180.0, 120.0):
-        on.ask("RobotConfig.setTcpOffset", offset=tool(length_mm))
-        on.ask("MotionControl.moveJoint", q=list(HOME), a=1.0, v=0.5)
-        on.clock.s += 20.0
-        ends.append(on.world.tool())
-        on.ask("MotionControl.moveJoint", q=[0.1, *HOME[1:]], a=1.0, v=0.5)
-        on.clock.s += 20.0
-    assert distance(ends[0], ends[1])[0] < 1e-3
 
 
 def test_a_move_that_is_under_way_keeps_the_offset_that_it_was_given(on: Any):

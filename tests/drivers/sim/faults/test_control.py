@@ -92,12 +92,6 @@ async def test_a_person_ends_a_stop_that_was_asked_for(ask: Ask, kind: str, mode
     assert await ask({"do": "release"}) == {"ok": True, "was": "Normal"}
 
 
-async def test_a_fresh_sheet_is_put_in(ask: Ask, rig: LoopbackRig):
-    before = rig.world.version
-    assert await ask({"do": "fresh-sheet"}) == {"ok": True}
-    assert rig.world.version == before + 1
-
-
 REFUSED: list[tuple[object, str]] = [
     (b"hello", "not JSON"),
     (b"", "not JSON"),
@@ -229,19 +223,6 @@ def test_the_words_of_a_command_line_become_a_request():
     assert request_of("clear", None, NOTHING | {"id": 3}) == {"do": "clear", "id": 3}
     wanted = {"do": "add", "fault": {"device": "robot", "kind": "mute", "on": "moveLine"}}
     assert request_of("robot", "mute", NOTHING | {"on": "moveLine"}) == wanted
-
-
-@pytest.mark.parametrize(
-    ("what", "kind", "options", "words"),
-    [
-        ("robot", None, {}, "give a device and a kind"),
-        ("state", "mute", {}, "takes no kind and no options"),
-        ("clear", None, {"on": "moveLine"}, "takes no kind and no option but --id"),
-    ],
-)
-def test_words_that_do_not_go_together_are_refused(what: str, kind: str | None, options: dict[str, str], words: str):
-    with pytest.raises(FaultRefused, match=words):
-        request_of(what, kind, NOTHING | options)
 
 
 def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):
