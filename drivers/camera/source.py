@@ -7,7 +7,7 @@ import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol, cast
+from typing import TYPE_CHECKING, Annotated, cast
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, Field
@@ -69,31 +69,7 @@ SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
 
 
-class Source(Protocol):
-    """Owned by one thread from open to release."""
-
-    live: bool
-    """False for recorded frames: they may end, and identical ones are not a fault."""
-
-    independent: bool
-    """True where FFmpeg decodes a JPEG for each frame."""
-
-    settings: dict[str, float]
-    """Settings that were read back, by name."""
-
-    simulated: bool
-    """True for the loopback camera, which identifies itself, and for recordings, which show no ink of this session."""
-
-    def read(self) -> NDArray[np.uint8] | None:
-        """The next frame, gray or BGR; None at the end."""
-        ...
-
-    def release(self) -> None:
-        """Release the device."""
-        ...
-
-
-def open_source(options: CameraOptions) -> Source:
+def open_source(options: CameraOptions) -> FolderSource | CaptureSource:
     """Open what `options.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that have no effect."""
     if Path(options.source).is_dir():
         return FolderSource(options)
@@ -116,7 +92,11 @@ def says_loopback(url: str) -> bool:
 
 
 class FolderSource:
-    """The images of a folder in order of name, at a steady rate; the last one is repeated without end."""
+    """The images of a folder in order of name, at a steady rate; the last one is repeated without end.
+
+    It has the attributes of `CaptureSource`. Recorded frames may end, identical ones are not a fault, and they show no
+    ink of this session: they count as simulated.
+    """
 
     def __init__(self, options: CameraOptions) -> None:
         folder = Path(options.source)
@@ -147,7 +127,12 @@ class FolderSource:
 
 
 class CaptureSource:
-    """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back."""
+    """A `cv2.VideoCapture` on a device, a stream or a file, its settings locked and read back.
+
+    Owned by one thread from open to release. `live` is False for a file; `independent` is True where FFmpeg decodes a
+    JPEG for each frame; `settings` are those read back, by name; `simulated` is True for the loopback camera, which
+    identifies itself, and for recordings.
+    """
 
     def __init__(self, options: CameraOptions) -> None:
         # Set before the first capture: otherwise the libraries would write their own lines across the screen.

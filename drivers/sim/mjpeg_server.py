@@ -7,7 +7,6 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import KINDS, Device, FaultBoard
-from brushloop.drivers.sim.scene import NOISE_FIELDS
+from brushloop.drivers.sim.scene import NOISE_FIELDS, Scene, Wall
 
 NOISE_LEVELS = 6
 """Number of gray levels of a covered sensor, which is not quite black."""
@@ -83,22 +82,10 @@ class _Line:
             self._writer.write(data)
 
 
-class Picture(Protocol):
-    """What a camera looks at: `Scene`, `Wall`."""
-
-    def tool(self) -> Pose:
-        """Pose of the tool now; called in the thread that owns the world."""
-        ...
-
-    def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
-        """A picture with the tool there; may run in another thread."""
-        ...
-
-
 class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
-    def __init__(self, scene: Picture, view: View) -> None:
+    def __init__(self, scene: Scene | Wall, view: View) -> None:
         """`view` gives the rate, the delay and the JPEG quality of the pictures."""
         super().__init__()
         self._scene = scene
@@ -111,7 +98,7 @@ class MjpegServer(LoopbackServer):
         self.faults: FaultBoard | None = None
         """Faults of this server; a rig shares one board among all its servers."""
 
-    def show(self, scene: Picture, view: View) -> None:
+    def show(self, scene: Scene | Wall, view: View) -> None:
         """Look at something else, with other settings. Every stream begins again, as when a camera is set up again."""
         self._scene, self._view = scene, view
         self._coded.clear()

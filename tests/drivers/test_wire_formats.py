@@ -487,6 +487,11 @@ def test_a_sound_line_that_is_no_reply_is_passed_over(text: str):
     assert station.find_reply(station.seal(7, text), 7) is None
 
 
+def test_the_reply_to_another_request_is_passed_over():
+    other, refusal = station.seal(4, "ok 1.0"), station.seal(5, "err 4 reservoir is empty")
+    assert station.find_reply(other + refusal, 5) == station.Reply((), 4, "reservoir is empty")
+
+
 def test_confirmations_of_other_units_registers_and_values_are_passed_over():
     others = pump.write_register(2, 4, 1) + pump.write_register(1, 1, 1) + pump.write_register(1, 4, 0)
     others += pump.exception(2, 6, 2) + pump.exception(1, 6, 0)
