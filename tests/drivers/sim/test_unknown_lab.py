@@ -151,7 +151,7 @@ def test_another_file_is_not_overwritten_by_the_truth(tmp_path: Path):
 
 async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
     lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "lab.sock"
-    async with live_control(lab.rig.faults, socket, lab.obey):
+    async with live_control(lab.rig, socket, lab.obey):
         said = await asyncio.to_thread(run, "hand", str(socket), "bring", "board-corner", "--corner", "lower left")
         assert said == "The tip is at the board-corner, lower left.\n"
         with pytest.raises(FaultRefused, match="to = 'moon' is not one of pin"):
@@ -160,6 +160,6 @@ async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
 
 async def test_nobody_is_in_a_known_rig(tmp_path: Path):
     lab, socket = UnknownLab(4, rate=500.0, picture_px=(640, 480)), tmp_path / "rig.sock"
-    async with live_control(lab.rig.faults, socket):
+    async with live_control(lab.rig, socket):
         with pytest.raises(FaultRefused, match="there is no person here"):
             await asyncio.to_thread(run, "hand", str(socket), "bring", "pin")
