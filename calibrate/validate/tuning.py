@@ -8,10 +8,10 @@ cells has its own tuning, in a folder named after a hash of its inputs; a killed
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import cv2
 import numpy as np
@@ -32,9 +32,6 @@ from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress
-
-if TYPE_CHECKING:
-    from brushloop.model.generator.train import Validation
 
 FOLDS = 5
 """Number of folds: cells are left out by fifths, since a tuning takes a minute."""
@@ -146,28 +143,16 @@ def tuned_by_cell(
                 aligned = aligned or align_captures([session], generator)
                 write_captures(aligned, captures, fold, fit)
             what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
-            steps_done = _TrainingProgress(progress, what, number * steps, len(folds) * steps)
-            _tune(folder, captures, generator, str(session.header.source), steps, steps_done)
+
+            def stepped(step: int, *_: float, what: str = what, before: int = number * steps) -> None:
+                progress(what, before + step, len(folds) * steps)
+
+            _tune(folder, captures, generator, str(session.header.source), steps, stepped)
         files |= dict.fromkeys(fold, path)
     return files
 
 
-@dataclass(slots=True)
-class _TrainingProgress:
-    """Reports the steps of a training; see `model.generator.train.Progress`."""
-
-    progress: Progress
-    what: str
-    before: int
-    total: int
-
-    def stepped(self, step: int, loss: float) -> None:
-        self.progress(self.what, self.before + step, self.total)
-
-    def validated(self, validation: Validation) -> None: ...
-
-
-def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int, progress: _TrainingProgress) -> None:
+def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int, stepped: Callable[..., None]) -> None:
     from brushloop.model.generator.data import TuningFiles
     from brushloop.model.generator.train import run_training
 
@@ -182,7 +167,7 @@ def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int
         picture_every=steps,
         checkpoint_every=max(1, steps // 4),
     )
-    run_training(config, folder, progress, lambda: False, files)
+    run_training(config, folder, stepped, lambda: False, files)
 
 
 def _placed(prepared: Prepared, target: Target) -> Image:

@@ -5,6 +5,7 @@ A command that trains returns the folder of the training, of which the front doo
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from brushloop.model.generator.config import TrainConfig
     from brushloop.model.generator.data import TuningFiles
-    from brushloop.model.generator.train import Validation
 
 app = typer.Typer(help="Train the neural stroke generator, or tune it on captures.")
 
@@ -77,8 +77,8 @@ def train_with_bar(config: TrainConfig, folder: Path, tuning: TuningFiles | None
 
     from brushloop.model.generator.train import run_training
 
-    words = TextColumn("{task.fields[loss]} {task.fields[validation]}")
-    columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True), words)
+    columns = (BarColumn(bar_width=16), MofNCompleteColumn(), TimeRemainingColumn(compact=True))
+    columns += (TextColumn("{task.fields[mse]}"),)
     with _asked_to_stop() as stopping, ProgressBar(*columns) as progress:
         path = run_training(config, folder, Bar(progress, config.steps), stopping, tuning)
     card = path.with_suffix(".md")
@@ -87,30 +87,22 @@ def train_with_bar(config: TrainConfig, folder: Path, tuning: TuningFiles | None
 
 
 class Bar:
-    """A progress bar that shows the latest losses; where there is no terminal, a line for each tenth of the steps."""
+    """A progress bar that shows the latest errors; where there is no terminal, a line for each tenth of the steps."""
 
     def __init__(self, progress: ProgressBar, steps: int) -> None:
         self._progress, self._steps, self._tenths = progress, steps, 0
-        self._task = progress.add_task("training", total=steps, loss="", validation="")
+        self._task = progress.add_task("training", total=steps, mse="")
 
-    def stepped(self, step: int, loss: float) -> None:
-        """See `Progress.stepped`."""
-        self._progress.update(self._task, completed=step, loss=f"left, MSE {loss:.1e}")
+    def __call__(self, step: int, loss: float, held_out: float) -> None:
+        """See `model.generator.train.Progress`."""
+        words = f"MSE {loss:.1e}" + (f", held out {held_out:.1e}" if math.isfinite(held_out) else "")
+        self._progress.update(self._task, completed=step, mse=words)
         if self._progress.console.is_terminal or 10 * step // self._steps <= self._tenths:
             return
         self._tenths = 10 * step // self._steps
         left_s = self._progress.tasks[self._task].time_remaining
         left = f", about {left_s:.0f} s left" if left_s and step < self._steps else ""
-        self._progress.console.print(f"training: {step} of {self._steps} steps{left}, MSE {loss:.1e}")
-
-    def validated(self, validation: Validation) -> None:
-        """See `Progress.validated`."""
-        self._progress.update(self._task, validation=f"held out {validation.mse:.1e}")
-        if validation.blank:
-            self._progress.console.print(
-                f"step {validation.step}: the generator draws {validation.ink_share:.2%} ink where the targets hold "
-                f"{validation.target_share:.2%}; training ends if that stays"
-            )
+        self._progress.console.print(f"training: {step} of {self._steps} steps{left}, {words}")
 
 
 @contextmanager

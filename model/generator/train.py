@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,42 +47,14 @@ from brushloop.model.generator.data import (
 from brushloop.model.generator.network import Generator, squared_error
 from brushloop.model.generator.stroke import FORMAT, read_generator
 
+Progress = Callable[[int, float, float], None]
+"""Called after each step with its number, Eq. 6 of its batch, and the MSE of the last validation (NaN before one)."""
 BLANK_SHARE = 0.05
 """Output is blank if its ink, or its paper, is less than this share of the targets' ink or paper."""
 SHOWN = 8
 """Validation strokes in a picture."""
 MOST_SAMPLES = 12
 _GAIN = 0.99
-
-
-@dataclass(frozen=True, slots=True)
-class Validation:
-    """Means over the validation set after `step` steps; ink shares are of all pixels."""
-
-    step: int
-    mse: float
-    iou: float
-    csim: float
-    ink_share: float
-    target_share: float
-
-    @property
-    def blank(self) -> bool:
-        """Whether the images hold almost no ink, or almost no paper."""
-        paper, target_paper = 1 - self.ink_share, 1 - self.target_share
-        return self.ink_share < BLANK_SHARE * self.target_share or paper < BLANK_SHARE * target_paper
-
-
-class Progress(Protocol):
-    """Shows the progress of a training."""
-
-    def stepped(self, step: int, loss: float) -> None:
-        """Called after a step."""
-        ...
-
-    def validated(self, validation: Validation) -> None:
-        """Called after a validation."""
-        ...
 
 
 def run_training(
@@ -223,7 +195,7 @@ class _Training:
             raise TrainingStopped(self.step, "the loss is no longer a number; train again with a smaller learning_rate")
         self.optimiser.step()
         self.losses.append(value)
-        self.progress.stepped(self.step, value)
+        self.progress(self.step, value, self.validations[-1][1] if self.validations else math.nan)
 
     def _validate(self) -> None:
         """Compute means over the validation set; raise TrainingStopped if the output was blank too often."""
@@ -231,12 +203,12 @@ class _Training:
         for drawn, target in self._drawn(self.sets[1]):
             shares = (images.mean((1, 2)).sum() for images in (drawn, target))
             sums += [*likeness(drawn, target).sum(0), *shares]
-        found = Validation(self.step, *(sums / len(self.sets[1])).tolist())
-        self.validations.append((found.step, found.mse, found.iou, found.csim))
-        self.progress.validated(found)
-        self.blanks = self.blanks + 1 if found.blank else 0
+        mse, iou, csim, ink, wanted = (sums / len(self.sets[1])).tolist()
+        self.validations.append((self.step, mse, iou, csim))
+        is_blank = ink < BLANK_SHARE * wanted or 1 - ink < BLANK_SHARE * (1 - wanted)
+        self.blanks = self.blanks + 1 if is_blank else 0
         if self.blanks >= self.config.blank_after:
-            what = f"the generator draws {found.ink_share:.2%} ink where the targets hold {found.target_share:.2%}"
+            what = f"the generator draws {ink:.2%} ink where the targets hold {wanted:.2%}"
             advice = "train again in a new folder with a smaller learning_rate or a larger ink_weight"
             raise TrainingStopped(self.step, f"{what}; {advice}")
 

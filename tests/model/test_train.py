@@ -7,8 +7,6 @@ import math
 import multiprocessing
 import random
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +27,7 @@ from brushloop.model.generator.config import TrainConfig, checked, load_config
 from brushloop.model.generator.data import batch_numbers, exact_sets, load_captures, save_captures, split, write_whole
 from brushloop.model.generator.network import Generator
 from brushloop.model.generator.stroke import load_generator
-from brushloop.model.generator.train import Validation, converged, learning_rate, new_network, run_training
-from tests.browser import BROWSER, content_widths_px
+from brushloop.model.generator.train import converged, new_network, run_training
 
 TINY: dict[str, Any] = {
     "target": {"px_mm": 0.8, "size_px": 32},
@@ -65,18 +62,11 @@ def write_toml(folder: Path, **changes: int) -> Path:
     return path
 
 
-class Notes:
-    """Keeps what is reported."""
+class Notes(list[float]):
+    """The losses that were reported."""
 
-    def __init__(self) -> None:
-        self.losses: list[float] = []
-        self.validations: list[Validation] = []
-
-    def stepped(self, step: int, loss: float) -> None:
-        self.losses.append(loss)
-
-    def validated(self, validation: Validation) -> None:
-        self.validations.append(validation)
+    def __call__(self, step: int, loss: float, held_out: float) -> None:
+        self.append(loss)
 
 
 @pytest.fixture(scope="module")
@@ -91,14 +81,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_learns_and_shows_pictures_every_m_steps(tmp_path: Path) -> None:
     notes = Notes()
     run_training(tiny(steps=120, validate_every=40, learning_rate=0.02), tmp_path, notes)
-    assert len(notes.losses) == 120
-    assert notes.losses[-1] < 0.2 * notes.losses[0]
-    assert [validation.step for validation in notes.validations] == [40, 80, 120]
-    assert notes.validations[-1].iou > 0.8
-    assert len(list((tmp_path / "pictures").iterdir())) == 8
     losses, validations = read_curves(tmp_path)
-    assert losses.tolist() == pytest.approx(notes.losses)
-    assert validations[-1, 1] == pytest.approx(notes.validations[-1].mse)
+    assert losses.tolist() == pytest.approx(notes)
+    assert losses[-1] < 0.2 * losses[0]
+    assert validations[:, 0].tolist() == [40, 80, 120]
+    assert validations[-1, 2] > 0.8
+    assert len(list((tmp_path / "pictures").iterdir())) == 8
 
 
 def test_the_folder_holds_all_that_the_algorithm_puts_out(finished: Path) -> None:
@@ -117,13 +105,7 @@ from pathlib import Path
 from brushloop.model.generator.config import load_config
 from brushloop.model.generator.train import run_training
 
-class Reporter:
-    def stepped(self, step, loss):
-        steps.send(step)
-    def validated(self, validation):
-        pass
-
-run_training(load_config(Path(toml)), Path(out), Reporter())
+run_training(load_config(Path(toml)), Path(out), lambda step, *_: steps.send(step))
 """
 
 
@@ -173,9 +155,9 @@ def test_cuda_without_a_gpu_is_refused_before_anything_is_written(tmp_path: Path
 def test_asked_to_stop_it_keeps_the_last_step(tmp_path: Path) -> None:
     notes = Notes()
     with pytest.raises(TrainingStopped, match=r"step 4: .* resumes here"):
-        run_training(tiny(), tmp_path, notes, lambda: len(notes.losses) == 3)
+        run_training(tiny(), tmp_path, notes, lambda: len(notes) == 3)
     run_training(tiny(), tmp_path, notes)
-    assert len(notes.losses) == 30
+    assert len(notes) == 30
 
 
 @pytest.mark.parametrize(("bias", "words"), [(-100.0, "draws 0.00% ink where .* ink_weight"), (100.0, "draws 100"),
@@ -197,7 +179,7 @@ def test_blank_output_ends_the_training_with_advice(
 def test_it_stops_when_converged(tmp_path: Path) -> None:
     notes = Notes()
     run_training(tiny(target_mse=0.9), tmp_path, notes)
-    assert len(notes.losses) == 10
+    assert len(notes) == 10
     patient = tiny(patience=2)
     assert converged(patient, [1.0, 0.5, 0.499, 0.498])
     assert not converged(patient, [1.0, 0.5, 0.499])
@@ -212,13 +194,6 @@ def test_batches_follow_from_seed_and_step() -> None:
     assert len(batch_numbers(7, 64, 0, 3)) == 7
     training, validation = exact_sets(tiny())
     assert not np.isin(validation.inputs[:, 0], training.inputs[:, 0]).any()
-
-
-def test_the_rate_rises_and_falls_to_nothing() -> None:
-    rates = [learning_rate(tiny(warmup_steps=5), step) for step in range(31)]
-    assert rates[0] == pytest.approx(tiny().learning_rate / 5, rel=0.01)
-    assert max(rates) == rates[4]
-    assert rates[30] == pytest.approx(0, abs=1e-12)
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,7 +267,7 @@ def test_fine_tuning_on_captures_is_marked_as_such(finished: Path, tmp_path: Pat
     assert "learning_rate: 0.01 -> 0.02" in str(again.exception)
 
 
-def test_the_page_draws_held_out_strokes_and_says_that_there_is_no_ink(finished: Path, tmp_path: Path) -> None:
+def test_the_page_draws_held_out_strokes_and_says_that_there_is_no_ink(finished: Path) -> None:
     """The same command again trains nothing, and writes the page again."""
     words = ["train", "--config", str(finished.parent / "train.toml"), "--out", str(finished)]
     ran = CliRunner().invoke(brushloop.__main__.app, words)
@@ -305,10 +280,6 @@ def test_the_page_draws_held_out_strokes_and_says_that_there_is_no_ink(finished:
     assert '<span class="source">exact images of a stroke model</span>' in page
     assert "was trained for 30 steps: all steps done" in page
     assert re.findall(r"(?:src|href)=\"(?!data:|#)", page) == []
-    if BROWSER is not None:
-        sizes, errors = content_widths_px({"train": page}, (390, 800, 1200, 1600), tmp_path)
-        assert errors == []
-        assert all(taken <= width for (_, width), taken in sizes.items()), sizes
 
 
 def test_without_a_terminal_each_tenth_is_a_line_with_the_time_that_is_left() -> None:
@@ -316,18 +287,12 @@ def test_without_a_terminal_each_tenth_is_a_line_with_the_time_that_is_left() ->
     progress = Progress(console=Console(file=said, width=120), get_time=lambda: float(next(now_s)), disable=True)
     bar = Bar(progress, 20)
     for step in range(1, 21):
-        bar.stepped(step, 0.5 / step)
+        bar(step, 0.5 / step, math.nan)
     lines = said.getvalue().splitlines()
     assert len(lines) == 10
     assert lines[0].startswith("training: 2 of 20 steps")
     assert "s left" in lines[4]
     assert lines[-1] == "training: 20 of 20 steps, MSE 2.5e-02"
-
-
-def test_help_loads_nothing_heavy() -> None:
-    heavy = {"torch", "numpy", "pydantic", "rich.progress"}
-    code = f"import sys, brushloop.model.generator.cli; assert not {heavy} & sys.modules.keys()"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize(
