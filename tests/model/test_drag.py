@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.model.drag import DragModel, distances, ink, trails
+from brushloop.model.drag import DragModel, distances, trails
 
 STIFF = DragModel(half_mm=2.0, half_per_mm=0.0, leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0)
 X_MM, Y_MM = np.linspace(-10.0, 50.0, 121), np.linspace(-20.0, 20.0, 81)
@@ -53,14 +53,6 @@ def test_lifting_below_no_width_leaves_no_ink() -> None:
     middle = away(model, path, np.array([15.0]), Y_MM)
     assert middle.max() < 0.0
     assert away(model, path, np.array([2.0]), np.array([0.0])).item() > 0.0
-
-
-def test_ink_is_half_as_likely_at_the_edge_and_likelier_inward() -> None:
-    seen = ink(away(STIFF, line(30.0), np.array([15.0]), np.array([0.0, 2.0, 4.0])), 0.125)[:, 0]
-    assert seen[0] > 0.99
-    assert seen[1] == pytest.approx(0.5, abs=1e-6)
-    assert seen[2] < 0.01
-    assert ink(np.array([-1e9, 1e9]), 0.1).tolist() == pytest.approx([0.0, 1.0])
 
 
 def test_a_batch_is_its_members() -> None:

@@ -18,7 +18,7 @@ from safetensors.numpy import load_file, save_file
 
 from brushloop.model.ccdbsm import Brush, DomainError, ccdbsm
 from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
-from brushloop.model.generator.card import likeness, report_of
+from brushloop.model.generator.card import likeness
 from brushloop.model.generator.config import MAX_WEIGHTS, PRESETS, Layers, Target, preset
 from brushloop.model.generator.data import exact_sets, sha256
 from brushloop.model.generator.network import Generator, covered, squared_error
@@ -26,17 +26,6 @@ from brushloop.model.generator.stroke import load_generator, read_generator, tra
 from brushloop.model.raster import centred_origin, coverage
 
 MOST_BYTES = 10_000_000
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_draws_strokes_that_fit_the_image(name: str) -> None:
-    target = PRESETS[name]
-    inputs = target.draw(64, (1,))
-    target.check(inputs)
-    images = target.images(inputs)
-    assert images.shape == (64, 128, 128)
-    areas = target.stroke_model.profile(*inputs.T).area_mm2
-    assert (images.sum((1, 2)) * target.px_mm**2).tolist() == pytest.approx(areas.tolist(), rel=1e-3)
 
 
 def test_placements_are_those_of_the_validation() -> None:
@@ -47,6 +36,10 @@ def test_placements_are_those_of_the_validation() -> None:
     anchored = (0.76 * 38.4 + 15 * math.tan(math.radians(8)), 19.2)
     expected = coverage(outline, anchored, px_mm=0.3)
     np.testing.assert_allclose(PRESETS["anchored"].images(inputs), expected, rtol=0, atol=1e-5)
+    for target in PRESETS.values():  # every stroke fits its image
+        drawn = target.draw(64, (1,))
+        ink_mm2 = target.images(drawn).sum((1, 2)) * target.px_mm**2
+        assert ink_mm2.tolist() == pytest.approx(target.stroke_model.profile(*drawn.T).area_mm2.tolist(), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -132,16 +125,6 @@ def test_the_shipped_generator_is_small_and_the_one_that_its_card_describes() ->
     assert 0.5 * file.report["mse"] < mse < 2.0 * file.report["mse"]
 
 
-def test_equal_images_are_perfect() -> None:
-    images = PRESETS["press"].images(np.array([[15.0, 5.0], [12.0, 1.0]]))
-    report = report_of([(images, images)])
-    assert (report["images"], report["mse"], report["iou"], report["psnr_db"]) == (2, 0, 1, math.inf)
-    assert report["csim"] == pytest.approx(1)
-    assert report["ssim_min"] == pytest.approx(1)
-    with pytest.raises(ValueError, match="no images"):
-        report_of([])
-
-
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
     path = tmp_path / "generator.safetensors"
@@ -163,19 +146,16 @@ BIAS = "convolution.0.bias"
 HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
     "absent": (Path.unlink, "no such file"),
     "text": (lambda p: p.write_text("hello"), "is not a safetensors file"),
-    "pickle": (lambda p: torch.save({"a": torch.zeros(1)}, p), "is not a safetensors file"),
     "cut": (lambda p: p.write_bytes(p.read_bytes()[:-100]), "is not a safetensors file"),
     "endless header": (lambda p: p.write_bytes(struct.pack("<Q", 2**60) + b"{}"), "is not a safetensors file"),
     "huge": (lambda p: os.truncate(p, 4 * MAX_WEIGHTS + 2**26 + 1), "bytes; at most"),
     "another kind": (lambda p: changed(p, format="other"), "format is 'other'"),
     "no config": (lambda p: changed(p, config=""), "config is not JSON"),
     "deep config": (lambda p: changed(p, config="[" * 60_000), "config is not JSON"),
-    "long config": (lambda p: changed(p, config=" " * 70_000), "config is longer than"),
     "unknown field": (lambda p: changed(p, config=json.dumps({"target": {"evil": 1}})), "evil: Extra inputs"),
     "many weights": (lambda p: changed(p, config=configured(width=2048, channels=128, side=64)), "weights; at most"),
     "report": (lambda p: changed(p, report="[1]"), "report is not a table"),
     "shape": (lambda p: changed(p, {BIAS: np.zeros(17, np.float32)}), "expected float32 (64,)"),
-    "type": (lambda p: changed(p, {BIAS: np.zeros(64)}), "float64 (64,), expected"),
     "not finite": (lambda p: changed(p, {BIAS: np.full(64, np.nan, np.float32)}), "not finite"),
     "one too many": (lambda p: changed(p, {"more": np.zeros(1, np.float32)}), "'more' is not known"),
 }

@@ -62,7 +62,7 @@ def test_place_and_heading_come_back_too(depth: float, tilt: float, heading: flo
     assert Flag.ALPHA_UNKNOWN in recovered.flags[0]
 
 
-@pytest.mark.parametrize("model", ["bezier", "ellipse", "qbc"])
+@pytest.mark.parametrize("model", ["bezier", "qbc"])
 def test_any_model_inverts_its_own_marks(model: str) -> None:
     depth, tilt = np.array([12.0, 16.0, 18.5]), np.array([2.0, 5.0, 9.0])
     images = drawn(depth, tilt, [ANCHOR] * 3, model=MODELS[model])
@@ -85,16 +85,6 @@ def test_intervals_under_sensor_noise_keep_their_word() -> None:
     recovered = INVERT(noisy, place)
     assert 0.92 <= inside(recovered, "depth_mm", depth) <= 0.98
     assert 0.92 <= inside(recovered, "tilt_deg", tilt) <= 0.98
-
-
-def test_the_recovered_press_is_the_best_of_a_grid_around_it() -> None:
-    _, _, place, images = anchored(1, 5)
-    target = (images > 0.5).astype(np.float32)
-    recovered = INVERT(target, place)
-    steps = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 21), np.linspace(-0.5, 0.5, 21)), -1).reshape(-1, 2)
-    near = recovered.values[0, :2] + np.vstack(((0.0, 0.0), steps))
-    cost = np.square(drawn(near[:, 0], np.maximum(near[:, 1], 0), np.repeat(place, len(near), 0)) - target).sum((1, 2))
-    assert cost[0] <= cost.min() * (1 + 1e-3)
 
 
 def test_an_uncertain_anchor_widens_the_interval_of_alpha() -> None:

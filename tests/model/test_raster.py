@@ -74,27 +74,6 @@ def test_boundary_pixels_match_quadrature_at_any_heading(press: tuple[float, flo
         assert abs(compiled[i, j] - expected) < 1e-6
 
 
-@pytest.mark.parametrize("name", sorted(MODELS))
-def test_supersampling_agrees_at_a_heading(name: str) -> None:
-    # A point is counted whole, so single pixels differ by up to half a line of 32 points.
-    outline, psi = MODELS[name].profile(15.0, 7.0), math.radians(30)
-    fine = (np.arange(32 * 64) + 0.5) * 0.4 / 32
-    right, up = np.meshgrid(fine - ORIGIN[0], ORIGIN[1] - fine)
-    x, y = right * math.cos(psi) + up * math.sin(psi), up * math.cos(psi) - right * math.sin(psi)
-    edge = outline.polyline(64)[0]
-    upper = edge[np.argsort(edge[:, 0])]
-    upper = upper[upper[:, 1] >= 0]  # every model here is symmetric about its axis
-    inside = abs(y) <= np.interp(x, *upper.T, left=-1, right=-1)
-    sampled = inside.reshape(64, 32, 64, 32).mean((1, 3))
-    raster = {"size_px": 64, "px_mm": 0.4}
-    for image in (
-        coverage_at(outline, ORIGIN, 30.0, **raster)[0].numpy(),
-        coverage(outline, ORIGIN, 30.0, **raster)[0],
-    ):
-        assert abs(image - sampled).max() <= 1 / 32
-        assert image.sum() == pytest.approx(sampled.sum(), rel=1e-3)
-
-
 @given(presses, st.floats(-360, 360), st.floats(-5, 30), st.floats(-5, 30), st.sampled_from(sorted(MODELS)))
 @settings(deadline=None, max_examples=60)
 def test_both_exact_paths_agree_wherever_a_mark_lies(
@@ -173,37 +152,16 @@ def test_marks_of_many_brushes_are_centred_and_checked() -> None:
         press_images(mark, out=np.zeros((3, 128, 128)))
 
 
-# torch itself compiles its forward-mode rules with torch.jit.script on first use, and warns about it.
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-def test_gradients_are_exact_in_every_parameter() -> None:
-    def image(h, tilt, radius, length, lam, origin, heading) -> torch.Tensor:
-        mark = ccdbsm(Brush(radius, length), h, tilt, lam)
-        return coverage_at(mark.outline(), origin, heading, size_px=9, px_mm=2.0)
-
-    values = ([13.0], [6.0], [6.0], [48.0], [3.0], [[14.3, 8.0]], [25.0])  # no boundary runs along a pixel edge
-    point = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values]
-    assert torch.autograd.gradcheck(image, point, check_forward_ad=True)
-
-
 @pytest.mark.parametrize("name", sorted(MODELS))
-def test_every_model_has_exact_gradients_that_stay_finite_where_the_axis_lies_on_a_row_edge(name: str) -> None:
+def test_gradients_are_exact_and_finite_where_the_axis_lies_on_a_row_edge(name: str) -> None:
     def image(h: torch.Tensor, tilt: torch.Tensor) -> torch.Tensor:
         return coverage_at(MODELS[name].profile(h, tilt), (14.3, 8.0), size_px=9, px_mm=2.0)
 
     point = [torch.tensor([value], dtype=torch.float64, requires_grad=True) for value in (13.0, 6.0)]
     assert torch.autograd.gradcheck(image, point)
-
-
-@given(presses, st.floats(-180, 180))
-@settings(deadline=None, max_examples=30)
-def test_single_precision_is_good_to_a_thousandth(press: tuple[float, float], heading_deg: float) -> None:
-    double, single = (
-        ccdbsm(Brush(), torch.tensor([press[0]], dtype=kind), press[1]).outline()
-        for kind in (torch.float64, torch.float32)
-    )
-    image = coverage_at(single, ORIGIN, heading_deg)
-    assert image.dtype == torch.float32
-    assert (image - coverage_at(double, ORIGIN, heading_deg)).abs().max().item() < 1e-3
+    single = coverage_at(MODELS[name].profile(point[0].float(), 6.0), ORIGIN)
+    assert single.dtype == torch.float32
+    assert (single - coverage_at(MODELS[name].profile(13.0, 6.0), ORIGIN)).abs().max().item() < 1e-3
 
 
 def test_the_tip_points_left_and_rows_grow_downwards() -> None:

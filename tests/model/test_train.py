@@ -24,7 +24,7 @@ from brushloop.model.generator import train as training
 from brushloop.model.generator.card import read_curves
 from brushloop.model.generator.cli import Bar, app
 from brushloop.model.generator.config import TrainConfig, checked, load_config
-from brushloop.model.generator.data import batch_numbers, exact_sets, load_captures, save_captures, split, write_whole
+from brushloop.model.generator.data import load_captures, save_captures, split
 from brushloop.model.generator.network import Generator
 from brushloop.model.generator.stroke import load_generator
 from brushloop.model.generator.train import converged, new_network, run_training
@@ -135,21 +135,9 @@ def test_a_finished_training_is_not_done_again_and_another_one_is_refused(finish
         run_training(tiny(steps=40), finished, Notes())
     with FileLock(tmp_path / ".lock"), pytest.raises(TrainError, match="another training writes here"):
         run_training(tiny(), tmp_path, Notes())
-
-
-@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 cut"])
-def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "checkpoint.pt").write_bytes(content)
+    (tmp_path / "checkpoint.pt").write_bytes(b"PK\x03\x04 cut")
     with pytest.raises(TrainError, match=r"is not a checkpoint of this training: [^\n]*$"):
         run_training(tiny(), tmp_path, Notes())
-
-
-def test_cuda_without_a_gpu_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    if torch.cuda.is_available():
-        pytest.skip("this machine has a GPU")
-    with pytest.raises(TrainError, match="no usable GPU"):
-        run_training(tiny(device="cuda"), tmp_path / "g", Notes())
-    assert not (tmp_path / "g").exists()
 
 
 def test_asked_to_stop_it_keeps_the_last_step(tmp_path: Path) -> None:
@@ -184,30 +172,6 @@ def test_it_stops_when_converged(tmp_path: Path) -> None:
     assert converged(patient, [1.0, 0.5, 0.499, 0.498])
     assert not converged(patient, [1.0, 0.5, 0.499])
     assert not converged(patient, [1.0, 0.5, 0.499, 0.498, 0.4])
-
-
-def test_batches_follow_from_seed_and_step() -> None:
-    epoch = np.concatenate([batch_numbers(96, 16, 5, step) for step in range(6)])
-    assert sorted(epoch.tolist()) == list(range(96))
-    assert batch_numbers(96, 16, 5, 9).tolist() == batch_numbers(96, 16, 5, 9).tolist()
-    assert batch_numbers(96, 16, 5, 0).tolist() != batch_numbers(96, 16, 5, 6).tolist()
-    assert len(batch_numbers(7, 64, 0, 3)) == 7
-    training, validation = exact_sets(tiny())
-    assert not np.isin(validation.inputs[:, 0], training.inputs[:, 0]).any()
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "file"
-    write_whole(path, b"old")
-
-    def full(part: Path, _: Path) -> None:
-        raise OSError(28, "no space left", str(part))
-
-    monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(OSError, match="no space"):
-        write_whole(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_captures_must_fit_the_generator(tmp_path: Path) -> None:

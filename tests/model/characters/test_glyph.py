@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from brushloop.model.characters.glyph import (
     GlyphError,
-    distance_to,
     parse_csv,
     parse_glyph,
     parse_json,
@@ -20,7 +19,7 @@ from brushloop.model.characters.glyph import (
     paths_of,
     reference,
 )
-from brushloop.model.characters.plan import Patch, resampled, tangents
+from brushloop.model.characters.plan import Patch
 
 SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"
 
@@ -57,23 +56,6 @@ def test_an_outline_is_a_closed_loop_counter_clockwise_whichever_way_it_was_draw
         assert 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) == pytest.approx(200.0**2)
 
 
-def test_curves_of_both_kinds_are_drawn_alike() -> None:
-    """A quadratic curve raised to a cubic is the same curve."""
-    quadratic = parse_path("M 0 0 Q 300 600 600 0 Z", "")
-    cubic = parse_path("M 0 0 C 200 400 400 400 600 0 Z", "")
-    for arcs in (quadratic, cubic):
-        start, middle, end = arcs[:, 0], arcs[:, 1], arcs[:, 2]
-        polygon = 0.5 * np.sum(start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0])
-        a, b = middle - start, end - start
-        assert polygon + np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 3 == pytest.approx(120_000.0, rel=1e-9)
-
-
-def test_the_half_width_of_a_bar_is_half_its_width() -> None:
-    loop = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 6.0], [0.0, 6.0]])
-    inside = distance_to(loop, np.array([[20.0, 3.0], [20.0, 1.0], [39.0, 3.0], [50.0, 3.0]]))
-    assert inside.tolist() == [3.0, 1.0, 1.0, 0.0]
-
-
 def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
     cell = Patch(70.0, 6.0)
     assert cell.to_mm(np.array([[0.0, -124.0], [1024.0, 900.0]])).tolist() == [[6.0, 6.0], [64.0, 64.0]]
@@ -83,34 +65,21 @@ def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
         assert steps.max() < 3.0
 
 
-def test_headings_are_unwrapped_along_a_spiral() -> None:
-    turn = np.linspace(0, 3 * np.pi, 60)
-    heading = tangents(resampled(np.column_stack((turn * np.cos(turn), turn * np.sin(turn))), 0.3))
-    assert np.abs(np.diff(heading)).max() < 60
-    assert heading[-1] - heading[0] > 360
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
-        ("[]", "is not a JSON object"),
         (glyph_text(strokes=[]), "strokes: expected a list of 1 to 64"),
-        (glyph_text(medians=[]), "medians: expected a list of 1 to 64"),
         (glyph_text(strokes=[SQUARE, SQUARE]), "medians: 1 for 2 strokes"),
-        (glyph_text(strokes=[7]), "strokes.0: is not text"),
         (glyph_text(strokes=["M 0 0 L 5"]), "strokes.0: L takes 2 numbers"),
         (glyph_text(strokes=["M 0 0 A 5 5 0 0 1 3 3 Z"]), "expected M first, then L, Q, C or Z"),
-        (glyph_text(strokes=["L 0 0"]), "expected M first"),
         (glyph_text(strokes=["M 0 0 L 1e9 0 L 0 9 Z"]), "expected 4096 at most"),
         (glyph_text(strokes=["M 0 0 L 9 0 Z"]), "strokes.0: encloses nothing"),
         (glyph_text(strokes=["M 0 0 L 9 0 #"]), "is not a path at character"),
         (glyph_text(strokes=["M 0 0 " + "L 1 2 L 3 4 " * 2000]), "more than 1024 pieces"),
         (glyph_text(medians=[[[0, 0]]]), "medians.0: expected a list of 2 to 256 points"),
         (glyph_text(medians=[[[0, 0], [0, "x"]]]), "medians.0.1: expected [x, y]"),
-        (glyph_text(medians=[[[0, 0], [0, float("nan")]]]), "medians.0.1: expected [x, y]"),
-        (glyph_text(medians=[[[0, 0], [True, 1]]]), "medians.0.1: expected [x, y]"),
         (glyph_text(medians=[[[5, 5], [5, 5]]]), "medians.0: expected two different points"),
         (" " * 300_000, "is longer than"),
     ],
@@ -151,7 +120,6 @@ def test_a_hand_gives_ways_and_widths() -> None:
         ("x_mm,y_mm,width_mm\n1,2\n", "line 2: expected 3 values"),
         ("x_mm,y_mm,width_mm\n1,900,3\n", "line 2: y_mm: must be a number, 0 to 70"),
         ("x_mm,y_mm,width_mm\n1,nan,3\n", "line 2: y_mm: must be a number"),
-        ("x_mm,y_mm,width_mm\n1,1_0,3\n", "line 2: y_mm: must be a number"),
         ("x_mm,y_mm,width_mm\n", "holds no stroke"),
         ("x_mm,y_mm,width_mm\n1,1,3\n2,1,3\n", "stroke 1: is 1 mm long"),
         ('x_mm,y_mm,width_mm\n"1,1,3\n', "is not CSV"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brushloop.model.characters.glyph import swept
-from brushloop.model.characters.lead import PLUNGE, covered, drawn, first_lead, lead
+from brushloop.model.characters.lead import covered, drawn, first_lead, lead
 from brushloop.model.characters.plan import Phase, Reach, StrokePath, phase_map, phases_of, resampled
 from brushloop.model.drag import NAMES, START, Drawings, Footprint, fit_each, fit_footprint, inked, marks, sampled
 
@@ -98,25 +98,6 @@ def test_a_brush_that_lifts_marks_ahead_of_where_it_was_dragged_to() -> None:
     dragged, lifted = (marks([nodes], np.array(START)).discs for nodes in (path, sampled(path)))
     assert dragged[-2, 0] == pytest.approx(34.0 - float(Footprint().lag_mm(np.array([8.0]))[0]))
     assert lifted[-2, 0] == pytest.approx(34.0 - float(Footprint().lag_mm(np.array([0.0]))[0]))
-
-
-def test_a_footprint_swings_round_behind_a_corner() -> None:
-    path = np.array([[14.0, 24.0, 4.0, 0.0], [24.0, 24.0, 4.0, 0.0], [24.0, 34.0, 4.0, 0.0]])
-    discs = marks([sampled(path)], np.array(START)).discs.reshape(-1, 3, 3)
-    along = discs[:, 0, :2] - discs[:, 2, :2]
-    heading = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
-    assert heading[0] == pytest.approx(0.0, abs=1e-6)
-    assert heading[-1] == pytest.approx(90.0, abs=10.0)
-    assert np.count_nonzero((heading > 20.0) & (heading < 70.0)) > 1
-    assert np.all(np.diff(heading) > -1e-9)
-
-
-def test_a_led_path_may_be_steeper_than_one_of_presses() -> None:
-    path = hook()
-    uneven = StrokePath(path.points, np.where(np.arange(len(path.points)) % 4 == 0, 3.0, 0.5))
-    [led] = first_lead([uneven], Footprint(), Reach(), SIDE_MM, 5.0)
-    slope = np.abs(np.diff(led[:, 2])) / np.linalg.norm(np.diff(led[:, :2], axis=0), axis=1)
-    assert Reach().plunge < slope.max() <= PLUNGE + 1e-9
 
 
 def test_a_stroke_is_divided_into_phases() -> None:

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.characters.glyph import parse_glyph, paths_of, reference, swept
-from brushloop.model.characters.plan import Patch, Reach, StrokePath, depth_of, trajectory
-from brushloop.model.characters.presses import dense, refine, stamped, written
+from brushloop.model.characters.glyph import parse_glyph, paths_of, reference
+from brushloop.model.characters.plan import Patch, Reach, depth_of, trajectory
+from brushloop.model.characters.presses import refine, stamped, written
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
 
@@ -95,11 +95,6 @@ def test_an_image_is_differentiable_in_every_number_of_a_point() -> None:
         assert float(slope[at]) == pytest.approx((both[0] - both[1]) / 2e-5, rel=1e-3, abs=1e-4)
 
 
-def test_dense_points_lie_on_the_way() -> None:
-    points = torch.tensor([[0.0] * 5, [2.0] * 5, [3.0] * 5])
-    assert dense(points, 2)[:, 0].tolist() == [0.0, 1.0, 2.0, 2.5, 3.0]
-
-
 def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
     text = (files("brushloop.model.characters") / "data" / "子.json").read_text("utf-8")
     glyph = parse_glyph(text, "子")
@@ -112,26 +107,7 @@ def test_refinement_brings_a_character_to_its_image_within_reach() -> None:
         assert_feasible(points, REACH)
 
 
-def test_a_shallow_brush_stays_shallow() -> None:
-    reach = Reach(depth_mm=(0.5, 3.0))
-    way = StrokePath(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 4.0))
-    first = trajectory(way, MODEL, reach, CELL, 0.0)
-    better = refine(MODEL, [first], swept([way], CELL.side_mm, 64), CELL.side_mm, reach, 5)
-    assert better[0][:, 2].max() <= 3.0
-
-
-def test_no_steps_change_nothing() -> None:
-    way = StrokePath(np.column_stack((np.linspace(10, 50, 21), np.full(21, 30.0))), np.full(21, 2.0))
-    first = trajectory(way, MODEL, REACH, CELL, 0.0)
-    assert np.array_equal(refine(MODEL, [first], swept([way], 60.0, 64), 60.0, REACH, 0)[0], first)
-
-
 @pytest.mark.parametrize("options", [{"depth_mm": (3.0, 3.0)}, {"tilt_deg": (-1.0, 5.0)}, {"plunge": 0.0}])
 def test_a_reach_that_makes_no_sense_is_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="expected"):
         Reach(**options)
-
-
-def test_a_last_point_that_returns_leaves_none_too_near() -> None:
-    there_and_back = np.array([[x, 0.0, 2.0, 5.0, 0.0] for x in (0.0, 1.5, 0.0, 1.5, 1.0)])
-    assert REACH.spaced(there_and_back)[:, 0].tolist() == [0.0, 1.0]
