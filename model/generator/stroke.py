@@ -23,8 +23,6 @@ from brushloop.model.strokes import StrokeModel
 
 Singles = NDArray[np.float32]
 FORMAT = "brushloop-generator-2"
-MAX_HEADER_BYTES = 4 * 1024 * 1024
-"""Largest header of a safetensors file; it holds the names of the tensors, and the configuration."""
 MAX_CONFIG_CHARS = 64 * 1024
 
 
@@ -180,10 +178,6 @@ def read_tensors(path: Path, most_bytes: int) -> tuple[dict[str, str], dict[str,
     if size > most_bytes:
         raise TrainError(path, f"holds {size:,} bytes; at most {most_bytes:,} are read")
     try:
-        with path.open("rb") as opened:
-            header = int.from_bytes(opened.read(8), "little")
-        if header > MAX_HEADER_BYTES:
-            raise ValueError(f"its header has {header:,} bytes; at most {MAX_HEADER_BYTES:,} are read")
         with safe_open(path, framework="np") as file:
             untyped: Any = file
             return dict(untyped.metadata() or {}), {name: untyped.get_tensor(name) for name in untyped.keys()}  # noqa: SIM118

@@ -95,7 +95,7 @@ def test_after_a_round_that_does_not_help_the_best_one_is_kept(plan: PlanRecord,
     assert figure.commanded == figure.best == plan.figures[0].commanded
     assert len(figure.rounds) == 2
     # Once settled it stays, whatever the next round shows.
-    assert learned(session(last)).figures[0].settled
+    assert learned(session(last, ink=WANTED)).figures[0].settled
 
 
 def test_the_report_lists_rounds_and_what_each_phase_lost(after: PlanRecord, tmp_path: Path) -> None:

@@ -67,6 +67,10 @@ def test_pressing_deeper_on_the_spot_marks_like_landing_as_deep() -> None:
     deep = ink > 0.3
     assert deep.sum() > 30
     assert np.all(slid[deep] > 0.0)
+    nodes = sampled(lands)
+    middle_disc = marks([nodes], np.array(START)).discs[1::3]
+    behind = np.hypot(*(middle_disc[:, :2] - (24.0, 24.0)).T)
+    assert behind[nodes[:, 2] == 8.0][0] == pytest.approx(4.5, abs=0.1)  # it slid there while the brush went down
 
 
 def test_each_stroke_has_a_footprint_of_its_own() -> None:
