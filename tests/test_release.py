@@ -172,7 +172,7 @@ def test_the_twin_presses(brushloop_twin):
 
 @pytest.mark.soak  # builds and installs
 def test_a_labs_own_tests_get_a_rig_and_its_twin(brushloop: Path, tmp_path: Path) -> None:
-    documented = dict(DOCUMENTED.findall((ROOT / "docs" / "twin.md").read_text()))
+    documented = dict(DOCUMENTED.findall((ROOT / "docs" / "loopback-brush.md").read_text()))
     (tmp_path / "twin.toml").write_text('name = "our brush, simulated"\n[brush]\nfriction = 0.3\n')
     (tmp_path / "pytest.ini").write_text(documented["ini"])
     (tmp_path / "test_ours.py").write_text(documented["python"] + OF_A_TWIN)

@@ -1,7 +1,7 @@
 """Faults of the loopback rig: what may go wrong, when it begins and how long it lasts.
 
 Every server of the rig asks the board, before it answers, whether a fault strikes. What a run does about each fault in
-each phase is in the table of docs/faults.md, "Ten faults in ten phases"; tests/collect/faults/test_matrix.py checks it.
+each phase is in the table of tests/collect/faults/test_matrix.py.
 """
 
 from __future__ import annotations

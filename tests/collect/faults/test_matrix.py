@@ -1,7 +1,7 @@
 """Ten faults in ten phases of a session: each patch has its outcome, and in every one the arm ends at rest.
 
 A run is fast up to its phase. As that begins, simulated time slows to half real speed, and the fault strikes a
-move that is under way. docs/faults.md holds the same table.
+move that is under way.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -97,20 +96,19 @@ SINGLE = ("late", "wrong id", "malformed", "protective stop", "emergency stop")
 class Outcome:
     """How a run ends."""
 
-    words: str
     error: type[DeviceError] | None = None
     device: str = ""
     alarm: bool = False
     """The message says that the arm may still be moving, and to use the emergency stop."""
 
 
-DONE = Outcome("goes on, done")
-SILENT = Outcome("`MotionFailed`: may still be moving", MotionFailed, "robot", alarm=True)
-TIMEOUT = Outcome("`DeviceTimeout`, stopped", DeviceTimeout, "robot")
-VIOLATION = Outcome("`ProtocolViolation`, stopped", ProtocolViolation, "robot")
-LOST = Outcome("`ConnectionLost`, stopped", ConnectionLost, "robot")
-UNSAFE = Outcome("`RobotNotSafe`, stopped", RobotNotSafe, "robot")
-BLIND = Outcome("camera `DeviceTimeout`, parked", DeviceTimeout, "camera")
+DONE = Outcome()
+SILENT = Outcome(MotionFailed, "robot", alarm=True)
+TIMEOUT = Outcome(DeviceTimeout, "robot")
+VIOLATION = Outcome(ProtocolViolation, "robot")
+LOST = Outcome(ConnectionLost, "robot")
+UNSAFE = Outcome(RobotNotSafe, "robot")
+BLIND = Outcome(DeviceTimeout, "camera")
 
 
 PRESSING = ("descent", "at depth", "lift")
@@ -343,25 +341,3 @@ def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: s
     [folder] = stage.sessions.iterdir()
     state = replay(folder / "journal.jsonl")
     assert len(state.used_patches) == 2, "the press that was cut lies on one, its repetition on another"
-
-
-def test_the_documentation_holds_this_table() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "faults.md").read_text(encoding="utf-8")
-    for row in rendered():
-        assert row in text
-
-
-def rendered() -> list[str]:
-    """The table as Markdown: phases down, faults across would be too wide, so equal neighbours are one entry."""
-    rows: list[str] = []
-    for name, outcomes in TABLE.items():
-        spans: list[str] = []
-        phases = list(PHASES)
-        begin = 0
-        for k in range(1, len(phases) + 1):
-            if k == len(phases) or outcomes[k] is not outcomes[begin]:
-                where = phases[begin] if k == begin + 1 else f"{phases[begin]} to {phases[k - 1]}"
-                spans.append(f"{where}: {outcomes[begin].words}")
-                begin = k
-        rows.append(f"| {name} | {'; '.join(spans)} |")
-    return rows
