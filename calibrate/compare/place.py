@@ -163,8 +163,8 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
     if calibration is not None and stroke.anchor_mm is not None:
         window, (left_mm, top_mm) = view.window_mm(stroke.anchor_mm), view.anchor_mm
         if stroke.kind == "drag" and stroke.cell_mm is not None:
-            window = x_mm, y_mm, _, height_mm = stroke.cell_mm
-            left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + height_mm - stroke.anchor_mm[1]
+            window = x_mm, y_mm, _, tall_mm = stroke.cell_mm
+            left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + tall_mm - stroke.anchor_mm[1]
         raster = rectify_by(image, calibration, window, capture.where)
         cell_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
         anchor = (left_mm * PX_PER_MM, top_mm * PX_PER_MM)
