@@ -14,8 +14,8 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field, ValidationError
 
 from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.check import Check, unmeasured
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
-from brushloop.collect.rig.plausible import Check, unmeasured
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.disk import fsync_folder, sync

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Choice
+from brushloop.collect.rig.check import brush_shorter_than_tool, deepest_press
 from brushloop.collect.rig.config_devices import InkDeviceConfig, InkStationConfig, ModbusPumpConfig
 from brushloop.collect.rig.devices import make_ink
-from brushloop.collect.rig.plausible import brush_shorter_than_tool, deepest_press
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.store import Notebook, StepName
 from brushloop.drivers.host import Clock

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.rig.plausible import brush_square
+from brushloop.collect.rig.check import brush_square
 from brushloop.collect.teach.arm_reader import ArmReader
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.guide import Target

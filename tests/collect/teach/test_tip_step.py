@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.rig.plausible import brush_square
+from brushloop.collect.rig.check import brush_square
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Brought, Target
 from brushloop.collect.teach.steps.arm import ArmStep
