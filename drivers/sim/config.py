@@ -30,8 +30,8 @@ class Table:
     board_square_mm: float = 12.0
     board_marker_mm: float = 9.0
     board_dictionary: str = "DICT_5X5_1000"
-    well_mm: tuple[float, float] = (305.0, 20.0)
-    """Centre of the ink well, in the paper frame."""
+    well_mm: tuple[float, float] = (-75.0, 150.0)
+    """Centre of the ink well, in the paper frame: on the way from where the arm parks to the sheet."""
     well_radius_mm: float = 15.0
     well_depth_mm: float = 14.0
     """Depth from its rim to its bottom, which stands on the table at the height of the paper."""

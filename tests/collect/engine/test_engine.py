@@ -169,9 +169,8 @@ def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None
     run(lab.engine(sheet=2))  # the same command again: the sheet is not changed twice
     [folder] = lab.sessions.iterdir()
     assert sum(1 for _ in Recording(folder).captures()) == 6
-    pressed = [
-        (line["sheet"], patch) for line in read_lines(folder / "journal.jsonl") for patch in line.get("patches", [])
-    ]
+    lines = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
+    pressed = [(line["sheet"], patch) for line in lines for patch in line.get("patches", [])]
     assert len(pressed) == len(set(pressed))
     assert {sheet for sheet, _ in pressed} == {0, 1}
 

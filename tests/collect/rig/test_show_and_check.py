@@ -52,7 +52,7 @@ def test_the_loopback_rig_contradicts_nothing_and_what_is_missing_is_said(rig: P
         ("[0.0, 0.0, 180.0]", "[0.0, 0.0, 0.18]", "tool length", "0.18 m are 180 mm"),
         ("square_mm = 12.0\nmarker_mm = 9.0", "square_mm = 0.012\nmarker_mm = 0.009", "square of the board", "12 mm"),
         ("squares = [26, 20]", "squares = [22, 16]", "board around the sheet", "print a larger one"),
-        ("well_mm = [305.0", "well_mm = [505.0", "inside the box, well", "Outside the box"),
+        ("well_mm = [-75.0", "well_mm = [505.0", "inside the box, well", "Outside the box"),
         ("x_mm = [200.0, 640.0]", "x_mm = [200.0, 940.0]", "room in the box", "little more"),
         ("park_mm = [250.0, -230.0", "park_mm = [250.0, -100.0", "park beside the board", "in the picture"),
         ("travel_speed_mm_s = 200.0", "travel_speed_mm_s = 400.0", "travel speed", "refuses every move"),
@@ -80,7 +80,7 @@ def test_what_is_shown_is_where_the_tip_goes(rig: Path) -> None:
     places = {place["name"]: place for place in shown["places"]}
     # Yaw 90: paper x runs along base y, paper y against base x.
     assert places["sheet lower right"]["at_mm"] == pytest.approx([460.0, 134.0, 98.03])
-    assert places["well"]["at_mm"] == pytest.approx([440.0, 195.0, 122.0])
+    assert places["well"]["at_mm"] == pytest.approx([310.0, -185.0, 122.0])
     assert places["park"]["paper_mm"] == pytest.approx([-120.0, 210.0])
     table = brushloop("rig", "show", rig).stdout
     assert all(name in table for name in places)

@@ -235,9 +235,9 @@ def test_points_of_a_registration_that_were_swapped_are_named() -> None:
     seen = robot + 5.0
     names = ("a", "b", "c", "d", "e")
     with pytest.raises(CalibrationError, match="fit only if b and e are swapped"):
-        register(names, robot[[0, 4, 2, 3, 1]], seen)
+        register(names, robot[[0, 4, 2, 3, 1]], seen, "test", (0.0, 0.0))
     with pytest.raises(CalibrationError, match="fit only as in a mirror"):
-        register(names, robot * [1.0, -1.0], seen)
+        register(names, robot * [1.0, -1.0], seen, "test", (0.0, 0.0))
     assert mixed_up(names, robot, seen) == ""
 
 
