@@ -183,15 +183,6 @@ def test_the_review_looks_through_the_lens_that_the_session_recorded(
     assert alike[1] == 2
 
 
-def test_the_review_follows_the_calibration_in_use(
-    photographed: Photographed, tmp_path: Path, shot: Shot, lens: Path
-) -> None:
-    session = collected(photographed, tmp_path / "without", shot)
-    assert Review(session).repeatability(Condition(13.0, 5.0)) is None
-    calibrate_session(session, lens)
-    assert Review(session).repeatability(Condition(13.0, 5.0)) is not None
-
-
 def test_the_review_says_why_it_compares_nothing(photographed: Photographed, tmp_path: Path, shot: Shot) -> None:
     session = collected(photographed, tmp_path / "damaged", shot)
     (session / "rig.effective.json").write_text('{"board": 7}')
@@ -206,14 +197,15 @@ def test_every_stage_is_shown_with_the_lens(photographed: Photographed, tmp_path
     refused = CliRunner().invoke(app, command)
     assert "is not calibrated: run `brushloop calibrate" in str(refused.exception)
     assert not out.exists()
+    assert Review(session).repeatability(Condition(13.0, 5.0)) is None
     made = calibrate_session(session, lens)
+    assert Review(session).repeatability(Condition(13.0, 5.0)) is not None, "the calibration in use"
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == 0, shown.output
     fields = dict(line.split() for line in shown.output.splitlines() if line.startswith("undistort."))
     assert float(fields["undistort.k1"]) == pytest.approx(CAMERAS[BARREL].k1, abs=0.005)
     # What is shown is what is measured: the same plane, the same paper cell.
-    shown_first = next(Recording(session).captures())
-    prepared = prepare_press(shown_first, made, Field())
+    prepared = prepare_press(next(Recording(session).captures()), made, Field())
     numbers = json.loads(out.with_suffix(".json").read_text())["fitted"]
     assert numbers["threshold.reflectance"] == prepared.threshold
     assert numbers["components.area_mm2"] == prepared.mask.sum() / PX_PER_MM**2

@@ -1,94 +1,66 @@
-"""Scale and plane from a board whose truth is known."""
+"""Scale and plane from a board whose truth is known, and the board as it is printed."""
 
 from __future__ import annotations
+
+import re
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from pydantic import ValidationError
 
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane, apply, distorted_share, fit_plane, local_scale
-from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.board.view import DISTORTED_SHARE, paper_mm, see_board
+from brushloop.calibrate.board.spec import MM_PER_INCH, Board, BoardSpec, Checkerboard, charuco_board, drawn, write_pdf
+from brushloop.calibrate.board.view import DISTORTED_SHARE, paper_mm
 from brushloop.calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
+PLACES = np.array([[200.0, 150.0], [650.0, 150.0], [450.0, 300.0], [200.0, 420.0]])
+PX_PER_MM = 8
 
 
-def photograph(spec: BoardSpec = SPEC, noise: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    """(image, image -> paper homography) of the board seen at a slant."""
-    scale = 8.0
-    size = (round(spec.squares[0] * spec.square_mm * scale), round(spec.squares[1] * spec.square_mm * scale))
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
-    board = cv2.aruco.CharucoBoard(spec.squares, spec.square_mm, spec.marker_mm, dictionary)
-    picture = cv2.copyMakeBorder(board.generateImage(size), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
-    top_mm = spec.origin_mm[1] + spec.squares[1] * spec.square_mm
-    picture_to_paper = np.array(
-        [
-            [1 / scale, 0, spec.origin_mm[0] + (0.5 - 40) / scale],
-            [0, -1 / scale, top_mm - (0.5 - 40) / scale],
-            [0, 0, 1],
-        ]
-    )
+@pytest.fixture(scope="module")
+def seen() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners of the board seen at a slant, px and mm, and the homography from the image to the paper."""
+    picture = charuco_board(SPEC, "test").generateImage((7 * 160, 5 * 160))
+    picture = cv2.copyMakeBorder(picture, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    left_mm, top_mm, step = SPEC.origin_mm[0], SPEC.origin_mm[1] + 100.0, 1.0 / PX_PER_MM
+    to_paper = np.array([[step, 0, left_mm - 39.5 * step], [0, -step, top_mm + 39.5 * step], [0, 0, 1]])
     slant = np.array([[0.62, 0.03, 30.0], [-0.02, 0.6, 40.0], [1e-5, 4e-5, 1.0]])
     image = cv2.warpPerspective(picture, slant, (900, 640), flags=cv2.INTER_AREA, borderValue=255)
-    noisy = cv2.GaussianBlur(image, (0, 0), 0.8) + np.random.default_rng(0).normal(0, noise, image.shape)
-    return np.clip(noisy, 0, 255).astype(np.uint8), picture_to_paper @ np.linalg.inv(slant)
-
-
-def corners_of(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    view = find_board(image, SPEC, "photo")
-    return view.pixels, paper_mm(view, SPEC)
+    noisy = cv2.GaussianBlur(image, (0, 0), 0.8) + np.random.default_rng(0).normal(0, 2.0, image.shape)
+    view = find_board(np.clip(noisy, 0, 255).astype(np.uint8), SPEC, "photo")
+    return view.pixels, paper_mm(view, SPEC), to_paper @ np.linalg.inv(slant)
 
 
 def flat(pixels: np.ndarray, paper: np.ndarray) -> Plane:
     return fit_plane(pixels, paper, unknown_lens((900, 640)), "photo", radial_terms=0)
 
 
-def test_the_plane_is_found_to_hundredths_of_a_millimetre() -> None:
-    image, truth = photograph()
-    plane = see_board(image, SPEC)
-    assert plane.corners == 24
-    points = np.array([[200.0, 150.0], [650.0, 150.0], [450.0, 300.0], [200.0, 420.0]])
-    assert apply(plane.image_to_paper, points) == pytest.approx(apply(truth, points), abs=0.02)
-
-
-def test_the_scale_is_within_its_interval_and_that_is_narrow() -> None:
-    image, truth = photograph()
-    pixels, paper = corners_of(image)
+def test_the_plane_is_found_to_hundredths_of_a_millimetre_and_its_scale_lies_in_a_narrow_interval(seen) -> None:
+    pixels, paper, truth = seen
     plane = flat(pixels, paper)
+    assert plane.corners == 24
+    assert apply(plane.image_to_paper, PLACES) == pytest.approx(apply(truth, PLACES), abs=0.02)
     low, high = plane.interval_mm_per_px
     assert low < plane.mm_per_px < high
     assert high - low < 1e-3 * plane.mm_per_px
     assert plane.mm_per_px == pytest.approx(local_scale(lambda at: apply(truth, at), pixels.mean(axis=0)), rel=5e-4)
 
 
-def test_a_misnamed_corner_is_dropped_and_counted() -> None:
-    image, truth = photograph()
-    pixels, paper = corners_of(image)
-    pixels[3] += (7.0, -5.0)
-    plane = flat(pixels, paper)
+def test_a_misnamed_corner_is_dropped_and_corners_on_no_plane_are_refused(seen) -> None:
+    pixels, paper, truth = seen
+    misnamed = pixels.copy()
+    misnamed[3] += (7.0, -5.0)
+    plane = flat(misnamed, paper)
     assert (plane.corners, plane.dropped) == (23, (3,))
-    points = np.array([[200.0, 150.0], [650.0, 420.0]])
-    assert apply(plane.image_to_paper, points) == pytest.approx(apply(truth, points), abs=0.03)
-
-
-def test_corners_that_do_not_fit_one_plane_are_refused() -> None:
-    image, _ = photograph()
-    pixels, paper = corners_of(image)
+    assert apply(plane.image_to_paper, PLACES) == pytest.approx(apply(truth, PLACES), abs=0.03)
     with pytest.raises(CalibrationError, match="residual"):
         flat(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less than")],
-)
-def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
-        BoardSpec.model_validate(SPEC.model_dump() | change)
 
 
 def test_a_lens_is_distinguished_from_a_board_that_is_curled_misread_or_noisy() -> None:
@@ -105,3 +77,50 @@ def test_a_lens_is_distinguished_from_a_board_that_is_curled_misread_or_noisy() 
     assert distorted_share(bent, paper, lens, "lens") > 0.99 > DISTORTED_SHARE
     assert distorted_share(curled, paper, lens, "board") < DISTORTED_SHARE
     assert distorted_share(noisy, paper, lens, "noise") < 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"dictionary": "DICT_NONE"}, "not one of OpenCV's"), ({"marker_mm": 20.0}, "must be less than")],
+)
+def test_a_board_that_cannot_be_is_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        BoardSpec.model_validate(SPEC.model_dump() | change)
+
+
+def printed(board: Board) -> np.ndarray:
+    """The page as a printer lays it down at 8 px/mm."""
+    canvas = FigureCanvasAgg(drawn(board, "a4"))
+    canvas.figure.set_dpi(PX_PER_MM * MM_PER_INCH)
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 0])
+
+
+@pytest.mark.parametrize("board", [SPEC, Checkerboard(inner_corners=(7, 5), square_mm=20.0)], ids=["charuco", "plain"])
+def test_a_printed_board_is_seen_whole_and_at_true_scale(board: Board) -> None:
+    view = find_board(printed(board), board, "print")
+    assert len(view.ids) in (24, 35)
+    assert np.polyfit(view.board_mm[:, 0], view.pixels[:, 0], 1)[0] == pytest.approx(PX_PER_MM, rel=1e-4)
+    [words] = drawn(board, "a4").texts
+    assert "of 20 mm" in words.get_text()
+    assert "the line is 100 mm long" in words.get_text()
+
+
+def test_a_page_is_a4_holds_its_board_and_overwrites_nothing_but_a_pdf(tmp_path: Path) -> None:
+    data = write_pdf(SPEC, tmp_path / "board.pdf").read_bytes()
+    points = [float(v) for v in re.search(rb"MediaBox \[ *0 0 ([\d.]+) ([\d.]+) *\]", data).groups()]
+    assert np.array(points) / 72.0 * MM_PER_INCH == pytest.approx([210.0, 297.0])
+    assert write_pdf(SPEC, tmp_path / "board.pdf").read_bytes() == data
+    recording = tmp_path / "s.pdf"
+    recording.write_bytes(b"\x89MCAP0\r\n")
+    large = BoardSpec(squares=(26, 20), square_mm=12, marker_mm=9, origin_mm=(0, 0))
+    for board, path, why in (
+        (large, tmp_path / "x.pdf", "has no room for a board of 312 x 240 mm"),
+        (SPEC, tmp_path / "s.mcap", "must end in .pdf"),
+        (SPEC, tmp_path / "no" / "board.pdf", "there is no folder"),
+        (SPEC, recording, "is not a PDF; it is not overwritten"),
+    ):
+        with pytest.raises(CalibrationError, match=why):
+            write_pdf(board, path)
+    assert recording.read_bytes() == b"\x89MCAP0\r\n"
+    assert not (tmp_path / "x.pdf").exists()
