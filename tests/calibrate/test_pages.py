@@ -22,6 +22,7 @@ from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, Pair, sc
 from brushloop.calibrate.loop.report import write_loop
 from brushloop.calibrate.pages.camera import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
+from brushloop.calibrate.report import printable, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
@@ -41,6 +42,7 @@ SPEC = BoardSpec(squares=(9, 7), square_mm=20.0, marker_mm=15.0, dictionary="DIC
 TWIN = "simulated bristle bundle (twin of 2026-03-02-grid-01)"
 WIDTHS_PX = (390, 800, 1200, 1600)
 MAX_BYTES = 3 * 1024 * 1024
+MADE = "simulated bristle bundle, paper (made to agree with the paper's Table 2: no evidence for the model)"
 
 
 def board() -> Gray:
@@ -217,6 +219,23 @@ def test_a_report_in_the_session_links_to_the_pages_that_are_there_and_one_elsew
     expected = [(f"calibration of {home.name}", f"../calibration/{page.name}")]
     assert list(pages_beside([session], home / "validation")) == expected
     assert list(pages_beside([session], tmp_path / "elsewhere")) == []
+
+
+def test_the_remark_of_a_described_brush_is_part_of_the_label() -> None:
+    remark = "brush made to agree with the paper's Table 2: no evidence for the model"
+    assert source_label(Source.LOOPBACK, [MADE, MADE]) == f"loopback rig, {remark}"
+    assert source_label(Source.LOOPBACK, [f"{MADE}, R = 6 mm, L = 48 mm"]) == f"loopback rig, {remark}"
+    assert source_note(Source.LOOPBACK, MADE).endswith(f"not a result on paper, {remark}")
+
+
+def test_the_label_of_any_other_brush_is_its_source() -> None:
+    assert source_label(Source.LOOPBACK, ["simulated bristle bundle, seed 1"]) == "loopback rig"
+    assert source_label(Source.REAL, ["Langhao brush (12 mm)"]) == "real capture"
+    assert source_note(Source.REAL, "Langhao brush (12 mm)") == source_note(Source.REAL)
+
+
+def test_a_plot_shows_a_question_mark_for_what_no_font_draws() -> None:
+    assert printable("left\t\x1b[31m.png") == "left??[31m.png"
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")

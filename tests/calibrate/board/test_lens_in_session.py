@@ -132,14 +132,13 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
     made = calibrate(CalibrateRequest(session), lambda _what, done, _of: steps.append(done)).calibration
     assert steps == [0, 1, 2, 3]
     holds(made, shot)
-    wrong = rig_lens(tmp_path / "wrong", 0.08)
-    with pytest.raises(CalibrationError, match=r"bent by .* of another camera, or of another focus"):
-        calibrate_session(session, wrong)
-    small = rig_lens(tmp_path / "small", -0.15, (1024, 768))
-    with pytest.raises(CalibrationError, match=r"is 2048 x 1536 px, the lens was calibrated at 1024 x 768 px"):
-        calibrate_session(session, small)
-    with pytest.raises(CalibrationError, match="no such file"):
-        calibrate_session(session, tmp_path / "nosuch.json")
+    for given, why in (
+        (rig_lens(tmp_path / "wrong", 0.08), r"bent by .* of another camera, or of another focus"),
+        (rig_lens(tmp_path / "small", -0.15, (1024, 768)), "is 2048 x 1536 px, the lens was calibrated at 1024 x 768"),
+        (tmp_path / "nosuch.json", "no such file"),
+    ):
+        with pytest.raises(CalibrationError, match=why):
+            calibrate_session(session, given)
 
 
 def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import PaperConfig, RigConfig, load_rig
 from brushloop.collect.rig.paper import to_base
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
 
 ROBOT = np.array([[460.0, -110.0], [460.0, 100.0], [310.0, 100.0], [310.0, -110.0], [380.0, 0.0], [420.0, 50.0]])

@@ -146,8 +146,5 @@ def test_two_presses_of_a_cell_are_enough_for_the_ceiling_and_one_is_not() -> No
     rows, errors_mm = leave_cell_out(presses(a_brush(), CELLS[:1] * 2), GRID, 6.0, 48.0)
     assert rows == []
     assert errors_mm.shape == (0, 2)
-
-
-def test_a_fit_needs_a_stroke() -> None:
     with pytest.raises(ValueError, match="at least one stroke"):
         fit_presses([], GRID, 6.0, 48.0)

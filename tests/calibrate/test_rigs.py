@@ -1,0 +1,110 @@
+"""Scale, masks and anchors on the loopback rig's frozen brushes and cameras, held against the sheet itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.intrinsics import fit_lens
+from brushloop.calibrate.board.lens import Lens
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.view import see_board_and_lens
+from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import rectify_distorted
+from brushloop.drivers.sim.config import Table
+from brushloop.drivers.sim.scene import Optics
+from tests.calibrate.simulated_rigs import (
+    BRUSHES,
+    CAMERAS,
+    Shot,
+    board_of,
+    boards,
+    heading_free_window,
+    lens_views,
+    sheet,
+    true_mask,
+    true_scale,
+)
+
+WORST = 2e-4
+soak = pytest.mark.soak
+half_an_hour = pytest.mark.timeout(1800)
+
+
+def draws(rig: int, count: int, seed: int = 0) -> list[tuple[float, bool]]:
+    """(relative error of pix2len, whether the interval holds the truth) for the camera aimed again each time."""
+    aimed: list[tuple[float, bool]] = []
+    for shot in boards(rig, count, seed):
+        plane = see_board_and_lens(shot.image, shot.board)
+        truth = true_scale(shot, plane.middle_px)
+        low, high = plane.interval_mm_per_px
+        aimed.append((plane.mm_per_px / truth - 1.0, low <= truth <= high))
+    return aimed
+
+
+def strokes(rig: int, presses: int) -> tuple[list[float], float]:
+    """IoU of every stroke's mask with the ink that is really there, and how far off the worst anchor is put, mm."""
+    shot = sheet(rig, presses)
+    plane = see_board_and_lens(shot.image, shot.board)
+    anchors = np.array(shot.anchors_mm)
+    off_mm = np.linalg.norm(plane.to_paper(shot.optics.image_of(anchors)) - anchors, axis=1)
+    return [overlap(shot, plane, anchor) for anchor in shot.anchors_mm], float(off_mm.max())
+
+
+def overlap(shot: Shot, plane: Plane, anchor: tuple[float, float]) -> float:
+    window = heading_free_window(anchor)
+    raster = rectify_distorted(shot.image, plane, window)
+    at = ((anchor[0] - window[0]) * PX_PER_MM, (window[1] + window[3] - anchor[1]) * PX_PER_MM)
+    mask = prepare(raster, at, "rig", Params()).mask
+    truth = true_mask(shot, window, PX_PER_MM)
+    return float((mask & truth).sum() / (mask | truth).sum())
+
+
+@pytest.mark.parametrize("rig", [1, 3], ids=["keystone", "barrel"])
+def test_pix2len_is_right_whatever_the_lens_does(rig: int) -> None:
+    [(error, _)] = draws(rig, 1)
+    assert abs(error) <= WORST
+
+
+@pytest.mark.parametrize("rig", [2, 3], ids=["shadow and pincushion", "barrel"])
+def test_strokes_and_anchors_are_where_they_are(rig: int) -> None:
+    overlaps, off_mm = strokes(rig, 1)
+    assert min(overlaps) >= 0.95
+    assert off_mm <= 0.1
+
+
+@soak
+@half_an_hour
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_interval_of_pix2len_holds_the_truth_as_often_as_it_says(seed: int) -> None:
+    every = [one for rig in range(len(CAMERAS)) for one in draws(rig, 40, seed)]
+    assert max(abs(error) for error, _ in every) <= WORST
+    assert 0.93 <= np.mean([held for _, held in every]) <= 0.97
+
+
+@soak
+@half_an_hour
+@pytest.mark.parametrize("rig", range(len(CAMERAS)))
+def test_slanted_boards_give_back_the_lens(rig: int) -> None:
+    view, board = CAMERAS[rig], board_of(Table())
+    seen = [find_board(image, board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
+    fitted = fit_lens(seen, "a board", {}, {})
+    assert fitted.rms_px < 0.2
+    assert fitted.lens.matrix[0] == pytest.approx(view.width_px, rel=1e-3)
+    # Where it matters: pixels of the corners of the image, straightened.
+    corners = np.array([[20.0, 20.0], [view.width_px - 20.0, 20.0], [view.width_px / 2, view.height_px - 20.0]])
+    optics = Optics(view, 1)
+    truth = Lens.of_opencv(optics.camera_matrix, np.append(optics.distortion, 0.0), fitted.lens.size_px)
+    assert fitted.lens.undistorted(corners) == pytest.approx(truth.undistorted(corners), abs=1.0)
+
+
+@soak
+@half_an_hour
+def test_every_brush_under_every_camera() -> None:
+    found = [strokes(rig, 15) for rig in range(len(BRUSHES))]
+    every = [iou for overlaps, _ in found for iou in overlaps]
+    assert max(off_mm for _, off_mm in found) <= 0.1
+    assert np.mean(every) >= 0.985
+    assert min(every) >= 0.95
