@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import math
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 
@@ -135,6 +136,20 @@ async def test_a_stop_in_mid_path_ends_it_and_no_line_follows(
     assert await rests_short(cabinet)
     with pytest.raises(MotionFailed, match="was stopped"):
         await way
+
+
+async def test_a_stop_while_lines_are_being_sent_lets_none_follow(arm: AuboArcs, cabinet: ArcsServer):
+    queue_line, stops = cabinet._methods["rob1.MotionControl.moveLine"], list[asyncio.Task[None]]()
+
+    def noted(params: dict[str, Any]) -> object:
+        stops.append(asyncio.create_task(arm.stop()))
+        return queue_line(params)
+
+    cabinet._methods["rob1.MotionControl.moveLine"] = noted
+    with pytest.raises(MotionFailed):
+        await arm.follow(line(10), **WAY)
+    await asyncio.gather(*stops)
+    assert sent(cabinet) == 1
 
 
 async def test_a_cancelled_way_is_stopped(arm: AuboArcs, cabinet: ArcsServer, way: asyncio.Task[None]):
