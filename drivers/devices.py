@@ -1,6 +1,7 @@
 """The devices of a rig as the engine sees them, and the samples that they give.
 
-A sample is frozen and has the time at which it was taken and its place in the sequence."""
+A sample is frozen and has the time at which it was taken and its place in the sequence.
+"""
 
 from __future__ import annotations
 

@@ -5,7 +5,8 @@ In plain floats, for single poses at the pace of a control loop: scipy's `Rotati
 for arrays of rotations.
 
 Formulas as in scipy: J. Diebel, Representing Attitude (2006); Euler angles after E. Bernardes and S. Viollet,
-PLoS ONE 17 (2022) e0276302."""
+PLoS ONE 17 (2022) e0276302.
+"""
 
 from __future__ import annotations
 
@@ -189,8 +190,8 @@ def interpolate(a: Pose, b: Pose, s: float) -> Pose:
 
 def from_line(a: Pose, b: Pose, pose: Pose) -> tuple[float, float]:
     """(mm, deg) from the nearest place of the straight line from a to b to `pose`."""
-    way, gone = np.subtract(b.position_mm, a.position_mm), np.subtract(pose.position_mm, a.position_mm)
-    share = float(way @ gone) / max(float(way @ way), 1e-12)
+    line, along = np.subtract(b.position_mm, a.position_mm), np.subtract(pose.position_mm, a.position_mm)
+    share = float(line @ along) / max(float(line @ line), 1e-12)
     return distance(interpolate(a, b, min(max(share, 0.0), 1.0)), pose)
 
 

@@ -1,7 +1,8 @@
 """The loopback rig in a process of its own: for a notebook, a lab's tests and the demo; and requests to it.
 
 A simulator needs an interpreter of its own: it keeps real time while the process that uses it computes. It also holds
-the simulated sheet, and the rig of a demo outlives the demo, so it is started as the command that serves it."""
+the simulated sheet, and the rig of a demo outlives the demo, so it is started as the command that serves it.
+"""
 
 from __future__ import annotations
 
@@ -109,16 +110,16 @@ class FaultRefused(Exception):
 
 def request_of(what: str, kind: str | None, options: Mapping[str, object]) -> dict[str, Any]:
     """The request that the words of a command line ask for. Raises `FaultRefused`."""
-    given = {name: value for name, value in options.items() if value is not None}
+    fields = {name: value for name, value in options.items() if value is not None}
     if what not in PLAIN:
         if kind is None:
             raise FaultRefused(f"{what}: give a device and a kind, or one of {', '.join(PLAIN)}")
-        given.pop("id", None)
-        return {"do": "add", "fault": {"device": what, "kind": kind, **given}}
-    if kind is not None or set(given) - ({"id"} if what == "clear" else set[str]()):
+        fields.pop("id", None)
+        return {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
+    if kind is not None or set(fields) - ({"id"} if what == "clear" else set[str]()):
         allowed = "no option but --id" if what == "clear" else "no options"
         raise FaultRefused(f"{what}: takes no kind and {allowed}")
-    return {"do": what, **given}
+    return {"do": what, **fields}
 
 
 def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:

@@ -162,12 +162,12 @@ class Messages:
 
     async def _new(self) -> list[int]:
         """Codes of the messages not seen before; empty if the controller does not answer."""
-        found: Any = []
+        messages: Any = []
         with contextlib.suppress(DeviceError):
-            found = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)
+            messages = await self._controller.ask("Trace.peek", num=NEWEST, last_time=self._seen)
         codes: list[int] = []
         newest = self._seen
-        for message in found if isinstance(found, list) else []:  # pyright: ignore[reportUnknownVariableType]
+        for message in messages if isinstance(messages, list) else []:  # pyright: ignore[reportUnknownVariableType]
             match message:
                 case {"code": int(code), "timestamp": int(stamp)} if stamp > self._seen:
                     codes.append(code)
@@ -204,13 +204,13 @@ def legs_of(
     A corner is rounded within half the shorter line, but never by less than the controller accepts; at the last pose
     the arm halts.
     """
-    ways = [distance(a, b)[0] for a, b in zip([start, *poses], poses, strict=False)]
+    lengths_mm = [distance(a, b)[0] for a, b in zip([start, *poses], poses, strict=False)]
     legs: list[Leg] = []
     before = start
     for i, pose in enumerate(poses):
         speed = limits.turn_capped(before, pose, speed_mm_s)
         last = i + 1 == len(poses)
-        blend = 0.0 if last else max(min(blend_mm, 0.5 * ways[i], 0.5 * ways[i + 1]), LEAST_BLEND_MM)
+        blend = 0.0 if last else max(min(blend_mm, 0.5 * lengths_mm[i], 0.5 * lengths_mm[i + 1]), LEAST_BLEND_MM)
         legs.append(Leg(pose, speed, blend, planned_s(before, pose, speed, acc_mm_s2)))
         before = pose
     return legs
@@ -288,14 +288,14 @@ def capped(
     start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float
 ) -> tuple[list[QueuedLine], float]:
     """The lines, each slow enough for its turn of the tool, and an upper estimate of how long they take, in s."""
-    made: list[QueuedLine] = []
+    slowed: list[QueuedLine] = []
     seconds, before = 0.0, start
     for line in lines:
         speed_mm_s = limits.turn_capped(before, line.target, line.speed_mm_s)
-        made.append(QueuedLine(line.target, speed_mm_s, line.least_s))
+        slowed.append(QueuedLine(line.target, speed_mm_s, line.least_s))
         seconds += max(planned_s(before, line.target, speed_mm_s, acc_mm_s2), line.least_s)
         before = line.target
-    return made, seconds
+    return slowed, seconds
 
 
 async def queue_all(

@@ -1,7 +1,8 @@
 """How an arm is set up, what is read back, and what must still be so before a line is sent.
 
 Any client may change these settings and use the arm, so a return code proves nothing, and everything is checked again
-before each departure. No step here moves the arm or clears a stop."""
+before each departure. No step here moves the arm or clears a stop.
+"""
 
 from __future__ import annotations
 
@@ -101,17 +102,17 @@ SETTINGS = (
 
 async def read_back(controller: Controller) -> Settings:
     """Read all settings from the controller. Raises `ProtocolViolation` for an answer of the wrong shape."""
-    found: dict[str, Value] = {}
+    values: dict[str, Value] = {}
     for setting in SETTINGS:
         try:
-            found[setting.name] = setting.read(await controller.ask(setting.getter))
+            values[setting.name] = setting.read(await controller.ask(setting.getter))
         except RpcError as error:
             if error.code != METHOD_NOT_FOUND:
                 raise
-            found[setting.name] = None
+            values[setting.name] = None
         except (TypeError, ValueError) as error:
             raise ProtocolViolation(DEVICE, setting.getter.rpartition(".")[2], str(error)) from None
-    return found
+    return values
 
 
 def configured(options: ArcsOptions) -> Settings:
@@ -126,23 +127,23 @@ def configured(options: ArcsOptions) -> Settings:
     return wanted
 
 
-def require_same(op: str, wanted: Settings, found: Settings) -> None:
+def require_same(op: str, wanted: Settings, current: Settings) -> None:
     """Raise `SettingsChanged` naming every setting in `wanted` that was found different."""
     changes = tuple(
-        f"{setting.name} is {_in_words(setting, found[setting.name])}, not {_in_words(setting, wanted[setting.name])}"
+        f"{setting.name} is {_in_words(setting, current[setting.name])}, not {_in_words(setting, wanted[setting.name])}"
         for setting in SETTINGS
-        if setting.name in wanted and not _same(setting, wanted[setting.name], found[setting.name])
+        if setting.name in wanted and not _same(setting, wanted[setting.name], current[setting.name])
     )
     if changes:
         raise SettingsChanged(DEVICE, op, changes)
 
 
-def _same(setting: Setting, wanted: Value, found: Value) -> bool:
-    if not isinstance(wanted, tuple) or not isinstance(found, tuple):
-        return wanted == found
+def _same(setting: Setting, wanted: Value, current: Value) -> bool:
+    if not isinstance(wanted, tuple) or not isinstance(current, tuple):
+        return wanted == current
     if setting.name == TOOL_OFFSET:  # one rotation has several sets of angles, such as 180 and -180 deg
-        return max(distance(_tool(wanted), _tool(found))) <= TOLERANCE
-    return all(abs(a - b) <= TOLERANCE for a, b in zip(wanted, found, strict=True))
+        return max(distance(_tool(wanted), _tool(current))) <= TOLERANCE
+    return all(abs(a - b) <= TOLERANCE for a, b in zip(wanted, current, strict=True))
 
 
 def _tool(offset: tuple[float, ...]) -> Pose:
@@ -184,11 +185,11 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     if options.speed_fraction is not None:
         code = await controller.ask("MotionControl.setSpeedFraction", fraction=options.speed_fraction)
         accepted("setSpeedFraction", code)
-    found = await read_back(controller)
-    require_same("power on", configured(options), found)
-    for name in (name for name, value in found.items() if value is None and name != OPERATIONAL_MODE):
+    settings = await read_back(controller)
+    require_same("power on", configured(options), settings)
+    for name in (name for name, value in settings.items() if value is None and name != OPERATIONAL_MODE):
         on_notice(f"the controller does not report its {name}: a change would go unnoticed")
-    return found
+    return settings
 
 
 async def power_on(controller: Controller, options: ArcsOptions) -> None:
@@ -264,22 +265,22 @@ class Departure:
         """
         await self._require_rest(op)
         start = await self._controller.pose()
-        way = [start, *poses]
-        down = any(b.z_mm < a.z_mm - DOWN_MM for a, b in itertools.pairwise(way))
+        path = [start, *poses]
+        down = any(b.z_mm < a.z_mm - DOWN_MM for a, b in itertools.pairwise(path))
         if down or self._moved(start):
             await self._require_settings(op)  # with another tool, the same place would look like another
         self._require_place(op, start)
-        for a, b in itertools.pairwise(way):
+        for a, b in itertools.pairwise(path):
             limits.check_way(DEVICE, a, b)
         return start
 
     async def _require_settings(self, op: str) -> None:
         self._require_enabled(op)
-        found = await read_back(self._controller)
+        values = await read_back(self._controller)
         await self._controller.require_safe(op)
         if await self._controller.mode() != RobotMode.RUNNING:
             raise NotPowered(DEVICE, op)
-        require_same(op, self._settings, found)
+        require_same(op, self._settings, values)
 
     async def _require_rest(self, op: str) -> None:
         self._require_enabled(op)

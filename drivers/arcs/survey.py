@@ -59,11 +59,11 @@ async def _asked(connection: RpcConnection) -> AsyncIterator[Exchange]:
     except DeviceError as error:
         yield Exchange("connect", None, {"refused": str(error)}, 0.0)
         return
-    found: dict[str, Any] = {}
+    answers: dict[str, Any] = {}
 
     async def ask(method: str, params: dict[str, Any] | None = None) -> Exchange:
         exchange = await _exchange(connection, method, params)
-        found[method.rpartition(".")[2]] = exchange.answer.get("result")
+        answers[method.rpartition(".")[2]] = exchange.answer.get("result")
         return exchange
 
     yield await ask("SystemInfo.getInterfaceVersionCode")
@@ -74,13 +74,13 @@ async def _asked(connection: RpcConnection) -> AsyncIterator[Exchange]:
         if connection.lost:
             return
     yield await ask("getRobotNames")
-    names = found["getRobotNames"]
+    names = answers["getRobotNames"]
     robot = str(names[0]) if isinstance(names, list) and names else "rob1"  # pyright: ignore[reportUnknownArgumentType]
     for method in (*OF_THE_CONTROLLER, *(f"{robot}.{name}" for name in OF_THE_ROBOT)):
         if connection.lost:
             return
         yield await ask(method)
-    joints, pose = found["getJointPositions"], found["getTcpPose"]
+    joints, pose = answers["getJointPositions"], answers["getTcpPose"]
     if isinstance(joints, list) and isinstance(pose, list):
         yield await ask(f"{robot}.RobotAlgorithm.forwardKinematics", {"q": joints})
         yield await ask(f"{robot}.RobotAlgorithm.inverseKinematics", {"qnear": joints, "pose": pose})

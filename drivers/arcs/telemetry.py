@@ -11,7 +11,8 @@ RTDE begins with a greeting that ends with two newlines, then come SOF frames of
 
 Poses are stamped on arrival, and a controller or a network may hold them back. While the arm moves, the driver also
 asks the controller where it is: the lag is the time by which the path of the poses that arrived must be shifted so that
-it agrees with the poses that were asked for."""
+it agrees with the poses that were asked for.
+"""
 
 from __future__ import annotations
 

@@ -75,10 +75,10 @@ class _Decoder(abc.ABC):
         if self._broken is not None:
             raise self._violation(self._broken)
         self._buffer += data
-        found: list[bytes] = []
-        while (one := self._next()) is not None:
-            found.append(one)
-        return found
+        payloads: list[bytes] = []
+        while (payload := self._next()) is not None:
+            payloads.append(payload)
+        return payloads
 
     @abc.abstractmethod
     def _next(self) -> bytes | None:
@@ -171,11 +171,11 @@ class BareDecoder(_Decoder):
         """Continue where the last piece ended; return the end of the document, or None if it has not arrived."""
         buffer = self._buffer
         while True:
-            found = (_STRING_END if self._in_string else _STRUCTURE).search(buffer, self._at)
-            if found is None:
+            match = (_STRING_END if self._in_string else _STRUCTURE).search(buffer, self._at)
+            if match is None:
                 self._at = len(buffer)
                 return None
-            byte, self._at = buffer[found.start()], found.end()
+            byte, self._at = buffer[match.start()], match.end()
             if byte == ord("\\"):
                 if self._at == len(buffer):  # the escaped character has not arrived: scan again from here
                     self._at -= 1
@@ -202,12 +202,12 @@ def numbers(values: object, count: int) -> list[float]:
     if not isinstance(values, list):
         raise ValueError(f"expected {count} numbers, got {str(values)[:80]!r}")
     try:
-        found = [float(v) if type(v) in (int, float) else math.nan for v in values]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        floats = [float(v) if type(v) in (int, float) else math.nan for v in values]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     except OverflowError:
-        found = []
-    if len(found) != count or not all(map(math.isfinite, found)):
+        floats = []
+    if len(floats) != count or not all(map(math.isfinite, floats)):
         raise ValueError(f"expected {count} finite numbers, got {str(values)[:80]}")  # pyright: ignore[reportUnknownArgumentType]
-    return found
+    return floats
 
 
 PARAMETERS: dict[str, tuple[str, ...]] = {

@@ -234,7 +234,7 @@ def found_settings(device: int, settle_s: float) -> dict[str, float]:
         until_s = time.monotonic() + settle_s
         while time.monotonic() < until_s and capture.read()[0]:
             pass
-        found = {name: float(capture.get(number)) for name, number in _properties().items()}
+        settings = {name: float(capture.get(number)) for name, number in _properties().items()}
     finally:
         capture.release()
-    return {name: value for name, value in found.items() if value > 0.0 or (name == "exposure" and value < -0.5)}
+    return {name: value for name, value in settings.items() if value > 0.0 or (name == "exposure" and value < -0.5)}

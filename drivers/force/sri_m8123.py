@@ -2,7 +2,8 @@
 
 The frame format is from public third-party code, not from the maker's manual; no board has confirmed it yet.
 The sensor needs a CAN adapter and a bus of its own: the arm's internal bus is never touched. A thread owns the bus from
-open to shutdown and turns its frames into wrenches."""
+open to shutdown and turns its frames into wrenches.
+"""
 
 from __future__ import annotations
 

@@ -131,13 +131,13 @@ class SerialPort:
             raise NotConnected(self._device, op, "not connected")
         loop, closing = asyncio.get_running_loop(), self._closing
         try:
-            received, found = await loop.run_in_executor(
+            received, reply = await loop.run_in_executor(
                 self._worker, lambda: self._ask(op, request, find, timeout_s, closing)
             )
         except ConnectionLost as error:
             raise ConnectionLost(self._device, op, error.what, condition=condition, remedy=REPLUG) from None
-        if found is not None:
-            return found
+        if reply is not None:
+            return reply
         if received:
             raise ProtocolViolation(
                 self._device, op, f"no reply among {shown(received)} in {timeout_s:g} s", condition=condition
@@ -196,8 +196,8 @@ class SerialPort:
                 if not (arrived := port.read(max(1, port.in_waiting))):
                     continue
                 received += arrived
-                if (found := find(received)) is not None:
-                    return received, found
+                if (reply := find(received)) is not None:
+                    return received, reply
                 if len(received) > MAX_REPLY_BYTES:
                     break
             return received, None

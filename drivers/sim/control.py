@@ -67,8 +67,8 @@ class ControlServer(LoopbackServer):
     async def open(self, path: Path) -> None:
         """Listen at `path`, replacing the socket of a rig that has ended. Raises `SimFileError`."""
         listener = _listener(path)
-        made = path.stat()
-        self._path, self._made = path, (made.st_dev, made.st_ino)
+        status = path.stat()
+        self._path, self._made = path, (status.st_dev, status.st_ino)
         self._server = await asyncio.start_unix_server(self._serve, sock=listener, limit=MAX_LINE_BYTES)
 
     async def stop(self) -> None:

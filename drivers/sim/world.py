@@ -68,9 +68,9 @@ class ContactWatch:
 
 def _sideways_mm(a: Pose, b: Pose) -> float:
     """Travel along the paper or across the brush's axis, whichever is shorter."""
-    way = np.subtract(b.position_mm, a.position_mm)
+    travel = np.subtract(b.position_mm, a.position_mm)
     axis = np.array(columns(unit(b.quaternion))[2])
-    return min(math.hypot(way[0], way[1]), float(np.linalg.norm(way - (way @ axis) * axis)))
+    return min(math.hypot(travel[0], travel[1]), float(np.linalg.norm(travel - (travel @ axis) * axis)))
 
 
 TILTS_DEG = (0.0, 7.5, 15.0, 30.0)

@@ -1,7 +1,8 @@
 """The loopback cabinet: an arm's motion, tool, power, safety and watchdogs, independent of the wire protocol.
 
 It simulates what a driver can get wrong: refusals by return code, poses that are accepted first and fail in planning, a
-path that a protective stop keeps. It simulates neither accuracy nor safety functions."""
+path that a protective stop keeps. It simulates neither accuracy nor safety functions.
+"""
 
 from __future__ import annotations
 
@@ -219,8 +220,8 @@ class Cabinet:
     def ik(self, near: list[float], pose: list[float]) -> list[Any]:
         """[joints, return code]; the joints are `near` if there is no solution."""
         target = matrix_of(from_wire([float(v) for v in pose]))
-        found = inverse(target @ inverted(self.tool()), near)
-        return [list(near), IK_NO_CONVERGE] if found is None else [list(found), 0]
+        joints = inverse(target @ inverted(self.tool()), near)
+        return [list(near), IK_NO_CONVERGE] if joints is None else [list(joints), 0]
 
     def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
         """Decelerate and forget the path."""

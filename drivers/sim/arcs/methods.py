@@ -2,7 +2,8 @@
 
 A pose out of reach is accepted first and fails in planning, as on a controller. Speeds above what the arm allows are
 clipped. The joints' speeds are those of the maker's URDF for the i5; the other maxima are the examples in the SDK's
-headers, which are for an i5H. A real cabinet reports its own."""
+headers, which are for an i5H. A real cabinet reports its own.
+"""
 
 from __future__ import annotations
 
@@ -113,9 +114,9 @@ class Moves:
     def _reachable(self, target: Pose) -> bool:
         """Whether the arm can reach a pose of the configured tool centre point."""
         flange = matrix_of(target) @ inverted(self._cabinet.tool())
-        found = inverse(flange, self._near) or inverse(flange, self._cabinet.motion.near)
-        self._near = found or self._near
-        return found is not None
+        joints = inverse(flange, self._near) or inverse(flange, self._cabinet.motion.near)
+        self._near = joints or self._near
+        return joints is not None
 
     def _out_of_reach(self) -> int:
         """Accept a move that then proves to be out of reach: the arm stops and a message says why."""

@@ -1,7 +1,8 @@
 """The loopback controller on the wire: ARCS JSON-RPC, written from observations of the maker's client, and RTDE.
 
 One port takes SOF frames and bare JSON, named and positional params, ids of any kind; a connection's first byte decides
-its framing. The RTDE port greets, and pushes samples to subscribers at the frequency they ask for."""
+its framing. The RTDE port greets, and pushes samples to subscribers at the frequency they ask for.
+"""
 
 from __future__ import annotations
 

@@ -65,8 +65,8 @@ def inverse(target: Matrix, near: Sequence[float]) -> Joints | None:
     toward = math.atan2(target[1, 3], target[0, 3])
     for seed in (near, (toward, *HOME[1:]), (toward + 0.3, *HOME[1:])):
         q = _descend(target, np.array(seed, dtype=np.float64))
-        if q is not None and (found := _within(q, near)) is not None:
-            return found
+        if q is not None and (joints := _within(q, near)) is not None:
+            return joints
     return None
 
 
@@ -92,14 +92,14 @@ def _descend(target: Matrix, q: Matrix) -> Matrix | None:
 
 def _within(q: Matrix, near: Sequence[float]) -> Joints | None:
     """Shift each joint by whole turns, as near to `near` as its limit allows."""
-    found: list[float] = []
+    joints: list[float] = []
     for value, close, limit_deg in zip(q.tolist(), near, LIMITS_DEG, strict=True):
         turns = [math.remainder(value, 2 * math.pi) + 2 * math.pi * k for k in (-1, 0, 1)]
         allowed = [v for v in turns if abs(v) <= math.radians(limit_deg)]
         if not allowed:
             return None
-        found.append(min(allowed, key=lambda v: abs(v - close)))
-    return (found[0], found[1], found[2], found[3], found[4], found[5])
+        joints.append(min(allowed, key=lambda v: abs(v - close)))
+    return (joints[0], joints[1], joints[2], joints[3], joints[4], joints[5])
 
 
 def matrix_of(pose: Pose) -> Matrix:

@@ -334,14 +334,14 @@ class MotionQueue:
 
     def _finish(self, segment: Segment) -> None:
         piece = segment.piece
-        way = piece.end - piece.enter
-        places = [piece.path.pose(piece.enter + way * k / piece.path.stretches) for k in range(piece.path.stretches)]
+        length = piece.end - piece.enter
+        places = [piece.path.pose(piece.enter + length * k / piece.path.stretches) for k in range(piece.path.stretches)]
         places.append(piece.path.pose(piece.end))
         self._rest, self._rest_since_s = places[-1], segment.end_s
         self.near = piece.joints(piece.end) or self.near
         if segment.ramp.v_out == 0.0:
             self.rests.append(Rest(segment.end_s, places[-1]))
-        if way > 0.0:
+        if length > 0.0:
             for start, end in itertools.pairwise(places):
                 self._on_path(start, end)
 
@@ -400,11 +400,11 @@ class MotionQueue:
         while speed > REST and running:
             piece = left_over.pop(0)
             running -= 1
-            way = min(speed * speed / (2.0 * acc), piece.length)
-            after = math.sqrt(max(speed * speed - 2.0 * acc * way, 0.0))
+            stretch = min(speed * speed / (2.0 * acc), piece.length)
+            after = math.sqrt(max(speed * speed - 2.0 * acc * stretch, 0.0))
             after = after if after > REST else 0.0
-            rest = piece.begin + way
-            ramp = Ramp(way, speed, acc, speed, after)
+            rest = piece.begin + stretch
+            ramp = Ramp(stretch, speed, acc, speed, after)
             self._segments.append(Segment(replace(piece, end=rest), ramp, self._end_s(now_s), brakes=True))
             speed = after
             if not after:

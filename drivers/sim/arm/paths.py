@@ -85,8 +85,8 @@ class Corner:
     @cached_property
     def bend(self) -> float:
         """Length of the difference of the two unit directions: 0 for straight on, 2 for a reversal."""
-        ways = [np.subtract(w.end.position_mm, w.start.position_mm) / w.length for w in (self.a, self.b)]
-        return float(np.linalg.norm(ways[1] - ways[0]))
+        directions = [np.subtract(w.end.position_mm, w.start.position_mm) / w.length for w in (self.a, self.b)]
+        return float(np.linalg.norm(directions[1] - directions[0]))
 
     def pose(self, done: float) -> Pose:
         """Where the true tip is after `done`, by de Casteljau's algorithm."""

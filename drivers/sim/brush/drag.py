@@ -102,8 +102,8 @@ def _samples(path: Sequence[Waypoint]) -> tuple[Vector, Vector, Vector]:
     for a, b in itertools.pairwise(corners):
         count = max(1, math.ceil(float(np.linalg.norm(b - a)) / STEP_MM))
         pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
-    way = np.concatenate(pieces)
-    return way[:, 0], way[:, 1], way[:, 2]
+    points = np.concatenate(pieces)
+    return points[:, 0], points[:, 1], points[:, 2]
 
 
 INK_PER_MM = 0.005

@@ -2,7 +2,8 @@
 
 Local frame of a cross-section: `across` runs sideways (+y of the paper), `outward` runs away from the paper in the
 plane of bending; both are fractions of the free radius, so a bristle is one point of the unit disc. A flaw is added to
-the mechanics of a flawless press: forces and the shape of the spine do not change."""
+the mechanics of a flawless press: forces and the shape of the spine do not change.
+"""
 
 from __future__ import annotations
 

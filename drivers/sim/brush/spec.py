@@ -152,9 +152,9 @@ def complaint(error: ValidationError) -> tuple[str, str]:
     """(field, what is wrong with it), one line; an unknown key first, as it is often a misspelt one."""
     first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     field = ".".join(str(part) for part in first["loc"])
-    given = "" if first["type"] in ("missing", "value_error") else f" (given: {str(first['input'])[:60]!r})"
+    value = "" if first["type"] in ("missing", "value_error") else f" (given: {str(first['input'])[:60]!r})"
     more = f"; and {error.error_count() - 1} more" if error.error_count() > 1 else ""
-    return _plain(field), _plain(f"{first['msg'].removeprefix('Value error, ')}{given}{more}")
+    return _plain(field), _plain(f"{first['msg'].removeprefix('Value error, ')}{value}{more}")
 
 
 def _plain(text: str) -> str:
@@ -202,8 +202,8 @@ def load_brush(path: Path, seed: int = BrushSpec().seed) -> NamedBrush:
     """
     if str(path) == LOOPBACK:
         return NamedBrush(BrushSpec(seed=seed), "")
-    found = _read(PAPER_FILE if str(path) == PAPER else path)
-    return NamedBrush(found.brush, found.name, None if found.camera is None else found.camera.noise, found.quality)
+    file = _read(PAPER_FILE if str(path) == PAPER else path)
+    return NamedBrush(file.brush, file.name, None if file.camera is None else file.camera.noise, file.quality)
 
 
 def _read(path: Path) -> _File:

@@ -326,10 +326,10 @@ def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:
     """Whether the arm reaches every pose of the tip with this tool."""
     tool, near = inverted(tool_of(config)), HOME
     for pose in wanted:
-        found = joints_for(tool, pose, near)
-        if found is None:
+        joints = joints_for(tool, pose, near)
+        if joints is None:
             return False
-        near = found
+        near = joints
     return True
 
 

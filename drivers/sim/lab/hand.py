@@ -49,8 +49,8 @@ UPRIGHT_ABOVE_MM = 70.0
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """A way to hold the board: its slant and the side toward which it slants, its turn in the picture, its place."""
+class Grip:
+    """How the board is held: its slant and the side toward which it slants, its turn in the picture, its place."""
 
     slant_deg: float = 0.0
     toward_deg: float = 0.0
@@ -60,20 +60,20 @@ class Way:
 
 
 HELD = (
-    Way(3.0),
-    *(Way(28.0, toward) for toward in (270.0, 90.0, 0.0, 180.0)),
-    Way(22.0, 45.0, 0.0, (-0.17, -0.17)),
-    Way(22.0, 135.0, 0.0, (0.17, -0.17)),
-    Way(22.0, 225.0, 0.0, (0.17, 0.17)),
-    Way(22.0, 315.0, 0.0, (-0.17, 0.17)),
-    Way(25.0, 60.0, 90.0),
+    Grip(3.0),
+    *(Grip(28.0, toward) for toward in (270.0, 90.0, 0.0, 180.0)),
+    Grip(22.0, 45.0, 0.0, (-0.17, -0.17)),
+    Grip(22.0, 135.0, 0.0, (0.17, -0.17)),
+    Grip(22.0, 225.0, 0.0, (0.17, 0.17)),
+    Grip(22.0, 315.0, 0.0, (-0.17, 0.17)),
+    Grip(25.0, 60.0, 90.0),
 )
 """How a person is asked to hold it: flat, slanted to each side, in the four corners, and turned by a quarter."""
 
 
-def _any_way(rng: np.random.Generator) -> Way:
+def _any_grip(rng: np.random.Generator) -> Grip:
     x, y, toward = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(0, 360)
-    return Way(float(rng.uniform(18, 30)), float(toward), 0.0, (float(x), float(y)))
+    return Grip(float(rng.uniform(18, 30)), float(toward), 0.0, (float(x), float(y)))
 
 
 class Aims:
@@ -102,7 +102,7 @@ class Aims:
         """How the board is held before the camera: each time at another slant and in another part of the picture."""
         facts, rng = self._facts(), self._drawn("hold-board", index, "")
         view, table = facts.config.view, facts.config.table
-        pose = HELD[index] if index < len(HELD) else _any_way(rng)
+        pose = HELD[index] if index < len(HELD) else _any_grip(rng)
         size_x_mm, size_y_mm = board_size_mm(table)
         high = view.height_px / view.width_px
         longest = max(size_x_mm, size_y_mm / high) if abs(pose.turn_deg) < 45.0 else max(size_y_mm, size_x_mm / high)
@@ -225,13 +225,13 @@ class Hand:
         lifted = withdrawn(here, LIFT_MM)
         reached, way = here, list[Joints]()
         for pose in (lifted, above, aim):
-            found = joints_for(free, pose, near)
-            if found is None and pose is not lifted:
-                found, pose = self._nearest(reached, pose, near)
-            if found is None:
+            joints = joints_for(free, pose, near)
+            if joints is None and pose is not lifted:
+                joints, pose = self._nearest(reached, pose, near)
+            if joints is None:
                 continue  # a stretched arm is not lifted along its brush: it swings over at once
-            way.append(found)
-            near, reached = found, pose
+            way.append(joints)
+            near, reached = joints, pose
         await self._move(way)
         return math.dist(reached.position_mm, aim.position_mm)
 
@@ -241,8 +241,8 @@ class Hand:
         best, reached, part = None, start, 0.0
         for halving in range(1, HALVINGS + 1):
             pose = interpolate(start, end, part + 0.5**halving)
-            if (found := joints_for(free, pose, near)) is not None:
-                best, reached, part = found, pose, part + 0.5**halving
+            if (joints := joints_for(free, pose, near)) is not None:
+                best, reached, part = joints, pose, part + 0.5**halving
         return best, reached
 
     async def _move(self, way: list[Joints]) -> None:
