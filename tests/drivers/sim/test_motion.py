@@ -58,9 +58,6 @@ def test_a_place_out_of_reach_has_no_joints(place: tuple[float, float, float]):
     assert inverse(matrix_of(brush_pose(*place)), HOME) is None
 
 
-ramps = st.builds(Ramp, st.floats(0.01, 800.0), st.floats(0.5, 250.0), st.floats(10.0, 1000.0))
-
-
 @pytest.fixture
 def travelled() -> list[tuple[Pose, Pose]]:
     return []

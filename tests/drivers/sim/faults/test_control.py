@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.loopback import FaultRefused, request_of
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.brush.spec import SimFileError
-from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.control import MAX_LINE_BYTES, ControlServer, live_control
 from brushloop.drivers.sim.rig import LoopbackRig
 from tests.waiting import PATIENCE_S, wait_until
@@ -129,28 +126,6 @@ async def test_a_line_without_end_is_refused_and_hung_up_on(control: ControlServ
     writer.close()
     await writer.wait_closed()
     assert (await ask({"do": "state"}))["ok"]
-
-
-NAMES = st.sampled_from(["do", "fault", "id", "device", "kind", "on", "count"]) | st.text(max_size=6)
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda value: st.lists(value, max_size=3) | st.dictionaries(NAMES, value, max_size=4),
-    max_leaves=8,
-)
-
-
-@pytest.fixture(scope="module")
-def idle_control() -> ControlServer:
-    """One that does not listen."""
-    return ControlServer(LoopbackRig(SimConfig(ink_device="none", force_sensor=False)))
-
-
-@settings(deadline=None)
-@given(line=st.binary(max_size=80) | json_values.map(lambda value: json.dumps(value).encode()))
-def test_whatever_a_client_says_has_an_answer_of_one_line(idle_control: ControlServer, line: bytes):
-    answer = asyncio.run(idle_control.answer(line))
-    assert isinstance(answer["ok"], bool)
-    assert answer["ok"] or answer["error"].isprintable()
 
 
 async def test_only_its_owner_can_open_it(control: ControlServer, path: Path):
