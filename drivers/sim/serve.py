@@ -1,18 +1,203 @@
-"""The rig as a process: it serves until a signal or until idle, writes its `rig.toml`, and may be controlled live."""
+"""The rig as a process: it serves until a signal or until idle, writes its `rig.toml`, and may be controlled live.
+
+The control socket takes one JSON object per line and answers with one per line, over a unix socket of mode 0600:
+
+| request | answer, in addition to `"ok": true` |
+|---|---|
+| `{"do": "add", "fault": {...}}` | `id` of the fault |
+| `{"do": "list"}` | `hanging` and `over`: id, fault, number of strikes |
+| `{"do": "clear"}`, or with `"id": 3` | `taken`: how many were removed |
+| `{"do": "state"}` | state of the world: phase, tip, presses, ink load, modes |
+| `{"do": "release"}` | `was`: the safety mode that a person at the arm has ended |
+| `{"do": "fresh-sheet"}` | |
+| `{"do": "hand", "act": ...}` | `says`, and `reached` for an act that moves the arm; only in an unknown lab |
+
+Anything else is answered with `{"ok": false, "error": "one line"}`.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import os
 import signal
-from collections.abc import Callable, Mapping
+import socket
+import stat
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.control import live_control
+from brushloop.drivers.sim.faults import Hung, fault_of
 from brushloop.drivers.sim.rig import LOOPBACK_HEAD, LoopbackRig
+
+Person = Callable[[Mapping[str, object]], Awaitable[dict[str, Any]]]
+"""Carries out a `hand` request. Raises ValueError, with a one-line message, for an invalid request."""
+MAX_LINE_BYTES = 8192
+MAX_CLIENTS = 16
+MAX_PATH_BYTES = 100
+"""Longest allowed path of a unix socket; the system's limit is slightly higher."""
+FIELDS: dict[str, tuple[str, ...]] = {
+    "add": ("fault",),
+    "list": (),
+    "clear": ("id",),
+    "state": (),
+    "release": (),
+    "fresh-sheet": (),
+    "hand": ("act", "to", "index", "corner"),
+}
+"""Other keys allowed with each `do`."""
+USAGE = (
+    'not a request: {"do": "add", "fault": {...}}, or "list", "clear" (with a number "id" or without), '
+    '"state", "release", "fresh-sheet", "hand"'
+)
+
+
+class ControlServer(LoopbackServer):
+    """Live control of the faults of one rig, and of the person in its lab if there is one."""
+
+    def __init__(self, rig: LoopbackRig, person: Person | None = None) -> None:
+        super().__init__()
+        self._rig = rig
+        self._person = person
+        self._path: Path | None = None
+        self._made = (0, 0)
+
+    async def open(self, path: Path) -> None:
+        """Listen at `path`, replacing the socket of a rig that has ended. Raises `SimFileError`."""
+        listener = _listener(path)
+        status = path.stat()
+        self._path, self._made = path, (status.st_dev, status.st_ino)
+        self._server = await asyncio.start_unix_server(self._serve, sock=listener, limit=MAX_LINE_BYTES)
+
+    async def stop(self) -> None:
+        """Close the listener and every client, and remove the socket."""
+        await super().stop()
+        path, self._path = self._path, None
+        if path is not None:
+            with contextlib.suppress(OSError):
+                now = path.lstat()
+                if (now.st_dev, now.st_ino) == self._made:
+                    path.unlink()
+
+    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer line by line; an overlong line is answered, then the connection is closed."""
+        if self.clients > MAX_CLIENTS:
+            writer.write(_line(_error(f"more than {MAX_CLIENTS} clients")))
+            return
+        while True:
+            try:
+                line = await reader.readuntil(b"\n")
+            except asyncio.LimitOverrunError:
+                writer.write(_line(_error(f"a line has at most {MAX_LINE_BYTES} bytes")))
+                return
+            writer.write(_line(await self.answer(line)))
+            await writer.drain()
+
+    async def answer(self, line: bytes) -> dict[str, Any]:
+        """The answer to a request; never raises, whatever a client sends."""
+        try:
+            request: Any = json.loads(line)
+        except (ValueError, RecursionError):
+            return _error("not JSON")
+        try:
+            return {"ok": True, **await self._obey(request)}
+        except ValueError as error:
+            return _error(str(error))
+
+    async def _obey(self, said: object) -> dict[str, Any]:
+        request = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
+        do = str(request.get("do"))
+        if do not in FIELDS or not set(request) <= {"do", *FIELDS[do]}:
+            raise ValueError(USAGE)
+        board = self._rig.faults
+        match do, request.get("fault"), request.get("id"):
+            case "add", dict(values), _:  # pyright: ignore[reportUnknownVariableType]
+                return {"id": board.hang(fault_of(values))}  # pyright: ignore[reportUnknownArgumentType]
+            case "list", _, _:
+                return {"hanging": [_as_json(h) for h in board.hanging], "over": [_as_json(h) for h in board.over]}
+            case "clear", _, None:
+                return {"taken": board.clear()}
+            case "clear", _, int(ident) if not isinstance(ident, bool):
+                return {"taken": int(board.take(ident))}
+            case "state", _, _:
+                return self._rig.state()
+            case "release", _, _:
+                return {"was": self._rig.arcs.cabinet.release()}
+            case "fresh-sheet", _, _:
+                self._rig.world.fresh_sheet()
+                return {}
+            case "hand", _, _ if self._person is not None:
+                return await self._person(request)
+            case "hand", _, _:
+                raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
+            case _:
+                raise ValueError(USAGE)
+
+
+@contextlib.asynccontextmanager
+async def live_control(rig: LoopbackRig, path: Path | None, person: Person | None = None) -> AsyncGenerator[None]:
+    """A control socket at `path` until the block ends; none if `path` is None. Raises `SimFileError`."""
+    server = ControlServer(rig, person)
+    if path is not None:
+        await server.open(path)
+    try:
+        yield
+    finally:
+        await server.stop()
+
+
+def _as_json(hung: Hung) -> dict[str, Any]:
+    fault = hung.fault.model_dump(mode="json", exclude_defaults=True)
+    return {"id": hung.ident, "fault": fault, "struck": hung.struck}
+
+
+def _error(text: str) -> dict[str, Any]:
+    return {"ok": False, "error": text.replace("\n", " ")[:500]}
+
+
+def _line(body: dict[str, Any]) -> bytes:
+    return json.dumps(body, separators=(",", ":")).encode() + b"\n"
+
+
+def _listener(path: Path) -> socket.socket:
+    """A bound socket to which only its owner can connect. Raises `SimFileError`."""
+    if len(os.fsencode(path)) > MAX_PATH_BYTES:
+        raise SimFileError(path, "", f"the path of a socket has at most {MAX_PATH_BYTES} bytes")
+    _clear_away(path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    # Set before the path exists: another user could connect before a later `chmod`.
+    mask = os.umask(0o177)
+    try:
+        listener.bind(str(path))
+    except OSError as error:
+        listener.close()
+        raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
+    finally:
+        os.umask(mask)
+    listener.setblocking(False)
+    return listener
+
+
+def _clear_away(path: Path) -> None:
+    """Remove a socket that has no listener; refuse to remove anything else."""
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except OSError:
+            path.unlink(missing_ok=True)
+            return
+    raise SimFileError(path, "", "another rig listens here")
 
 
 def serve(

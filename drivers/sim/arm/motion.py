@@ -17,8 +17,21 @@ import numpy as np
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
-from brushloop.drivers.sim.arm.paths import Corner, JointLine, Line, Ramp, fixed
+from brushloop.drivers.sim.arm.kinematics import (
+    HOME,
+    Corner,
+    JointLine,
+    Joints,
+    Line,
+    Matrix,
+    Ramp,
+    fixed,
+    forward,
+    inverse,
+    inverted,
+    matrix_of,
+    pose_of,
+)
 
 STEADY_LAG_S = 0.08
 """The controller reports steady a little after its queue is empty."""

@@ -20,11 +20,10 @@ from brushloop.drivers.server import LoopbackServer, NotLoopback
 from brushloop.drivers.sim import rig as rig_module
 from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.control import ControlServer
 from brushloop.drivers.sim.lab.lab import OlderSoftware
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
-from brushloop.drivers.sim.serve import serve
+from brushloop.drivers.sim.serve import ControlServer, serve
 from brushloop.drivers.sim.world import World
 
 

@@ -17,8 +17,8 @@ from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.loopback import FaultRefused, request_of
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.brush.spec import SimFileError
-from brushloop.drivers.sim.control import MAX_LINE_BYTES, ControlServer, live_control
 from brushloop.drivers.sim.rig import LoopbackRig
+from brushloop.drivers.sim.serve import MAX_LINE_BYTES, ControlServer, live_control
 from tests.waiting import PATIENCE_S, wait_until
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]
