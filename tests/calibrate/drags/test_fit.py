@@ -14,17 +14,12 @@ from brushloop.calibrate.drags import report
 from brushloop.calibrate.drags.brush import BETWEEN_SESSIONS, Learned, different, learn
 from brushloop.calibrate.drags.captures import Drawn, commanded_path
 from brushloop.calibrate.drags.fit import (
-    CIRCLES,
-    CIRCLES_FREEDOM,
-    FREEDOM,
-    INK_ABOVE,
     SPREAD_MM,
     Correction,
     fit_drags,
     marks_mm,
     threshold,
 )
-from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
 from brushloop.model.drag import DragModel, Drawings, ink
 from brushloop.sessions.records import Header, Source
 
@@ -122,34 +117,6 @@ def test_a_stroke_that_counts_less_moves_the_fit_less() -> None:
         for w in (1.0, 0.1)
     )
     assert TRUTH.half_mm <= less.model.half_mm < even.model.half_mm - 0.1
-
-
-def test_the_simulated_brush_trails_and_the_fit_sees_it() -> None:
-    """On the loopback rig: a brush drawn along an L stays away from the corner, and circles at the tip do not."""
-    brush = Brush(BrushSpec())
-    paths, images = [], []
-    for k, (depth, turn) in enumerate([(4.0, -1.0), (7.0, -1.0), (4.0, 1.0), (7.0, 1.0)]):
-        corners = [(0.0, 0.0), (25.0, 0.0), (25.0, 14.0 * turn)]
-        mark = brush.drag([Waypoint(x, y, depth) for x, y in corners], 0.0, 0.0, ink_load=1.0, press_seed=k)
-        leg, rise = np.linspace(0.0, 25.0, 15), np.linspace(0.0, 14.0 * turn, 9)[1:]
-        xy = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([0 * rise + 25.0, rise])])
-        paths.append(np.column_stack([xy, np.full(len(xy), depth)]))
-        column = np.round(mark.origin_px[0] + X_MM * mark.px_per_mm).astype(int)
-        row = np.round(mark.origin_px[1] - Y_MM * mark.px_per_mm).astype(int)
-        images.append(np.pad(mark.density, 400)[np.ix_(row + 400, column + 400)] > 0.3)
-    seen = np.array(images)
-    target = replace(drawings(paths), ink=seen.astype(np.float32))
-
-    def overlap(model: DragModel) -> float:
-        predicted = ink(marks_mm(model, target), SPREAD_MM) > INK_ABOVE
-        return np.count_nonzero(predicted & seen) / np.count_nonzero(predicted | seen)
-
-    lagging = fit_drags(target).model
-    circles = fit_drags(target, start=CIRCLES, freedom=CIRCLES_FREEDOM).model
-    assert (circles.leash_mm, circles.land_mm) == (0.0, 0.0)
-    assert overlap(lagging) > max(0.7, overlap(circles) + 0.02)
-    assert 1.0 < lagging.leash_mm + 7.0 * lagging.leash_per_mm < 15.0
-    assert set(FREEDOM) == set(DragModel.names())
 
 
 def test_what_the_model_lacks_is_learned_from_neighbours() -> None:

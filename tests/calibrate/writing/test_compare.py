@@ -9,11 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.compare.score import Polarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.stroke.rectify import rectify_by
 from brushloop.calibrate.writing.record import (
     FigureRecord,
     PlannedBy,
@@ -92,18 +90,6 @@ def test_ink_on_the_edge_of_the_cell_is_reported_and_other_cells_are_refused() -
         captured(capture(page()), CALIBRATION)
 
 
-def test_a_character_is_seen_through_the_lens_of_the_calibration() -> None:
-    lens = Lens(
-        source="lens file a", size_px=(1000, 800), matrix=(1200.0, 1200.0, 500.0, 400.0), distortion=(-0.3, 0, 0, 0, 0)
-    )
-    image = page((250, 600, 750, 640))
-    undistorted = rectify_by(image, through := CALIBRATION.model_copy(update={"lens": lens}), CELL, "test")
-    assert np.abs(undistorted.astype(float) - rectify_by(image, CALIBRATION, CELL, "test")).max() > 100
-    through_lens, plain = (captured(capture(image), given)[0][Tone.BINARY] for given in (through, CALIBRATION))
-    ink = cv2.resize((undistorted < 125).astype(np.float32), (128, 128), interpolation=cv2.INTER_AREA)
-    assert np.abs(through_lens - ink).sum() < 0.1 * np.abs(plain - ink).sum()
-
-
 def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
     small = cv2.resize(cross(), (64, 64), interpolation=cv2.INTER_AREA)
     moved = np.zeros((128, 128), np.float32)
@@ -115,15 +101,6 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
         assert far[0] < 0.5
     whole = aligned(cross(), Alignment.SIZE_NORMALISED) > 0.5
     assert np.ptp(np.flatnonzero(whole.any(axis=1))) + 1 == pytest.approx(100, abs=2)
-
-
-def test_a_blank_page_scores_high_where_paper_is_one_and_cannot_be_scored_where_ink_is() -> None:
-    dot = np.zeros((128, 128), np.float32)
-    dot[0:2, 0:2] = 1.0
-    assert compare_ink(as_ink(cross()), as_ink(dot), (Alignment.MM, Tone.BINARY, Polarity.PAPER))[0] > 0.9
-    assert compare_ink(as_ink(cross()), as_ink(dot), STRICT)[0] == 0.0
-    with pytest.raises(ValueError, match="blank"):
-        compare_ink(as_ink(cross()), as_ink(np.zeros((128, 128), np.float32)), STRICT)
 
 
 def character() -> Character:
