@@ -313,7 +313,8 @@ def paper_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """The paper's Table 2 beside the same table of the simulated brush whose constants were searched so that it agrees.
 
     Agreement is no evidence for the model. The rows of ccd-bsmg were not part of the search. `n` presses of each
-    condition (ten, as in the paper); size-normalised, binary; ratio = the allowed difference over the difference.
+    condition (ten, as in the paper); size-normalised, binary; `conditions` are the paper's number and ours minus it,
+    ratio = the allowed difference over the difference, the smallest of the three.
     """
     repeats = rounds_of(n, 10)
     with tempfile.TemporaryDirectory() as scratch:
@@ -327,13 +328,12 @@ def paper_brush(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     results: list[Result] = []
     for model, measure in itertools.product(TABLE_2, ("csim", "ssim")):
         printed: dict[str, float] = dict(zip(("max", "min", "avg"), getattr(TABLE_2[model], measure), strict=True))
-        for which, allowed in WITHIN_POINTS.items():
-            value = float(ours[model, measure][which])
-            off = value - printed[which]
-            peer = f"goal {allowed:g} points off the paper's {printed[which]:.2f} (ours {off:+.2f})"
-            name = f"paper-brush.{model}.{measure}.{which}"
-            ratio = allowed / max(abs(off), 0.01)
-            results.append(Result(name, value, "%", peer, ratio, repeats * len(CELLS), seed, machine()))
+        off = {which: float(ours[model, measure][which]) - paper for which, paper in printed.items()}
+        ratio = min(allowed / max(abs(off[which]), 0.01) for which, allowed in WITHIN_POINTS.items())
+        peer = f"goal {' / '.join(f'{points:g}' for points in WITHIN_POINTS.values())} points off the paper"
+        where = ", ".join(f"{which} {paper:.2f} {off[which]:+.2f}" for which, paper in printed.items())
+        name, value = f"paper-brush.{model}.{measure}", printed["avg"] + off["avg"]
+        results.append(Result(name, value, "%", peer, ratio, repeats * len(CELLS), seed, f"{where}; {machine()}"))
     return results
 
 
