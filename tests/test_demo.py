@@ -61,7 +61,7 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     session, again = sorted((out / "sessions").iterdir())
     for folder in (session, again):
         begun = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
-        cells = [(line["sheet"], line["patch"]) for line in begun if "patch" in line]
+        cells = [(line["sheet"], patch) for line in begun for patch in line.get("patches", [])]
         assert len(cells) == len(set(cells)), "no cell is ever pressed twice"
     strokes = [capture.stroke for capture in Recording(session).captures()]
     assert len(strokes) == 4

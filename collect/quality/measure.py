@@ -13,6 +13,7 @@ from brushloop.calibrate.board.pix2len import Plane, apply
 from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Soft
 from brushloop.collect.quality.ink import Ink, Point
 
+Floats32 = NDArray[np.float32]
 FINE_PX, WIDE_PX = 1.0, 2.0
 """Two blurs that are added; the ratio of an edge's slopes after each gives the edge's own blur."""
 EDGE_SHARE = 0.02
@@ -46,30 +47,31 @@ def blur_px(image: Gray) -> float | None:
     gradient of a step of blur s, blurred again by a, is proportional to 1 / sqrt(s^2 + a^2). Two such blurs give s,
     whatever the contrast. At a contrast of less than 80 levels, rounding makes s up to a third too large or small.
     """
-    found = [s for s in (_blur_along(image, 1, 0), _blur_along(image, 0, 1)) if s is not None]
+    exact = image.astype(np.float32)
+    fine, wide = (np.asarray(cv2.GaussianBlur(exact, (0, 0), s_px), np.float32) for s_px in (FINE_PX, WIDE_PX))
+    across = np.array([[-0.5, 0.0, 0.5]], np.float32)
+    found = [s for kernel in (across, across.T) if (s := _blur_along(fine, wide, kernel)) is not None]
     return max(found) if found else None
 
 
-def _blur_along(image: Gray, dx: int, dy: int) -> float | None:
-    fine = _slope(image, FINE_PX, dx, dy)
+def _blur_along(fine_smooth: Floats32, wide_smooth: Floats32, kernel: Floats32) -> float | None:
+    fine = _slope(fine_smooth, kernel)
     # At the crest of an edge only its blur matters, not the thickness of the line.
-    crest = fine == cv2.dilate(fine, np.ones((1, 7) if dx else (7, 1), np.uint8))
+    crest = fine == cv2.dilate(fine, np.ones((1, 7) if len(kernel) == 1 else (7, 1), np.uint8))
     steep = fine[crest & (fine > LEAST_EDGE)]
     if steep.size < FEWEST_EDGES:
         return None
     least = np.quantile(steep, 1.0 - min(1.0, max(EDGE_SHARE, 500 / steep.size)))
     chosen = crest & (fine >= max(float(least), LEAST_EDGE))
-    wide = _slope(image, WIDE_PX, dx, dy)
+    wide = _slope(wide_smooth, kernel)
     ratio = np.maximum(fine[chosen] / np.maximum(wide[chosen], 1e-3), 1.0 + 1e-6)
     wide2, fine2 = WIDE_PX**2 + SLOPE_PX2, FINE_PX**2 + SLOPE_PX2
     own2 = (wide2 - ratio**2 * fine2) / (ratio**2 - 1.0)
     return float(np.sqrt(np.median(np.maximum(own2, 0.0))))
 
 
-def _slope(image: Gray, sigma_px: float, dx: int, dy: int) -> NDArray[np.float32]:
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
-    kernel = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    return np.abs(cv2.filter2D(smooth, cv2.CV_32F, kernel if dx else kernel.T)).astype(np.float32)
+def _slope(smooth: Floats32, kernel: Floats32) -> Floats32:
+    return np.abs(cv2.filter2D(smooth, cv2.CV_32F, kernel)).astype(np.float32)
 
 
 def edge_mm(points_mm: Floats, plane: Plane, shape: tuple[int, ...]) -> float:
