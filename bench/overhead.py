@@ -113,7 +113,7 @@ def _motion_of(spans: Spans, step: str, motion_s: float, strokes: int, seed: int
 
 def share_out(spans: Spans, begin_s: float, end_s: float) -> dict[str, float]:
     """Seconds of [begin, end] by part; an instant that no part covers is `the rest`."""
-    from brushloop.drivers.sim.arm.motion import STEADY_LAG_S
+    from brushloop.drivers.sim.motion import STEADY_LAG_S
 
     moves = [_around(move, spans["motion"]) for move in spans["move"]]
     parts = dict(spans) | {

@@ -178,7 +178,7 @@ async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
     robot = make_robot(config, clock, notices.append)
     try:
         identity = await robot.connect()
-        state = await robot.condition(CALLS)
+        state = await robot.state(CALLS)
     finally:
         await robot.close()
     condition = f"{state.mode}, safety {state.safety}" + _simulated(identity)

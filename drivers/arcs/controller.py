@@ -161,7 +161,7 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class ArmState:
     """The controller's names of its robot and safety modes, and the median time of a call."""
 
     mode: str
@@ -217,7 +217,7 @@ class Controller:
         except ValueError:
             raise ProtocolViolation(DEVICE, "getRobotModeType", f"unknown mode {mode!r}") from None
 
-    async def condition(self, calls: int) -> Condition:
+    async def state(self, calls: int) -> ArmState:
         """Read the modes and time `calls` consecutive calls of one kind; sets nothing."""
         loop = asyncio.get_running_loop()
         took_s: list[float] = []
@@ -226,7 +226,7 @@ class Controller:
             await self.pose()
             took_s.append(loop.time() - began)
         safety = str(await self.ask("RobotState.getSafetyModeType"))
-        return Condition(str(await self.mode()), safety, statistics.median(took_s) * 1e3)
+        return ArmState(str(await self.mode()), safety, statistics.median(took_s) * 1e3)
 
     async def require_safe(self, op: str) -> None:
         """Raise `RobotNotSafe`, with condition and remedy, unless the mode allows motion; reduced is reported."""

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, TypeVar
 
-from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Condition, Controller
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, ArmState, Controller
 from brushloop.drivers.arcs.motion import (
     Look,
     Messages,
@@ -28,7 +28,7 @@ from brushloop.drivers.errors import DeviceError, MotionFailed, NotConnected
 from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.limits import Limits
 
-__all__ = ["ArcsOptions", "AuboArcs", "Condition"]
+__all__ = ["ArcsOptions", "ArmState", "AuboArcs"]
 
 AUBOPE_PORT = 8899
 _R = TypeVar("_R")
@@ -119,9 +119,9 @@ class AuboArcs:
         await self._watchdog.arm()
         await self._telemetry.read()
 
-    async def condition(self, calls: int) -> Condition:
-        """The arm's current modes, and the time of a call; see `Controller.condition`."""
-        return await self._motion.condition(calls)
+    async def state(self, calls: int) -> ArmState:
+        """The arm's current modes, and the time of a call; see `Controller.state`."""
+        return await self._motion.state(calls)
 
     def check(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         """Raise `LimitExceeded` where the target is not allowed, without asking the controller."""

@@ -44,7 +44,7 @@ STEADY_AFTER = 8
 """Number of frames at the usual period after which it is no longer taken for misjudged."""
 
 
-class Fault(StrEnum):
+class FrameFault(StrEnum):
     """What is wrong with a frame."""
 
     BLACK = "black"
@@ -55,8 +55,8 @@ class Fault(StrEnum):
 
 
 LIKELY = {
-    Fault.BLACK: "The picture is black: lens covered or light off? ",
-    Fault.SATURATED: "The picture is white: too much light, or exposed too long? ",
+    FrameFault.BLACK: "The picture is black: lens covered or light off? ",
+    FrameFault.SATURATED: "The picture is white: too much light, or exposed too long? ",
 }
 """The cause of a fault that a person can see at the camera."""
 
@@ -81,11 +81,11 @@ class FrameHealth:
         """Number of frames that came at the usual period."""
         self._stalled = False
         self._learning_again = False
-        self.counts: Counter[Fault] = Counter()
+        self.counts: Counter[FrameFault] = Counter()
         self.repeated = False
         """Whether the last frame equals the one before it: nothing new, though not yet a fault."""
 
-    def judge(self, image: NDArray[np.uint8], arrival_ns: int) -> Fault | None:
+    def judge(self, image: NDArray[np.uint8], arrival_ns: int) -> FrameFault | None:
         """The first fault found in an (h, w) or (h, w, 3) uint8 frame, or None."""
         fault = self._look(image)
         # Clock and digest are kept up to date for faulty frames too.
@@ -95,9 +95,9 @@ class FrameHealth:
         patched = self._is_patched(image, same)
         frozen, late = self._is_frozen(same), self._is_late(arrival_ns)
         if fault is None and patched:
-            fault = Fault.TORN
+            fault = FrameFault.TORN
         if fault is None and self._live:
-            fault = Fault.FROZEN if frozen else Fault.LATE if late else None
+            fault = FrameFault.FROZEN if frozen else FrameFault.LATE if late else None
         if fault is not None:
             self.counts[fault] += 1
         return fault
@@ -106,21 +106,21 @@ class FrameHealth:
         """Counts by fault, such as `3 black, 1 torn`; empty if there were none."""
         return ", ".join(f"{count} {fault}" for fault, count in sorted(self.counts.items()))
 
-    def describe(self, fault: Fault) -> str:
+    def describe(self, fault: FrameFault) -> str:
         """The likely cause, where it is known, and how many frames of each kind were skipped."""
         return f"{LIKELY.get(fault, '')}frames skipped: {self.summary()}"
 
-    def _look(self, image: NDArray[np.uint8]) -> Fault | None:
+    def _look(self, image: NDArray[np.uint8]) -> FrameFault | None:
         import numpy as np
 
         sample = image[::SAMPLE_STEP, ::SAMPLE_STEP]
         if np.count_nonzero(sample >= BLACK_BELOW) < LIGHT_SHARE * sample.size:
-            return Fault.BLACK
+            return FrameFault.BLACK
         if float(np.mean(sample >= 255)) > SATURATED_SHARE:
-            return Fault.SATURATED
+            return FrameFault.SATURATED
         band = image[-max(8, round(TORN_BAND_SHARE * image.shape[0])) :]
         if int(band.max()) - int(band.min()) <= 1 and int(band.min()) < 254:  # clipped white is light, not loss
-            return Fault.TORN
+            return FrameFault.TORN
         return None
 
     def _is_patched(self, image: NDArray[np.uint8], same: bool) -> bool:

@@ -16,13 +16,13 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.rounds import Wrench
 from brushloop.drivers.geometry import brush_pose, columns, from_wire, interpolate, lean, of_vector, product, unit
 from brushloop.drivers.ink.simulator import Well
-from brushloop.drivers.sim.arm.kinematics import Matrix, matrix_of
-from brushloop.drivers.sim.arm.motion import MotionQueue
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush, BrushSpec
 from brushloop.drivers.sim.brush.drag import Waypoint, ink_left
 from brushloop.drivers.sim.brush.footprint import Flaw, flaw_of_load, natural_split
 from brushloop.drivers.sim.brush.paper import Paper
 from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.kinematics import Matrix, matrix_of
+from brushloop.drivers.sim.motion import MotionQueue
 
 SIDEWAYS_MM = 0.5
 """A contact that travels less far sideways is a press."""

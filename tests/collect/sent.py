@@ -15,7 +15,7 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import to_paper
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.sim.arm.motion import MotionQueue
+from brushloop.drivers.sim.motion import MotionQueue
 
 SAME_MM, SAME_DEG = 1e-6, 1e-4
 

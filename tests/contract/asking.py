@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import make_robot, sole_driver
-from brushloop.drivers.arcs.robot import Condition
+from brushloop.drivers.arcs.robot import ArmState
 from brushloop.drivers.devices import Identity, Pose
 from brushloop.drivers.host import HostClock
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SPEED_MM_S
@@ -20,12 +20,12 @@ QUESTION = "Keep a hand at the emergency stop. May the arm move? [y/N] "
 def permission_refused(config: pytest.Config, rig: RigConfig, tests: int) -> str | None:
     """Tell and ask; None for a yes, else why no test may move the arm. Raises what connecting raises."""
     with sole_driver(rig.robot.host, rig.robot.port):
-        identity, where, condition = asyncio.run(_look(rig))
+        identity, where, state = asyncio.run(_look(rig))
     capture = config.pluginmanager.getplugin("capturemanager")
     assert capture is not None
     capture.suspend_global_capture(in_=True)
     try:
-        sys.stdout.write(_announcement(rig, identity, where, condition, tests))
+        sys.stdout.write(_announcement(rig, identity, where, state, tests))
         if not sys.stdin.isatty():
             sys.stdout.write("No terminal to ask on: nothing moves.\n")
             return "--rig: no terminal to ask on whether the arm may move"
@@ -39,16 +39,16 @@ def permission_refused(config: pytest.Config, rig: RigConfig, tests: int) -> str
     return None if answer in ("y", "yes") else f"--rig: the answer to whether the arm may move was {answer or 'no'!r}"
 
 
-async def _look(rig: RigConfig) -> tuple[Identity, Pose, Condition]:
+async def _look(rig: RigConfig) -> tuple[Identity, Pose, ArmState]:
     """Connect and ask; powers, sets and moves nothing."""
     robot = make_robot(rig, HostClock(), lambda _text: None)
     try:
-        return await robot.connect(), await robot.where(), await robot.condition(1)
+        return await robot.connect(), await robot.where(), await robot.state(1)
     finally:
         await robot.close()
 
 
-def _announcement(rig: RigConfig, identity: Identity, where: Pose, condition: Condition, tests: int) -> str:
+def _announcement(rig: RigConfig, identity: Identity, where: Pose, state: ArmState, tests: int) -> str:
     robot, limits = rig.robot, rig.robot.limits
     what = "the loopback rig, simulated" if identity.simulated else "A REAL ARM"
     x, y, z = where.position_mm
@@ -56,7 +56,7 @@ def _announcement(rig: RigConfig, identity: Identity, where: Pose, condition: Co
 {tests} tests are about to power an arm and move it.
   robot    {identity.model}, {identity.firmware}: {what}
   address  {robot.host}:{robot.port}, framing {robot.framing}; rig {rig.name!r}
-  state    robot mode {condition.mode}, safety mode {condition.safety}
+  state    robot mode {state.mode}, safety mode {state.safety}
   tip      x {x:.1f}, y {y:.1f}, z {z:.1f} mm with the tool that the controller has now; the rig's tool is set first
   box      straight up by at most {LIFT_MM:g} mm from where the tip stands, and back; not lower, not sideways, no turn
   step     {LIFT_MM:g} mm at most, at {SPEED_MM_S:g} mm/s and {ACC_MM_S2:g} mm/s2 at most

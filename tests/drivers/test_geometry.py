@@ -93,12 +93,6 @@ def turned_deg(a: float, b: float) -> float:
 
 
 @settings(deadline=None)
-@given(angles, angles, angles)
-def test_angles_on_the_wire_are_turns_about_z_then_y_then_x(rx: float, ry: float, rz: float):
-    assert matrix(from_wire([0.0, 0.0, 0.0, rx, ry, rz])) == pytest.approx(by_hand(rx, ry, rz), abs=1e-12)
-
-
-@settings(deadline=None)
 @given(poses)
 def test_a_pose_survives_the_wire(pose: Pose):
     off_mm, off_deg = distance(pose, from_wire(to_wire(pose)))
@@ -158,10 +152,3 @@ def test_on_the_way_both_distances_are_shared_out(a: Pose, b: Pose, s: float):
     done_mm, done_deg = distance(a, interpolate(a, b, s))
     assert done_mm == pytest.approx(s * total_mm, abs=1e-6)
     assert done_deg == pytest.approx(s * total_deg, abs=1e-4)
-
-
-@settings(deadline=None)
-@given(headings, headings, tilts, st.floats(0.0, 1.0))
-def test_a_turn_between_two_headings_never_tilts_further(a: float, b: float, tilt: float, s: float):
-    ends = [brush_pose(0.0, 0.0, 0.0, heading_deg=h, tilt_deg=tilt) for h in (a, b)]
-    assert lean(interpolate(*ends, s))[0] <= tilt + 1e-4

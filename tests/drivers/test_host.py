@@ -14,10 +14,6 @@ from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.world import SimClock
 
 
-def test_the_host_clock_gives_wall_time():
-    assert abs(HostClock().now_ns() - time.time_ns()) < 50_000_000
-
-
 def test_the_host_clock_goes_on_when_wall_time_is_set_back(monkeypatch: pytest.MonkeyPatch):
     clock = HostClock()
     before = clock.now_ns()

@@ -15,7 +15,7 @@ import numpy as np
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import from_wire, to_wire
-from brushloop.drivers.sim.arm.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import Joints, Matrix, forward, inverse, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.world import World
 
 BOOT_S = 0.7

@@ -15,7 +15,7 @@ from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOW
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import from_wire, to_wire
 from brushloop.drivers.sim.arcs.cabinet import ROBOT, SOFT_STOP_M_S2, Cabinet
-from brushloop.drivers.sim.arm.kinematics import LIMITS_DEG, Joints, inverse, inverted, matrix_of
+from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, inverse, inverted, matrix_of
 
 Params = dict[str, Any]
 

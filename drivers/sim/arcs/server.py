@@ -21,8 +21,8 @@ from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
 from brushloop.drivers.sim.arcs.methods import methods
-from brushloop.drivers.sim.arm.motion import Rest
 from brushloop.drivers.sim.faults import KINDS, LOST, REPLIES, STOPS, Device, Fault, FaultBoard, Truth
+from brushloop.drivers.sim.motion import Rest
 from brushloop.drivers.sim.world import World
 
 PIECE_S = 0.001

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arm.kinematics import HOME, Joints, Matrix, inverse, inverted, matrix_of
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.kinematics import HOME, Joints, Matrix, inverse, inverted, matrix_of
 from brushloop.drivers.sim.scene import homography
 from brushloop.drivers.sim.world import tool_of
 

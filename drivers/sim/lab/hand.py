@@ -16,7 +16,7 @@ from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import interpolate
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
-from brushloop.drivers.sim.arm.kinematics import Joints, inverted
+from brushloop.drivers.sim.kinematics import Joints, inverted
 from brushloop.drivers.sim.lab.facts import (
     LIFT_MM,
     PIN_TILT_DEG,

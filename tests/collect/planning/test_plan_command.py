@@ -23,8 +23,8 @@ from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.errors import ConnectionLost, ProtocolViolation
 from brushloop.drivers.geometry import brush_pose, from_wire
 from brushloop.drivers.sim.arcs.server import ArcsServer
-from brushloop.drivers.sim.arm.kinematics import inverted, matrix_of
 from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.kinematics import inverted, matrix_of
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
 from tests.command import brushloop

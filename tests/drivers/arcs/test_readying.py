@@ -17,7 +17,7 @@ from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs.server import ArcsServer
-from brushloop.drivers.sim.arm.kinematics import forward, pose_of
+from brushloop.drivers.sim.kinematics import forward, pose_of
 from brushloop.drivers.sim.rig import HOST
 
 NEAR = brush_pose(260.0, -220.0, 250.0)

@@ -41,7 +41,7 @@ async def test_the_driver_finds_what_the_doctor_found(archive: Archive) -> None:
         options = ArcsOptions("127.0.0.1", controller.port, (0.0, 0.0, 0.0), framing=archive.framing)
         arm = AuboArcs(options, NOWHERE, HostClock())
         identity = await arm.connect()
-        state = await arm.condition(1)
+        state = await arm.state(1)
         await arm.close()
     assert identity.model == archive.robot["identity"]
     assert archive.robot["firmware"].startswith(identity.firmware)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera
-from brushloop.drivers.camera.opencv import Fault, FrameHealth
+from brushloop.drivers.camera.opencv import FrameFault, FrameHealth
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout
 from brushloop.drivers.host import HostClock
@@ -35,11 +35,11 @@ def test_a_page_with_ink_is_sound() -> None:
 
 
 def test_a_lens_cap_is_black_though_not_quite_zero() -> None:
-    assert health().judge(page(8.0, 3.0), 0) is Fault.BLACK
+    assert health().judge(page(8.0, 3.0), 0) is FrameFault.BLACK
 
 
 def test_an_overexposed_page_is_saturated_but_a_white_one_is_not() -> None:
-    assert health().judge(page(300.0), 0) is Fault.SATURATED
+    assert health().judge(page(300.0), 0) is FrameFault.SATURATED
     assert health().judge(page(245.0), 0) is None
 
 
@@ -47,13 +47,13 @@ def test_an_overexposed_page_is_saturated_but_a_white_one_is_not() -> None:
 def test_a_frame_whose_lower_part_never_arrived_is_torn(fill: int) -> None:
     image = page()
     image[400:] = fill
-    assert health().judge(image, 0) is Fault.TORN
+    assert health().judge(image, 0) is FrameFault.TORN
 
 
 def test_the_fifth_equal_frame_is_frozen_and_a_new_one_thaws() -> None:
     judged, image = health(), page()
     faults = [judged.judge(image, k * PERIOD) for k in range(6)]
-    assert faults == [None, None, None, None, Fault.FROZEN, Fault.FROZEN]
+    assert faults == [None, None, None, None, FrameFault.FROZEN, FrameFault.FROZEN]
     assert judged.judge(page(), 6 * PERIOD) is None
     assert judged.summary() == "2 frozen"
 
@@ -64,7 +64,7 @@ def test_a_camera_that_was_slow_at_first_is_not_late_for_ever_after_a_pause() ->
     slow = [k * 500_000_000 for k in range(4)]
     resumed = [slow[-1] + 2_000_000_000 + k * 100_000_000 for k in range(12)]
     assert [judged.judge(page(), t) for t in slow] == [None] * 4
-    assert [judged.judge(page(), t) for t in resumed] == [Fault.LATE] * 5 + [None] * 7
+    assert [judged.judge(page(), t) for t in resumed] == [FrameFault.LATE] * 5 + [None] * 7
 
 
 def test_a_camera_whose_first_frames_come_in_a_burst_is_late_for_a_few_frames_only() -> None:
@@ -74,7 +74,7 @@ def test_a_camera_whose_first_frames_come_in_a_burst_is_late_for_a_few_frames_on
     for t in burst:
         judged.judge(page(), t)
     found = [judged.judge(page(), t) for t in steady]
-    assert found[0] is Fault.LATE
+    assert found[0] is FrameFault.LATE
     assert found[5:] == [None] * 35
 
 
@@ -84,7 +84,7 @@ def test_a_backlog_after_a_pause_is_late_until_frames_come_at_their_own_pace() -
     assert [judged.judge(page(), t) for t in arrivals] == [None] * 6
     resumed = arrivals[-1] + 2_000_000_000
     burst = [resumed, resumed + 1_000_000, resumed + 2_000_000]
-    assert [judged.judge(page(), t) for t in burst] == [Fault.LATE] * 3
+    assert [judged.judge(page(), t) for t in burst] == [FrameFault.LATE] * 3
     assert judged.judge(page(), burst[-1] + PERIOD) is None
     assert judged.judge(page(), burst[-1] + 2 * PERIOD) is None
 

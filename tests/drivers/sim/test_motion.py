@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
-from brushloop.drivers.sim.arm.kinematics import HOME, LIMITS_DEG, Ramp, forward, inverse, matrix_of, pose_of
-from brushloop.drivers.sim.arm.motion import STEADY_LAG_S, MotionQueue
+from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, Ramp, forward, inverse, matrix_of, pose_of
+from brushloop.drivers.sim.motion import STEADY_LAG_S, MotionQueue
 
 TOOL = np.eye(4)
 TOOL[2, 3] = 0.18

@@ -18,7 +18,7 @@ from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
-from brushloop.drivers.sim.arm.kinematics import forward, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.lab.facts import CORNERS, corner, draw, in_picture
 from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab, truth
 from brushloop.drivers.sim.serve import LabRefused, live_control

@@ -12,7 +12,7 @@ import pytest
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
 from brushloop.drivers.sim.arcs.cabinet import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
-from brushloop.drivers.sim.arm.kinematics import HOME
+from brushloop.drivers.sim.kinematics import HOME
 
 START = brush_pose(250.0, -230.0, 260.0)
 NEAR = brush_pose(350.0, -230.0, 260.0)

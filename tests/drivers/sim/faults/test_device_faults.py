@@ -11,8 +11,7 @@ import pytest
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
-from brushloop.drivers.camera.opencv import Fault as Judgement
-from brushloop.drivers.camera.opencv import FrameHealth
+from brushloop.drivers.camera.opencv import FrameFault, FrameHealth
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -221,7 +220,7 @@ def test_a_picture_whose_end_is_to_the_bit_that_of_the_one_before_is_torn():
     patched[300:], again[400:] = first[300:], first[400:]
     jpegs = FrameHealth(latency_ns=0, frozen_after=5, live=True, independent=True)
     judged = [jpegs.judge(image, k * 10**8) for k, image in enumerate((first, patched, again, third, third))]
-    assert judged == [None, Judgement.TORN, Judgement.TORN, None, None]
+    assert judged == [None, FrameFault.TORN, FrameFault.TORN, None, None]
     video = FrameHealth(latency_ns=0, frozen_after=5, live=True)  # repeats what does not move, and may
     assert [video.judge(image, k * 10**8) for k, image in enumerate((first, patched))] == [None, None]
 

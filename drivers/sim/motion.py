@@ -17,7 +17,7 @@ import numpy as np
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
-from brushloop.drivers.sim.arm.kinematics import (
+from brushloop.drivers.sim.kinematics import (
     HOME,
     Corner,
     JointLine,
@@ -149,8 +149,8 @@ def timed(pieces: Sequence[Piece], v_in: float, begin_s: float) -> list[Segment]
         return speed if pieces[i].even else math.sqrt(speed * speed + 2.0 * pieces[i].acc * pieces[i].length)
 
     for i in range(len(pieces) - 1, 0, -1):
-        joined = pieces[i - 1].corner or pieces[i].corner
-        speeds[i] = min(caps[i - 1], caps[i], reach(i, speeds[i + 1])) if joined else 0.0
+        rounded = pieces[i - 1].corner or pieces[i].corner
+        speeds[i] = min(caps[i - 1], caps[i], reach(i, speeds[i + 1])) if rounded else 0.0
     if v_in > reach(0, speeds[1]) * (1.0 + SLACK) + SLACK:
         return None
     speeds[0] = v_in
