@@ -1,4 +1,4 @@
-"""`twin.toml`, which `brushloop sim --brush` presses with, the file of an interrupted run, and the camera's noise.
+"""`twin.toml`, which `brushloop sim --brush` presses with and the command prints, and the camera's noise.
 
 The noise comes from stills of one view: what differs between two of them where nothing was drawn.
 """
@@ -6,24 +6,17 @@ The noise comes from stills of one view: what differs between two of them where 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from pathlib import Path
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
 
-from brushloop.calibrate.artefact import Frozen, made_by
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.artefact import made_by
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Recording
-from brushloop.twin.brush import SHAPE
 from brushloop.twin.run import Twin
-from brushloop.twin.search import Found
 
 STILLS = 8
 """Stills that are compared, each with the next one."""
@@ -32,51 +25,6 @@ TO_SD = 1.4826
 JPEG_QUALITY = 95
 PAPER_GRAY = 215
 TRIED = np.arange(0.0, 12.1, 0.5)
-
-
-class Step(Frozen):
-    """A finished step: the point that the search has reached, and the seed of the individual."""
-
-    point: Annotated[
-        tuple[Annotated[float, Field(allow_inf_nan=False)], ...],
-        Field(min_length=len(SHAPE) + 3, max_length=len(SHAPE) + 3),
-    ]
-    seed: Annotated[int, Field(ge=0)]
-
-
-class Steps(Frozen):
-    """Finished steps of a run by name; valid for the same captures and software only."""
-
-    made_of: tuple[str, ...]
-    steps: dict[str, Step]
-
-
-class Notes:
-    """The finished steps of a run, kept beside the file that it will write until that is written.
-
-    Raises `CalibrationError` for a file that is not one of an interrupted run; that of other captures is not used.
-    """
-
-    def __init__(self, out: Path, *made_of: str) -> None:
-        self.path = out.with_name(f"{out.name}.unfinished.json")
-        self._made_of, self._steps = made_of, dict[str, Step]()
-        if self.path.exists():
-            try:
-                saved = Steps.model_validate_json(read_bounded(self.path))
-            except ValidationError:
-                what = "is not the file of an interrupted `brushloop twin`: move it away"
-                raise CalibrationError(str(self.path), what) from None
-            if saved.made_of == made_of:
-                self._steps |= saved.steps
-
-    def known(self, name: str, work: Callable[[], Found]) -> Found:
-        """The result of a step, from the file or else from the work, which is then written. Raises OSError."""
-        if name in self._steps:
-            return Found(np.array(self._steps[name].point), self._steps[name].seed)
-        found = work()
-        self._steps[name] = Step(point=tuple(found.point.tolist()), seed=found.seed)
-        write_whole(self.path, Steps(made_of=self._made_of, steps=self._steps).model_dump_json(indent=1) + "\n")
-        return found
 
 
 def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> str:
@@ -89,7 +37,9 @@ def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[st
     yield f"# Made by `brushloop twin` ({made_by()}); press with it: brushloop sim --brush FILE."
     yield "# Everything that it presses is simulated. Intervals hold about 95 %: docs/loopback-brush.md."
     yield f'name = "simulated bristle bundle (twin of {plain[:60]}, simulated)"'
-    if noise_gray is not None:
+    if noise_gray is None:
+        yield "# The camera's noise was not measured: no two stills show the same view."
+    else:
         yield ""
         yield "[camera]"
         yield f"noise = {noise_gray:.2f}    # gray levels, from pairs of stills"
@@ -106,10 +56,13 @@ def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[st
     for one in twin.estimates:
         known = f"{one.low:.4g} to {one.high:.4g}" if one.determined else "not determined by these presses"
         unit = f"{one.constant.unit}; " if one.constant.unit else ""
-        yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}"
+        yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}; default {one.constant.default:.4g}"
     for row in twin.held_out:
-        yield f"# cells left out: {row.model}: CSIM {row.csim:.2f} %, SSIM {row.ssim:.2f} %, n = {row.n}"
-    if twin.spread is not None:
+        scores = f"CSIM {row.csim:.2f} %, SSIM {row.ssim:.2f} %, n = {row.n}"
+        yield f"# a third of the cells left out in turn: {row.model}: {scores}"
+    if twin.spread is None:
+        yield "# No cell has three captures: how presses differ is left as in the default brush."
+    else:
         yield (
             f"# two presses of a cell: CSIM {twin.spread.captured_percent:.2f} % captured, "
             f"{twin.spread.twin_percent:.2f} % from the twin"

@@ -14,8 +14,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
+from brushloop.calibrate.store import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.sessions.terminal import Progress, unseen
 from brushloop.twin.brush import (
@@ -36,6 +38,7 @@ from brushloop.twin.search import (
     FINE,
     Found,
     Repeats,
+    Round,
     Spread,
     Target,
     choose_individual,
@@ -66,8 +69,6 @@ MARGIN_MM = 0.8
 and other presses differ."""
 LEAST_MISPLACED_MM = 1.6
 """The limit of the quality checks by default: a smaller one is not needed."""
-Known = Callable[[str, Callable[[], Found]], Found]
-"""The result of a step by its name: that of an interrupted run, or else that of the work, which is then kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +155,9 @@ def fit_twin(
     length_mm: float,
     pool: Executor,
     progress: Progress = unseen,
-    known: Known = lambda _name, work: work(),
+    store: Store | None = None,
 ) -> Twin:
-    """Fit the twin of a brush of this size to its presses.
+    """Fit the twin of a brush of this size to its presses. Passes of the search that the store holds are not repeated.
 
     Raises ValueError for a press that is deeper than a brush of this size allows.
     """
@@ -164,8 +165,8 @@ def fit_twin(
     means = np.asarray([np.mean([press.ink for press in group], axis=0) for group in cells.values()], np.float32)
     target = Target(BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0), tuple(cells), grid, means)
     parts = parts_of(target.cells)
-    searches = _Searches(pool, known, progress, 1 + len(parts))
-    found = searches.coarse("all cells", target)
+    searches = _Searches(pool, store, progress, 1 + len(parts))
+    found = searches.coarse(target)
     several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST_REPEATS}
     repeats = Repeats(tuple(several), tuple(np.array([press.ink for press in group]) for group in several.values()))
     spread: Spread | None = None
@@ -173,15 +174,15 @@ def fit_twin(
         spread = fit_spread(_brush(found, target), offset_at(found.point), repeats, grid, pool.map)
         # hairs that stray make every mark wider and its ends fainter: the shape is fitted to the captures with them
         target = replace(target, base=with_values(target.base, SPREAD, spread.point))
-    found = searches.fine("all cells", target, found)
+    found = searches.fine(target, found)
     variance = np.diagonal(covariance(target, found, pool))
     spec, offset = _brush(found, target), offset_at(found.point)
     if spread is not None:
         spread = fit_spread(spec, offset, repeats, grid, pool.map, spread.point)
     predicted, points = list[Predicted](), list[Vector]()
-    for number, part in enumerate(parts, 1):
-        name, others = f"part {number} left out", target.only([k for k in range(len(cells)) if k not in part])
-        there = searches.fine(name, others, searches.coarse(name, others))
+    for part in parts:
+        others = target.only([k for k in range(len(cells)) if k not in part])
+        there = searches.fine(others, searches.coarse(others))
         points.append(there.point)
         predicted += _predicted(cells, [target.cells[k] for k in part], there, target)
     errors = WIDER * np.sqrt(variance + of_parts(points))
@@ -194,31 +195,35 @@ def fit_twin(
 
 
 class _Searches:
-    """The searches of one twin; those that an interrupted run finished are not repeated."""
+    """The searches of one twin; passes that the store holds, as those of an interrupted run, are not repeated."""
 
-    def __init__(self, pool: Executor, known: Known, progress: Progress, twins: int) -> None:
-        self._pool, self._known, self._progress = pool, known, progress
+    def __init__(self, pool: Executor, store: Store | None, progress: Progress, twins: int) -> None:
+        self._pool, self._store, self._progress = pool, store, progress
         self._done, self._count = 0, twins * (2 + len(COARSE) + 1)
         progress("twin: passes of the search", 0, self._count)
 
-    def coarse(self, what: str, target: Target) -> Found:
-        found = self._step(f"{what}, first individual", lambda: choose_individual(target, start(), self._pool))
+    def coarse(self, target: Target) -> Found:
+        found = self._step(choose_individual, target, start())
         for one in COARSE:
-            before = found
-            name = f"{what}, blur {one.blur_mm:g} mm"
-            found = self._step(name, lambda one=one, before=before: search(target, before, one, self._pool))
+            found = self._step(search, target, found, one)
         return found
 
-    def fine(self, what: str, target: Target, found: Found) -> Found:
-        chosen = self._step(f"{what}, individual", lambda: choose_individual(target, found, self._pool))
-        name = f"{what}, blur {FINE.blur_mm:g} mm"
-        return self._step(name, lambda: search(target, chosen, FINE, self._pool))
+    def fine(self, target: Target, found: Found) -> Found:
+        return self._step(search, target, self._step(choose_individual, target, found), FINE)
 
-    def _step(self, name: str, work: Callable[[], Found]) -> Found:
-        found = self._known(name, work)
+    def _step(self, work: Callable[..., Found], target: Target, found: Found, *passes: Round) -> Found:
+        place = target.grid.x_mm, target.grid.y_mm, target.mean
+        key = key_of("twin", made_by(), passes, target.base, target.cells, *place, found.seed, found.point)
+        kept = None if self._store is None else self._store.get(key)
+        if kept is None:
+            result = work(target, found, *passes, self._pool)
+            if self._store is not None:
+                self._store.put(key, {"point": result.point, "seed": np.array(result.seed)})
+        else:
+            result = Found(kept["point"], int(kept["seed"]))
         self._done += 1
         self._progress("twin: passes of the search", self._done, self._count)
-        return found
+        return result
 
 
 def _brush(found: Found, target: Target) -> BrushSpec:

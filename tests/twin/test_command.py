@@ -21,7 +21,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.heldout import HeldOut
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead, load_brush
 from brushloop.twin.brush import SHAPE
-from brushloop.twin.file import Notes, noise_of, twin_toml
+from brushloop.twin.file import noise_of, twin_toml
 from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, workers
 from brushloop.twin.search import Found, Round
 from tests.photographed import imported_presses
@@ -77,7 +77,6 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     monkeypatch.setattr("brushloop.twin.run.search", counted)
     with pytest.raises(PowerCut):
         twin(session, out)
-    assert Notes(out).path.exists()
     assert not out.exists()
     assert searched == [1.0, 0.5]
 
@@ -86,7 +85,6 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
     unknown = "No cell has three captures", "The camera's noise was not measured"
     for words in ("friction", "a third of the cells left out in turn", "next: brushloop sim --brush", *unknown):
         assert words in said
-    assert not Notes(out).path.exists()
     assert load_brush(out).name == "simulated bristle bundle (twin of presses, simulated)"
     with pytest.raises(CalibrationError, match="exists: give --out FILE or --replace"):
         twin(session, out)
@@ -102,19 +100,8 @@ def test_a_twin_is_read_back_and_what_is_not_determined_has_no_interval(tmp_path
     assert (found.spec, found.noise_gray, found.head) == (spec, 1.23, SoundHead(2.2, 4.0))
     assert found.name == "simulated bristle bundle (twin of session ?1??, simulated)"
     lines = {line.split(" = ")[0]: line for line in path.read_text().splitlines()}
-    assert lines["friction"].endswith("# 0.1 to 0.4")
-    assert lines["set_deg"].endswith("# deg; not determined by these presses")
-
-
-def test_steps_of_other_captures_are_not_used_and_a_foreign_file_is_refused(tmp_path: Path) -> None:
-    found, other = (Found(np.full(len(SHAPE) + 3, at), seed) for at, seed in ((0.5, 4), (1.0, 5)))
-    out = tmp_path / "twin.toml"
-    Notes(out, "session a").known("all cells", lambda: found)
-    assert Notes(out, "session a").known("all cells", lambda: other).seed == 4
-    assert Notes(out, "session b").known("all cells", lambda: other).seed == 5
-    Notes(out).path.write_text('{"steps": 3}')
-    with pytest.raises(CalibrationError, match=r"twin\.toml\.unfinished\.json: is not the file of an interrupted"):
-        Notes(out, "session a")
+    assert lines["friction"].endswith("# 0.1 to 0.4; default 0.22")
+    assert lines["set_deg"].endswith("# deg; not determined by these presses; default 8")
 
 
 def still(sd: float, seed: int) -> np.ndarray:
