@@ -1,6 +1,6 @@
 """The neural stroke generator (the paper's CCD-BSMG): its training, and its images and outlines in numpy.
 
-Only `network` and `train` load torch.
+Only `train` loads torch.
 """
 
 from __future__ import annotations

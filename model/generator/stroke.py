@@ -1,6 +1,6 @@
 """A trained generator as a stroke model: its file, its images in numpy, and the outlines traced from them.
 
-Only training needs torch (`model.generator.network` is the same network there).
+Only training needs torch (`model.generator.train` has the same network).
 """
 
 from __future__ import annotations

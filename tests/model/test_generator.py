@@ -21,8 +21,8 @@ from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
 from brushloop.model.generator.card import likeness
 from brushloop.model.generator.config import MAX_WEIGHTS, PRESETS, Layers, Target, preset
 from brushloop.model.generator.data import exact_sets, sha256
-from brushloop.model.generator.network import Generator, covered, squared_error
 from brushloop.model.generator.stroke import load_generator, read_generator, traced
+from brushloop.model.generator.train import Generator, covered, squared_error
 from brushloop.model.raster import centred_origin, coverage
 
 MOST_BYTES = 10_000_000

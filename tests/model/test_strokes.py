@@ -16,8 +16,7 @@ from brushloop.model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
 from brushloop.model.outline import Outline
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import UnknownModelError, fit_plane, stroke_model, stroke_models
-from brushloop.model.strokes.peers import bezier, bounding_ellipse, circle, line
-from brushloop.model.strokes.qbc import qbc
+from brushloop.model.strokes.peers import bezier, bounding_ellipse, circle, line, qbc
 
 MODELS = stroke_models(Brush())
 NAMES = ["ccd-bsm", "bezier", "circle", "ellipse", "line", "qbc"]

@@ -25,9 +25,8 @@ from brushloop.model.generator.card import read_curves
 from brushloop.model.generator.cli import Bar, app
 from brushloop.model.generator.config import TrainConfig, checked, load_config
 from brushloop.model.generator.data import load_captures, save_captures, split
-from brushloop.model.generator.network import Generator
 from brushloop.model.generator.stroke import load_generator
-from brushloop.model.generator.train import converged, new_network, run_training
+from brushloop.model.generator.train import Generator, converged, new_network, run_training
 
 TINY: dict[str, Any] = {
     "target": {"px_mm": 0.8, "size_px": 32},
