@@ -82,10 +82,9 @@ class ForceBoard:
             my,
             mz,
         )
-        left_out = {"no-first": 0, "no-second": 1, "no-third": 2}
         for place, (can_id, data) in enumerate(encode_round(wrench)):
-            if fault is None or left_out.get(fault) != place:
-                yield CanFrame(can_id, data[:4] if fault == "short" and place == 1 else data)
+            if fault != "no-second" or place != 1:
+                yield CanFrame(can_id, data)
 
 
 FRAME_S = 0.0002

@@ -121,12 +121,10 @@ STOPS = frozenset({"protective-stop", "emergency-stop", "safeguard-stop"})
 
 KINDS: dict[Device, frozenset[str]] = {
     Device.ROBOT: LOST | REPLIES | STOPS,
-    Device.TELEMETRY: frozenset({"mute", "late", "malformed", "drop"}),
-    Device.CAMERA: frozenset({"stale", "black", "frozen", "torn", "drop"}),
+    Device.TELEMETRY: frozenset({"mute", "late"}),
+    Device.CAMERA: frozenset({"stale", "black", "frozen", "torn"}),
     Device.INK: frozenset({"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}),
-    Device.FORCE: frozenset(
-        {"silence", "no-first", "no-second", "no-third", "short", "nan", "inf", "bus-error", "bus-off", "stuck"}
-    ),
+    Device.FORCE: frozenset({"silence", "no-second", "nan", "inf", "bus-error", "bus-off", "stuck"}),
 }
 """What each kind does is in docs/faults.md."""
 

@@ -124,8 +124,6 @@ class MjpegServer(LoopbackServer):
         shown = b""
         while True:
             match self._fault():
-                case "drop":
-                    return
                 case "stale":
                     held.append(await self._jpeg(line))
                 case "black":

@@ -15,7 +15,7 @@ from typing import Any
 
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
-from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, encode_short, named
+from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, named
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.server import LoopbackServer
@@ -215,8 +215,6 @@ def _error(ident: object, code: int, message: str) -> bytes:
 MAX_HZ = 500.0
 BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
-MALFORMED = b"\xff\x81"
-"""A CBOR break instead of a value: neither CBOR nor JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,17 +299,11 @@ class RtdeServer(LoopbackServer):
 
     def _push_once(self, topic: Topic, writer: asyncio.StreamWriter, rest: Rest | None = None) -> None:
         fault = self.faults.meet(Device.TELEMETRY, "push", KINDS[Device.TELEMETRY])
-        match fault.kind if fault is not None else "":
-            case "mute":
-                pass
-            case "malformed":
-                writer.write(encode_short(MALFORMED))
-            case "drop":
-                writer.close()
-            case kind:
-                sample = encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments])
-                late_s = fault.late_s if fault is not None and kind == "late" else 0.0
-                asyncio.get_running_loop().call_later(late_s, self._send, writer, sample)
+        if fault is not None and fault.kind == "mute":
+            return
+        sample = encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments])
+        late_s = 0.0 if fault is None else fault.late_s
+        asyncio.get_running_loop().call_later(late_s, self._send, writer, sample)
 
     @staticmethod
     def _send(writer: asyncio.StreamWriter, sample: bytes) -> None:
