@@ -101,8 +101,8 @@ def put_to_use(artefact: Artefact, session: Path, folder: str = FOLDER) -> Path:
 
 def artefacts(session: Path, folder: str = FOLDER) -> list[Path]:
     """Every artefact in `folder` of a session, oldest first."""
-    found = (path for path in (session / folder).glob("*.json") if path.is_file())
-    return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+    paths = (path for path in (session / folder).glob("*.json") if path.is_file())
+    return sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
 
 def current(session: Path, folder: str = FOLDER) -> Path | None:

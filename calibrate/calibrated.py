@@ -50,12 +50,13 @@ class Calibrated:
 
     def lines(self) -> list[str]:
         """What the command prints."""
-        found = self.calibration
+        calibration = self.calibration
+        low, high = calibration.mm_per_px_low, calibration.mm_per_px_high
         return [
-            *(f"warning: {flag}" for flag in found.flags),
-            f"pix2len {found.mm_per_px:.5f} mm/px (95 %: {found.mm_per_px_low:.5f} to {found.mm_per_px_high:.5f}), "
-            f"board residual {found.rms_px:.3f} px over {found.corners} corners, {found.source}",
-            f"lens: {found.lens.source if found.lens else 'none'}",
+            *(f"warning: {flag}" for flag in calibration.flags),
+            f"pix2len {calibration.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
+            f"board residual {calibration.rms_px:.3f} px over {calibration.corners} corners, {calibration.source}",
+            f"lens: {calibration.lens.source if calibration.lens else 'none'}",
             str(self.path),
             f"Page: {self.page}",
         ]
@@ -112,46 +113,46 @@ def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path
     A calibration of another recording is refused without `force`; with it, a new artefact names the origin and the
     error of this session's board under it. Raises `CalibrationError`.
     """
-    recording, given = Recording(session), load_artefact(path, Calibration)
+    recording, other = Recording(session), load_artefact(path, Calibration)
     folder = recording.path.parent
     if recording.header.source.imported:
         raise CalibrationError(str(recording.path), "is an import and has its own scale: no calibration can be applied")
-    if given.recording_sha256 == recording.sha256:
-        return put_to_use(given, folder)
+    if other.recording_sha256 == recording.sha256:
+        return put_to_use(other, folder)
     if force:
-        return put_to_use(_labelled(given, recording), folder)
-    problem = f"belongs to another recording ({given.session_id}); --force applies it, and labels every result"
+        return put_to_use(_labelled(other, recording), folder)
+    problem = f"belongs to another recording ({other.session_id}); --force applies it, and labels every result"
     raise CalibrationError(str(path), problem)
 
 
-def _labelled(given: Calibration, recording: Recording) -> Calibration:
-    origin = given.foreign or Foreign(
-        digest=given.digest,
-        session_id=given.session_id,
-        source=given.source,
-        recording_sha256=given.recording_sha256,
+def _labelled(other: Calibration, recording: Recording) -> Calibration:
+    origin = other.foreign or Foreign(
+        digest=other.digest,
+        session_id=other.session_id,
+        source=other.source,
+        recording_sha256=other.recording_sha256,
         board_off_mm=None,
     )
-    return given.model_copy(
+    return other.model_copy(
         update={
-            "schema_version": type(given).model_fields["schema_version"].default,
+            "schema_version": type(other).model_fields["schema_version"].default,
             "session_id": recording.header.session_id,
             "source": recording.header.source,
             "recording_sha256": recording.sha256,
-            "foreign": origin.model_copy(update={"board_off_mm": _board_off_mm(given, recording)}),
+            "foreign": origin.model_copy(update={"board_off_mm": _board_off_mm(other, recording)}),
         }
     )
 
 
-def _board_off_mm(given: Calibration, recording: Recording) -> float | None:
+def _board_off_mm(other: Calibration, recording: Recording) -> float | None:
     """Root mean square error of this session's last board under the calibration; None if none is seen."""
     spec, where = board_of(recording), str(recording.path)
     off_mm: float | None = None
     for _, image in board_stills(recording):
-        given.lens.check_size(image, where)
+        other.lens.check_size(image, where)
         try:
             view = find_board(image, spec, where)
         except CalibrationError:
             continue
-        off_mm = rms(given.to_paper(view.pixels) - paper_mm(view, spec))
+        off_mm = rms(other.to_paper(view.pixels) - paper_mm(view, spec))
     return off_mm

@@ -38,8 +38,8 @@ def board(
     """Write a printable board as a PDF at true scale, with a ruler to check the print."""
     from brushloop.calibrate.board.spec import describe, write_pdf
 
-    made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
-    say(f"{write_pdf(made, out, page)}: {describe(made)}")
+    target = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    say(f"{write_pdf(target, out, page)}: {describe(target)}")
 
 
 @app.command()
@@ -64,21 +64,21 @@ def intrinsics(
     from brushloop.calibrate.pages.camera import MAX_THUMBNAILS, Thumbnail, thumbnail, write_lens_page
     from brushloop.sessions.terminal import counted, shown
 
-    made = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    target = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
     seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
     small = dict[str, Thumbnail]()
-    given = named(photographs)
+    paths = named(photographs)
     with shown() as progress:
-        for name, path in counted(given.items(), "photographs searched for the board", len(given), progress):
+        for name, path in counted(paths.items(), "photographs searched for the board", len(paths), progress):
             image = read_gray(path)
             if len(small) < MAX_THUMBNAILS:
                 small[name] = thumbnail(image)
             digests[name] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
             try:
-                seen.append(find_board(image, made, name))
+                seen.append(find_board(image, target, name))
             except CalibrationError as error:
                 unusable[name] = error.what
-    file = fit_lens(seen, describe(made), digests, unusable, limit_px)
+    file = fit_lens(seen, describe(target), digests, unusable, limit_px)
     for name, residual in file.residuals_px.items():
         say(f"{name}: {residual:.3f} px, slanted by {file.slants_deg[name]:.0f} deg")
     for name, residual in file.dropped.items():
@@ -143,20 +143,20 @@ def drift(
     recording = Recording(session)
     known = known_lens(recording, lens)
     with shown() as progress:
-        found = board_over_session(recording, board_of(recording), known, progress)
-    for seen in found.seen:
+        measured = board_over_session(recording, board_of(recording), known, progress)
+    for seen in measured.seen:
         low, high = (seen.mm_per_px * (1.0 + side * seen.reach) for side in (-1.0, 1.0))
-        after_s = (seen.t_ns - found.seen[0].t_ns) / 1e9
+        after_s = (seen.t_ns - measured.seen[0].t_ns) / 1e9
         say(
             f"{after_s:8.0f} s: {seen.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
             f"residual {seen.plane.rms_px:.3f} px, board moved {seen.moved_px:.2f} px"
         )
-    if found.trend is not None:
-        low, high = found.trend.interval
-        say(f"trend {100 * found.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
-    for warning in found.warnings:
+    if measured.trend is not None:
+        low, high = measured.trend.interval
+        say(f"trend {100 * measured.trend.slope:+.4f} % per hour (95 %: {100 * low:+.4f} to {100 * high:+.4f})")
+    for warning in measured.warnings:
         say(f"warning: {warning}")
-    if found.warnings:
+    if measured.warnings:
         raise typer.Exit(5)
 
 

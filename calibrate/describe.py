@@ -29,10 +29,10 @@ KINDS: dict[str, type[Artefact]] = {
 def read_any(path: Path) -> tuple[Path, Artefact]:
     """Read an artefact, or the calibration that a session uses; returns its path too. Raises `CalibrationError`."""
     if path.is_dir():
-        found = current(path)
-        if found is None:
+        used = current(path)
+        if used is None:
             raise CalibrationError(str(path), f"is not calibrated: run `brushloop calibrate {path}`")
-        path = found
+        path = used
     try:
         values: Any = json.loads(read_bounded(path))
     except (ValueError, RecursionError):

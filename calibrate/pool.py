@@ -107,8 +107,8 @@ def _workers(client: Any, address: str) -> int:
     threads: dict[str, int] = client.nthreads()
     if not threads:
         raise ClusterError(f"--scheduler {address}: the cluster has no worker")
-    found: dict[str, Any] = client.run(software, on_error="return")
-    for worker, answer in found.items():
+    answers: dict[str, Any] = client.run(software, on_error="return")
+    for worker, answer in answers.items():
         if answer != software():
             words = one_line(answer) if isinstance(answer, BaseException) else f"has {answer}"
             raise ClusterError(f"--scheduler {address}: worker {worker} {words}; {software()} is needed there")

@@ -210,7 +210,7 @@ def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, f
     count = min(int(ways.max()) + 1, MOST_LEFT_OUT)
     left_out = (ways % count).tolist()
     without = [solve([v for v, out in zip(views, left_out, strict=True) if out != k], where) for k in range(count)]
-    focal = np.array([one.lens.matrix[:2] for one in without])
+    focal = np.array([solved.lens.matrix[:2] for solved in without])
     spread = np.sqrt((count - 1) / count * ((focal - focal.mean(axis=0)) ** 2).sum(axis=0))
     return float(spread[0]), float(spread[1])
 
@@ -242,15 +242,15 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
 def named(photographs: Sequence[Path]) -> dict[str, Path]:
     """Photographs by unique name: the file's, with its folder if there are several, and a number if repeated."""
     folders = len({path.parent for path in photographs})
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for path in photographs:
         name = plain = f"{path.parent.name}/{path.name}" if folders > 1 else path.name
         number = 1
-        while name in found:
+        while name in paths:
             number += 1
             name = f"{plain} ({number})"
-        found[name] = path
-    return found
+        paths[name] = path
+    return paths
 
 
 def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
@@ -282,12 +282,12 @@ def nominal_normals(views: Sequence[BoardView]) -> Floats:
     They are rough, but a lens that was wrongly fitted to boards of one orientation cannot make them differ.
     """
     rays = np.linalg.inv(unknown_lens(views[0].size_px).camera)
-    found = list[Floats]()
+    normals = list[Floats]()
     for view in views:
         across, along, _ = (rays @ homography(view.board_mm, view.pixels, view.name)).T
         normal = np.cross(across, along)
-        found.append(normal / (np.linalg.norm(normal) * (-1.0 if normal[2] < 0.0 else 1.0)))
-    return np.array(found)
+        normals.append(normal / (np.linalg.norm(normal) * (-1.0 if normal[2] < 0.0 else 1.0)))
+    return np.array(normals)
 
 
 def reasons(why: Mapping[str, str]) -> list[str]:

@@ -145,12 +145,12 @@ def mixed_up(names: Sequence[str], robot_mm: Floats, seen_mm: Floats) -> str:
             f"fit only as in a mirror (off by {as_named:.1f} mm otherwise): were they named from the other side, or is "
             "the photograph mirrored?"
         )
-    found = list[tuple[float, str]]()
+    exchanges = list[tuple[float, str]]()
     for a, b in itertools.combinations(range(len(names)), 2):
         exchanged = robot_mm.copy()
         exchanged[[a, b]] = robot_mm[[b, a]]
-        found.append((_worst(exchanged, seen_mm), f"{names[a]} and {names[b]}"))
-    off_mm, pair = min(found)
+        exchanges.append((_worst(exchanged, seen_mm), f"{names[a]} and {names[b]}"))
+    off_mm, pair = min(exchanges)
     if off_mm > enough_mm:
         return ""
     return f"fit only if {pair} are swapped (off by {as_named:.1f} mm otherwise): one was touched in the other's place"

@@ -165,7 +165,7 @@ def _minimise(
         h0_mm = at_values(clipped).values[TOUCH[0]]
         return None if any(s.depth_mm + h0_mm <= 0.1 for s in strokes) else clipped
 
-    found = descend(
+    lowest = descend(
         equations,
         press.values[at],
         rounds=ROUNDS,
@@ -175,7 +175,7 @@ def _minimise(
         damping=DAMPING,
         feasible=feasible,
     )
-    return at_values(found.vector), found.at.cost
+    return at_values(lowest.vector), lowest.at.cost
 
 
 def _normal(

@@ -85,16 +85,16 @@ class Refit:
         cls, strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, prior: Prior | None = None
     ) -> Refit:
         """The fit to these presses, whose ink is on the grid."""
-        rows = inked_rows([one.ink for one in strokes], grid.px_mm)
-        inks = (to_pixels(np.asarray(one.ink[rows], np.float32)) / 255.0 for one in strokes)
-        cut = tuple(replace(one, ink=ink) for one, ink in zip(strokes, inks, strict=True))
+        rows = inked_rows([stroke.ink for stroke in strokes], grid.px_mm)
+        inks = (to_pixels(np.asarray(stroke.ink[rows], np.float32)) / 255.0 for stroke in strokes)
+        cut = tuple(replace(stroke, ink=ink) for stroke, ink in zip(strokes, inks, strict=True))
         return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior)
 
     @property
     def key(self) -> str:
         """Key in the store of finished work."""
         prior = () if self.prior is None else (self.prior.mean, self.prior.precision)
-        presses = (part for one in self.strokes for part in (one.depth_mm, one.tilt_deg, one.ink))
+        presses = (part for stroke in self.strokes for part in (stroke.depth_mm, stroke.tilt_deg, stroke.ink))
         return key_of("refit", self.radius_mm, self.length_mm, self.grid.x_mm, self.grid.y_mm, *prior, *presses)
 
 

@@ -85,7 +85,7 @@ def write_fit_page(
 def _window(captures: Captures, presses: tuple[FittedPress, ...]) -> tuple[float, float, float, float]:
     """The (left, top, width, height) in mm, y downward, that holds all ink and every outline."""
     grid = captures.grid
-    inked = np.any([one.ink > 0.5 for one in captures.strokes], axis=0)
+    inked = np.any([stroke.ink > 0.5 for stroke in captures.strokes], axis=0)
     x, y = grid.x_mm[inked.any(axis=0)], -grid.y_mm[inked.any(axis=1)]
     low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
     for loop in (_outline(press, cell) for press in presses for cell in by_cell(captures.strokes)):
@@ -98,7 +98,7 @@ def _window(captures: Captures, presses: tuple[FittedPress, ...]) -> tuple[float
 
 def _cell(cell: Cell, strokes: list[Pressed], press: FittedPress, published: FittedPress, grid: Grid) -> dict[str, Any]:
     """One picture: the mean ink of the cell's presses, and both outlines as SVG paths in mm."""
-    mean = np.mean([one.ink for one in strokes], axis=0).astype(np.float32)
+    mean = np.mean([stroke.ink for stroke in strokes], axis=0).astype(np.float32)
     left, top = float(grid.x_mm[0]) - 0.5 * grid.px_mm, -float(grid.y_mm[0]) - 0.5 * grid.px_mm
     across, down = len(grid.x_mm) * grid.px_mm, len(grid.y_mm) * grid.px_mm
     return {
@@ -121,7 +121,7 @@ def _csim(press: FittedPress, cell: Cell, strokes: list[Pressed], grid: Grid) ->
         return ""
     if not drawn.any():
         return ""
-    seen = [np.asarray(one.ink > 0.5, np.float32) for one in strokes]
+    seen = [np.asarray(stroke.ink > 0.5, np.float32) for stroke in strokes]
     return f"{100.0 * np.mean([csim(drawn, image) for image in seen if image.any()]):.1f}"
 
 
@@ -148,7 +148,7 @@ def _sizes(captures: Captures, press: FittedPress, label: str) -> str:
     figure, axes = plot(1, 2, (10.0, 3.6))
     strokes, grid = captures.strokes, captures.grid
     heights = np.linspace(min(s.depth_mm for s in strokes), max(s.depth_mm for s in strokes), SMOOTH_POINTS)
-    tilts = sorted({one.tilt_deg for one in strokes})
+    tilts = sorted({stroke.tilt_deg for stroke in strokes})
     shown = tilts if len(tilts) <= len(COLOURS) else [tilts[0], tilts[len(tilts) // 2], tilts[-1]]
     for tilt, colour in zip(shown, COLOURS, strict=False):
         pressed = [(s.depth_mm, *measure(s, grid)) for s in strokes if s.tilt_deg == tilt]

@@ -63,15 +63,15 @@ def write_calibration_page(recording: Recording, path: Path) -> Path:
 
     Raises `CalibrationError` where the recording shows no board, and OSError.
     """
-    made = load_artefact(path, Calibration)
+    calibration = load_artefact(path, Calibration)
     where = str(recording.path)
-    image = _photograph(recording, made, where)
-    seen = find_board(image, made.board, where)
-    expected = made.to_image(paper_mm(seen, made.board))
+    image = _photograph(recording, calibration, where)
+    seen = find_board(image, calibration.board, where)
+    expected = calibration.to_image(paper_mm(seen, calibration.board))
     off = seen.pixels - expected
     size = np.linalg.norm(off, axis=1)
     dropped = np.zeros(len(size), np.bool_)
-    dropped[np.argsort(-size)[: made.corners_dropped]] = True
+    dropped[np.argsort(-size)[: calibration.corners_dropped]] = True
     sheet_mm = rig_of(recording).sheet_mm
     frame = about(recording.header)
     label = frame["label"]
@@ -80,21 +80,21 @@ def write_calibration_page(recording: Recording, path: Path) -> Path:
         "calibration.html.j2",
         **frame,
         session=recording.header.session_id,
-        picture=_picture(image, seen.pixels, expected, off, dropped, made, sheet_mm),
-        verdict=list(_verdict(made)),
-        trust=[source_point(recording.header.source), *_trust(made)],
+        picture=_picture(image, seen.pixels, expected, off, dropped, calibration, sheet_mm),
+        verdict=list(_verdict(calibration)),
+        trust=[source_point(recording.header.source), *_trust(calibration)],
         residuals=_residuals(off, dropped, label),
-        scale=_scale(made, image.shape[1], image.shape[0], sheet_mm, label),
+        scale=_scale(calibration, image.shape[1], image.shape[0], sheet_mm, label),
         worst=_worst(seen.ids.tolist(), size, dropped),
-        facts=list(_facts(made, path)),
+        facts=list(_facts(calibration, path)),
     )
 
 
-def _photograph(recording: Recording, made: Calibration, where: str) -> Gray:
+def _photograph(recording: Recording, calibration: Calibration, where: str) -> Gray:
     stills = [still for _, still in recording.stills_of("board")]
     if not stills:
         raise CalibrationError(where, NO_BOARD)
-    used = [still for still in stills if hashlib.sha256(still).hexdigest() == made.still_sha256]
+    used = [still for still in stills if hashlib.sha256(still).hexdigest() == calibration.still_sha256]
     return decode_gray((used or stills)[-1], where)
 
 
@@ -104,7 +104,7 @@ def _picture(
     expected: Floats,
     off: Floats,
     dropped: Mask,
-    made: Calibration,
+    calibration: Calibration,
     sheet_mm: tuple[float, float] | None,
 ) -> dict[str, Any]:
     """What the template draws over the photograph, in its pixels."""
@@ -113,8 +113,8 @@ def _picture(
     ends = expected + times * off
     rows = zip(seen.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
     corners = [
-        {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*one)), 2), "dropped": bool(out)}
-        for (at, start, end), one, out in zip(rows, off, dropped, strict=True)
+        {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*residual)), 2), "dropped": bool(out)}
+        for (at, start, end), residual, out in zip(rows, off, dropped, strict=True)
     ]
     return {
         "uri": photograph_uri(image),
@@ -123,7 +123,7 @@ def _picture(
         "unit": round(width / 1000, 2),
         "times": f"{times:g}",
         "corners": corners,
-        "sheet": [] if sheet_mm is None else _outline(made, sheet_mm),
+        "sheet": [] if sheet_mm is None else _outline(calibration, sheet_mm),
     }
 
 
@@ -136,55 +136,56 @@ def _times(expected: Floats, off: Floats) -> float:
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))
 
 
-def _outline(made: Calibration, sheet_mm: tuple[float, float]) -> list[list[float]]:
+def _outline(calibration: Calibration, sheet_mm: tuple[float, float]) -> list[list[float]]:
     """The sheet's edge in the photograph; its sides are bent where the lens bends them."""
     x, y = sheet_mm
     corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]])
     along = np.linspace(0.0, 1.0, SIDE_POINTS)[:-1, None]
     sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    return made.to_image(np.concatenate(sides)).round(1).tolist()
+    return calibration.to_image(np.concatenate(sides)).round(1).tolist()
 
 
-def _verdict(made: Calibration) -> Iterator[str]:
-    reach = _reach(made)
+def _verdict(calibration: Calibration) -> Iterator[str]:
+    reach = _reach(calibration)
     yield (
-        f"One pixel is {made.mm_per_px:.5f} mm of paper in the middle of the board, known to ±{100 * reach:.3f} % "
-        f"(95 %, if the board is printed to scale): 20 mm are known to ±{20 * reach:.4f} mm."
+        f"One pixel is {calibration.mm_per_px:.5f} mm of paper in the middle of the board, known to "
+        f"±{100 * reach:.3f} % (95 %, if the board is printed to scale): 20 mm are known to ±{20 * reach:.4f} mm."
     )
     yield (
-        f"{made.corners} corners lie {made.rms_px:.2f} px ({made.rms_px * made.mm_per_px:.3f} mm) from where the "
-        "fitted plane puts them (root mean square)."
+        f"{calibration.corners} corners lie {calibration.rms_px:.2f} px "
+        f"({calibration.rms_px * calibration.mm_per_px:.3f} mm) from where the fitted plane puts them "
+        "(root mean square)."
     )
 
 
-def _trust(made: Calibration) -> Iterator[Point]:
-    residual = f"The residual is {made.rms_px:.2f} px; {FLAT_PX}, and above {RMS_LIMIT_PX:g} px it warns."
-    yield Point(made.rms_px <= RMS_LIMIT_PX, residual)
-    reach = _reach(made)
+def _trust(calibration: Calibration) -> Iterator[Point]:
+    residual = f"The residual is {calibration.rms_px:.2f} px; {FLAT_PX}, and above {RMS_LIMIT_PX:g} px it warns."
+    yield Point(calibration.rms_px <= RMS_LIMIT_PX, residual)
+    reach = _reach(calibration)
     yield Point(reach <= WORST_INTERVAL, f"Scale known to ±{100 * reach:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
-    sharp = 1.0 / made.mm_per_px
+    sharp = 1.0 / calibration.mm_per_px
     yield Point(sharp >= LEAST_PX_PER_MM, f"{sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
-    if made.corners_dropped:
-        many = f"{made.corners_dropped} corners do" if made.corners_dropped > 1 else "One corner does"
+    if calibration.corners_dropped:
+        many = f"{calibration.corners_dropped} corners do" if calibration.corners_dropped > 1 else "One corner does"
         yield Point(
             False,
             f"{many} not lie on the plane of the others. The fit leaves out the corners that are crossed in blue.",
         )
     else:
         yield Point(True, "No corner was left out.")
-    if made.lens.source == FITTED:
+    if calibration.lens.source == FITTED:
         words = "No lens file: k1 was fitted on this one board and is known only where corners were seen."
         yield Point(None, words)
     else:
-        yield Point(True, f"Seen through the {made.lens.source}; k1 was refitted for this focus.")
-    for flag in made.flags:
+        yield Point(True, f"Seen through the {calibration.lens.source}; k1 was refitted for this focus.")
+    for flag in calibration.flags:
         yield Point(False, f"{flag[0].upper()}{flag[1:]}.")
-    if made.label:
-        yield Point(False, f"{made.label[0].upper()}{made.label[1:]}.")
+    if calibration.label:
+        yield Point(False, f"{calibration.label[0].upper()}{calibration.label[1:]}.")
 
 
-def _reach(made: Calibration) -> float:
-    return (made.mm_per_px_high - made.mm_per_px_low) / (2.0 * made.mm_per_px)
+def _reach(calibration: Calibration) -> float:
+    return (calibration.mm_per_px_high - calibration.mm_per_px_low) / (2.0 * calibration.mm_per_px)
 
 
 def _residuals(off: Floats, dropped: Mask, label: str) -> str:
@@ -201,15 +202,15 @@ def _residuals(off: Floats, dropped: Mask, label: str) -> str:
     return plot_uri(figure)
 
 
-def _scale(made: Calibration, width: int, height: int, sheet_mm: tuple[float, float] | None, label: str) -> str:
+def _scale(calibration: Calibration, width: int, height: int, sheet_mm: tuple[float, float] | None, label: str) -> str:
     """Contours of mm per pixel across the photograph."""
     figure, axis = plot(1, 1, (5.6, 4.4))
     across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
-    scale = np.array([[local_scale(made.to_paper, np.array([x, y])) for x in across] for y in down])
+    scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
     lines = axis.contour(across, down, scale, levels=8, colors=BLUE, linewidths=0.9)
     axis.clabel(lines, fontsize=8, fmt="%.4f")
     if sheet_mm is not None:
-        outline = np.array(_outline(made, sheet_mm))
+        outline = np.array(_outline(calibration, sheet_mm))
         axis.plot(*np.vstack([outline, outline[:1]]).T, color="0.5", lw=1.2)
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
@@ -223,15 +224,15 @@ def _worst(ids: list[int], size: Floats, dropped: Mask) -> list[tuple[str, str, 
     return [(str(name), f"{px:.2f}", "left out" if out else "used") for name, px, out in rows[:10]]
 
 
-def _facts(made: Calibration, path: Path) -> Iterator[tuple[str, str]]:
-    yield "session", made.session_id
-    yield "source", made.source
-    yield "recording", f"sha256 {made.recording_sha256}"
-    yield "photograph of the board", f"sha256 {made.still_sha256}"
-    yield "board", describe(made.board)
-    yield "lens", f"{made.lens.source}; k1 {made.lens.distortion[0]:+.4f}"
-    yield "95 % interval", f"{made.mm_per_px_low:.5f} to {made.mm_per_px_high:.5f} mm/px"
-    yield "calibrated with", made.software
+def _facts(calibration: Calibration, path: Path) -> Iterator[tuple[str, str]]:
+    yield "session", calibration.session_id
+    yield "source", calibration.source
+    yield "recording", f"sha256 {calibration.recording_sha256}"
+    yield "photograph of the board", f"sha256 {calibration.still_sha256}"
+    yield "board", describe(calibration.board)
+    yield "lens", f"{calibration.lens.source}; k1 {calibration.lens.distortion[0]:+.4f}"
+    yield "95 % interval", f"{calibration.mm_per_px_low:.5f} to {calibration.mm_per_px_high:.5f} mm/px"
+    yield "calibrated with", calibration.software
     yield "artefact", path.name
 
 

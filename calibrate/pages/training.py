@@ -76,13 +76,13 @@ def _note(config: TrainConfig) -> str:
 
 def _samples(folder: Path) -> Iterator[dict[str, Any]]:
     """Target, network and difference of each stroke that the training kept, the worst first."""
-    found = load_samples(folder)
-    targets, images = (list(np.asarray(stack, np.float32)) for stack in (found.targets, found.drawn))
+    samples = load_samples(folder)
+    targets, images = (list(np.asarray(stack, np.float32)) for stack in (samples.targets, samples.drawn))
     scores = [_score(target, drawn) for target, drawn in zip(targets, images, strict=True)]
     for k in sorted(range(len(scores)), key=lambda k: scores[k]):
         target, drawn = targets[k], images[k]
         yield {
-            "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, found.inputs[k], strict=True)),
+            "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, samples.inputs[k], strict=True)),
             "csim": f"{100.0 * scores[k]:.2f}",
             "images": {
                 "target": ink_uri(target),
