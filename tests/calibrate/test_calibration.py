@@ -29,6 +29,7 @@ from brushloop.sessions.records import Stroke
 from tests.calibrate.given import CALIBRATION
 from tests.calibrate.simulated_rigs import board_of
 from tests.command import brushloop
+from tests.photographed import imported_presses
 
 if TYPE_CHECKING:
     from conftest import Photographed
@@ -105,6 +106,15 @@ def test_a_mirrored_board_is_refused_and_half_a_board_is_flagged(
         path = current(session)
         assert path is not None
         assert any("partly hidden" in flag for flag in load_artefact(path, Calibration).flags) is warned
+
+
+def test_an_import_has_its_own_scale(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    pressed = imported_presses(tmp_path / "photos", tmp_path / "s", [(11.0, 0.0)], (300, 480), (380, 150))
+    for ran in (run(pressed), run("apply", CALIBRATION.save(tmp_path), pressed)):
+        assert isinstance(ran.exception, CalibrationError)
+        assert "is an import and has its own scale" in str(ran.exception)
+    assert not (pressed / "calibration").exists()
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(

@@ -186,10 +186,10 @@ def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Pa
     assert prepared.anchor_px == pytest.approx([20.0 * (at + 16.0) for at in Field().anchor_mm], abs=20.0)
 
 
-def test_a_start_outside_its_page_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "pages").mkdir()
-    page = imported_presses(tmp_path / "pages", tmp_path / "page", CELLS[:1], (300, 480), (380, 150))
-    [capture] = Recording(page).captures()
+def test_a_start_outside_its_page_is_refused_and_a_photograph_that_cannot_be_read(session: Path) -> None:
+    capture = next(Recording(session).captures())
+    torn = presses.PrepareJob(replace(capture, still_png=capture.still_png[:100]), None, Field())
+    assert list(presses.prepare_job(torn)) == ["refused"]
     stroke = capture.stroke.model_copy(update={"anchor_px": (9000.0, 150.0)})
     with pytest.raises(CaptureRefused, match="none of it is in the field"):
         presses.crop(replace(capture, stroke=stroke), None)

@@ -8,7 +8,7 @@ from brushloop.calibrate.fit.captures import FEWEST_CELLS, Grid, Pressed, sizes_
 from brushloop.calibrate.fit.fit import draw, fit_presses, zero_touches
 from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
 from brushloop.calibrate.fit.prior import learned, spreads
-from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.stats import CEILING, student_95
 from brushloop.model.fitted import NAMES, PARAMETERS, FittedPress, published
 
 PX_MM = 0.4
@@ -79,6 +79,9 @@ def test_a_correction_knows_how_far_the_earlier_fit_may_be_off() -> None:
     assert errors_mm.shape == (len(CELLS), 2)
     for estimate in touch_estimates(touches_mm, errors_mm):
         assert estimate.low < 0.0 < estimate.high
+    # By hand: errors of 1 mm in five cells, a plane of three numbers through them, and one cell touched now.
+    lift, _ = touch_estimates(np.zeros((1, 2)), np.ones((5, 2)))
+    assert lift.high == pytest.approx(student_95(5) * np.sqrt(1.0 + 3.0 / 5.0))
 
 
 def test_sizes_of_marks_are_those_of_the_brush_with_intervals_that_narrow() -> None:
