@@ -13,6 +13,7 @@ from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import FOLDER, BrushFit, correction, fit_session
 from brushloop.calibrate.fit.captures import read_presses
+from brushloop.calibrate.session import open_session
 from brushloop.calibrate.validate.report import load_report
 from brushloop.model.fitted import NAME, NAMES
 from tests.photographed import imported_presses
@@ -61,6 +62,8 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     assert same.lift_mm.value == pytest.approx(0.0, abs=0.3)
     assert same.lift_mm.low < 0.0 < same.lift_mm.high
     assert same.reference == "presses"
+    with pytest.raises(CalibrationError, match="holds presses, which `fit` takes without --drags"):
+        open_session(session, kind="drag")
 
     edited = path.with_name("0" * 16 + ".json")
     edited.write_bytes(path.read_bytes())
