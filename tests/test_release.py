@@ -1,22 +1,20 @@
-"""What is released works without the repository: the wheel, the source archive, and completion in shells."""
+"""What is released works without the repository, completes in shells, and is locked as the project asks."""
 
 from __future__ import annotations
 
 import os
-import pty
 import re
-import select
-import shutil
 import subprocess
 import sys
 import tarfile
-import time
+import tomllib
 import venv
+from importlib import metadata
 from pathlib import Path
 
 import pytest
-
-from tests.waiting import PATIENCE_S
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
 
@@ -83,45 +81,6 @@ def test_a_shell_is_given_what_completes_a_command(
     assert completed in run(command, cwd=tmp_path, _BRUSHLOOP_COMPLETE=f"complete_{shell}", **typed)
 
 
-LOAD = 'eval "$(brushloop --show-completion)"'
-SHELLS = [
-    ("bash", ["--norc", "--noprofile", "-i"], LOAD),
-    ("zsh", ["-f", "-i"], f"autoload -U compinit; compinit -u; {LOAD}"),
-]
-
-
-@pytest.mark.soak  # an interactive shell that starts brushloop twice
-@pytest.mark.parametrize(("shell", "options", "load"), SHELLS, ids=["bash", "zsh"])
-def test_tab_completes_a_command_in_a_shell(
-    command: Path, tmp_path: Path, shell: str, options: list[str], load: str
-) -> None:
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
-    here, there = pty.openpty()
-    path = f"{command.parent}:{os.environ['PATH']}"
-    environment = {"PATH": path, "HOME": str(tmp_path), "TERM": "dumb", "LANG": "C.UTF-8", "PS1": "> "}
-    started = {"stdin": there, "stdout": there, "stderr": there, "start_new_session": True}
-    with subprocess.Popen([shell, *options], env=environment, cwd=tmp_path, **started) as process:
-        os.close(there)
-        try:
-            os.write(here, f'{load}; echo rea""dy\n'.encode())
-            read_until(here, b"ready\r\n")
-            os.write(here, b"brushloop ses\t")
-            read_until(here, b"brushloop sessions ")
-        finally:
-            process.kill()
-            os.close(here)
-
-
-def read_until(terminal: int, words: bytes) -> None:
-    """Read what a terminal shows until it shows these words; fails after `PATIENCE_S`."""
-    shown, deadline = b"", time.monotonic() + PATIENCE_S
-    while words not in shown:
-        assert time.monotonic() < deadline, shown
-        if select.select([terminal], [], [], 1.0)[0]:
-            shown += os.read(terminal, 4096)
-
-
 FOLDERS = ("calibrate", "collect", "drivers", "model", "sessions", "twin")
 OF_ANOTHER_PROJECT = """
 import model
@@ -179,3 +138,53 @@ def test_a_labs_own_tests_get_a_rig_and_its_twin(brushloop: Path, tmp_path: Path
     path = f"{brushloop.parent}:{os.environ['PATH']}"
     said = run(brushloop.with_name("python"), "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=tmp_path, PATH=path)
     assert "2 passed" in said
+
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def locked(name: str) -> dict[str, str]:
+    text = (ROOT / "requirements" / name).read_text(encoding="utf-8")
+    lines = [Requirement(line) for line in text.splitlines() if line and not line.startswith("#")]
+    return {canonicalize_name(line.name): next(iter(line.specifier)).version for line in lines}
+
+
+def torch() -> dict[str, str]:
+    return dict(re.findall(r'"(torch)==([\d.]+)"', (ROOT / "requirements" / "install.py").read_text(encoding="utf-8")))
+
+
+def needed(requirements: list[str]) -> set[str]:
+    """The requirements and all that they require, as installed here."""
+    seen: set[tuple[str, frozenset[str]]] = set()
+    todo = [(Requirement(text), frozenset({""})) for text in requirements]
+    while todo:
+        requirement, extras = todo.pop()
+        if requirement.marker and not any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+            continue
+        name = canonicalize_name(requirement.name)
+        if (name, frozenset(requirement.extras)) not in seen:
+            seen.add((name, frozenset(requirement.extras)))
+            further = metadata.distribution(name).requires or []
+            todo += [(Requirement(text), frozenset({"", *requirement.extras})) for text in further]
+    return {name for name, _ in seen}
+
+
+def test_the_lock_for_running_holds_all_that_the_product_requires() -> None:
+    assert needed(PROJECT["dependencies"]) - {"setuptools"} <= locked("run.lock").keys() | torch().keys()
+
+
+@pytest.mark.parametrize("extra", ["", *PROJECT["optional-dependencies"]])
+def test_what_is_locked_is_what_the_project_asks_for(extra: str) -> None:
+    every = {**locked("run.lock"), **locked("dev.lock"), **torch()}
+    asked = PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"]
+    for requirement in map(Requirement, asked):
+        name = canonicalize_name(requirement.name)
+        if name == "gcsfs":  # not locked: nothing here can try it
+            continue
+        assert requirement.specifier.contains(every[name]), requirement
+
+
+def test_what_is_installed_here_is_what_is_locked() -> None:
+    for name, version in {**locked("run.lock"), **locked("dev.lock")}.items():
+        if name not in {"setuptools", "pyaubo-sdk"}:  # not needed or not offered for every Python
+            assert metadata.version(name) == version, name

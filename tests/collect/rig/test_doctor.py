@@ -1,4 +1,4 @@
-"""The doctor: what answers, what is wrong, how to put it right; and nothing is powered by asking."""
+"""The doctor: what answers, what is wrong, how to put it right; and the archive that it writes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,24 @@ from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.faults import Device, Fault
 from tests.command import brushloop
+
+if TYPE_CHECKING:
+    from conftest import Lab
+
+
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from brushloop.collect.rig.doctor import Finding
+from brushloop.collect.rig.report import write_report
+from brushloop.collect.rig.scrub import numbers_only, scrubber_of
+from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
+from tests.drivers.arcs.transcript import Archive
 
 if TYPE_CHECKING:
     from conftest import Lab
@@ -90,3 +108,99 @@ def test_a_cabinet_that_does_not_answer_ends_with_code_4_and_the_rest_is_reporte
         assert robot["remedy"]
     else:
         assert "no answer" in ran.stdout
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 9, 9, 9, 9, "/dev/serial/by-id/usb-lab-7")))
+    return path
+
+
+def test_an_archive_holds_what_every_device_answered(lab: Lab) -> None:
+    report = lab.folder / "report.zip"
+    ran = brushloop("doctor", "--config", lab.folder / "rig.toml", "--report", report)
+    assert ran.returncode == 0
+    assert "Read it before you send it" in ran.stdout
+    with zipfile.ZipFile(report) as archive:
+        document = json.loads(archive.read("report.json"))
+        rtde = json.loads(archive.read("rtde.json"))
+    assert [finding["device"] for finding in document["findings"]] == ["camera", "force", "ink", "robot"]
+    assert document["versions"]["brushloop"]
+    assert document["versions"]["numpy"]
+    assert document["platform"]["python"]
+    assert document["rig"]["robot"]["tcp_offset_mm"] == [0.0, 0.0, 180.0]
+    assert len(rtde["sample"]) == 2
+    lines = Archive.read(report).lines
+    answered = {line["method"]: line["answer"] for line in lines}
+    assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
+    assert answered["rob1.MotionControl.getSpeedFraction"]["result"] == 1.0
+    assert all(line["took_ms"] > 0.0 for line in lines)
+    assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
+    assert lab.rig.world.motion._next_id == 0
+
+
+async def test_a_controller_that_is_not_there_is_reported_as_such(rig: Path, tmp_path: Path) -> None:
+    finding = Finding("robot", "127.0.0.1:9", answers=False, problem="connect: 127.0.0.1:9: Connection refused")
+    await write_report(tmp_path / "report.zip", load_rig(rig), [finding])
+    archive = Archive.read(tmp_path / "report.zip")
+    assert [line["method"] for line in archive.lines] == ["connect"]
+    assert "refused" in archive.lines[0]["answer"]
+    assert "127.0.0.1" not in json.dumps([archive.robot, archive.lines])
+
+
+async def test_what_the_controller_refuses_is_kept_word_for_word(rig: Path, tmp_path: Path) -> None:
+    server = ArcsServer(World(SimConfig()))
+    await server.start("127.0.0.1", 0)
+    del server._methods["rob1.RobotConfig.getCollisionLevel"]
+    rig.write_text(rig.read_text().replace("port = 9\nrtde_port = 9", f"port = {server.port}"))
+    await write_report(tmp_path / "report.zip", load_rig(rig), [Finding("robot", "", answers=True)])
+    await server.stop()
+    [line] = [line for line in Archive.read(tmp_path / "report.zip").lines if "CollisionLevel" in line["method"]]
+    assert line["answer"]["error"]["code"] == -32601
+
+
+def test_names_addresses_paths_and_the_environment_stay_in_the_lab(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "arm7.lab.example")
+    monkeypatch.setenv("LOGNAME", "wanghui")
+    monkeypatch.setattr("socket.gethostname", lambda: "rigpc")
+    scrubber = scrubber_of(load_rig(rig))
+    said = (
+        "robot: connect: arm7.lab.example:30004 as wanghui@rigpc from 192.0.2.7 (fe80::1:2:3, 00:1b:44:11:3a:b7); "
+        "see /home/wanghui/rig.toml and C:\\Users\\wanghui, http://wanghui:secret@cam.example/stream, "
+        "on rigpc; 200 rounds/s, 0.1600 mm/px"
+    )
+    scrubbed = scrubber.text(said)
+    for secret in ("arm7", "lab.example", "wanghui", "rigpc", "192.0.2.7", "fe80", "00:1b", "secret", "cam.example"):
+        assert secret not in scrubbed, scrubbed
+    assert scrubbed.startswith("robot: connect: <host>:30004 as ")
+    assert scrubbed.endswith("on <host>; 200 rounds/s, 0.1600 mm/px")
+
+
+def test_of_the_rig_only_numbers_and_fixed_words_are_sent(rig: Path) -> None:
+    sent = numbers_only(load_rig(rig).model_dump(mode="json"))
+    assert sent["robot"]["host"] == sent["brush"]["name"] == sent["camera"]["source"] == "<text>"
+    assert sent["robot"]["kind"] == "aubo-arcs"
+    assert sent["board"]["squares"] == [26, 20]
+    assert "usb-lab-7" not in json.dumps(sent)
+
+
+def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
+    robot = load_rig(lab.folder / "rig.toml").robot
+    rig, report = lab.folder / "new.toml", lab.folder / "report.zip"
+    address = Taught(value=f"{robot.host}:{robot.port}", how="typed", at=now_utc(), step="arm")
+    stream = Taught(value="http://cam.example/stream", how="typed", at=now_utc(), step="camera")
+    squares = Taught(value=[26, 20], how="typed", at=now_utc(), step="camera")
+    values = {"aside.address": address, "camera.source": stream, "board.squares": squares}
+    TaughtFile(rig).save(Notebook().with_values(values))
+    ran = brushloop("doctor", "--config", rig, "--report", report)
+    assert ran.returncode == 0, ran.stderr
+    assert "new.toml yet" in ran.stdout
+    archive = Archive.read(report)
+    answered = {line["method"]: line["answer"] for line in archive.lines}
+    assert answered["rob1.RobotState.getSafetyModeType"] == {"result": "Normal"}
+    with zipfile.ZipFile(report) as held:
+        text = held.read("report.json").decode()
+    assert json.loads(text)["taught"]["board.squares"] == [26, 20]
+    assert robot.host not in text
+    assert "cam.example" not in text

@@ -1,4 +1,4 @@
-"""Going back: always to the question before, with everything before that one as it was."""
+"""Going back, teaching a step again, leaving off: what was answered before is as it was."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.collect.errors import CollectAborted
+from brushloop.collect.errors import CannotTeach, CollectAborted
 from brushloop.collect.operator import Choice
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import LeftOff, Shown, StepState, WentBack
 from brushloop.collect.teach.steps import brush
-from brushloop.collect.teach.steps.brush import BrushStep
+from brushloop.collect.teach.steps.brush import STATION, BrushStep
+from brushloop.collect.teach.steps.camera import CameraStep
 from brushloop.collect.teach.steps.force import ForceStep
-from brushloop.collect.teach.store import Taught, now_utc
+from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.collect.teach.wizard import Wizard
+from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.host import HostClock
 
 TAUGHT = {
@@ -152,3 +154,70 @@ async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tm
     await Wizard(day, (BrushStep(), ForceStep())).again("brush")
     assert again.asked == [R]
     assert day.notebook == before
+
+
+class LeavingAtOnce:
+    """A person who leaves at the first question."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    async def overview(self, steps: tuple[StepState, ...]) -> None:
+        pass
+
+    async def show(self, what: Shown) -> None:
+        self.shown += what.lines
+
+    async def choose(self, *_: object) -> str:
+        raise LeftOff
+
+    async def number(self, *_: object) -> float:
+        raise LeftOff
+
+
+async def test_a_step_that_is_taught_again_stays_open_until_it_is_done(tmp_path: Path) -> None:
+    values = {
+        "camera.source": Taught(value="http://192.0.2.8/", how="typed", at=now_utc(), step="camera"),
+        "aside.frame_rate_hz": Taught(value=10.0, how="counted", at=now_utc(), step="camera"),
+    }
+    taught = Notebook().with_values(values).finished("arm").finished("camera")
+    TaughtFile(tmp_path / "rig.toml").save(taught)
+    day = Day(LeavingAtOnce(), tmp_path / "rig.toml", HostClock(), armed=False)  # type: ignore[arg-type]
+    with pytest.raises(CollectAborted):
+        await Wizard(day, (CameraStep(),)).again("camera")
+    assert set(day.notebook.done) == {"arm"}
+    assert day.notebook.values == {}
+
+
+async def test_a_step_that_failed_says_in_what_state_the_arm_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def silent(*_: object) -> None:
+        error = DeviceTimeout("robot", "moveLine", "no reply in 1 s", condition="A stop was sent to the arm.")
+        error.add_note("The arm may still be moving.")
+        raise error
+
+    monkeypatch.setattr(CameraStep, "teach", silent)
+    person = LeavingAtOnce()
+    day = Day(person, tmp_path / "rig.toml", HostClock(), armed=True)  # type: ignore[arg-type]
+    with pytest.raises(CollectAborted):
+        await Wizard(day, (CameraStep(),)).run()
+    assert person.shown[0] == (
+        "robot: moveLine: no reply in 1 s. A stop was sent to the arm. The arm may still be moving."
+    )
+
+
+class Enter:
+    """A person who has an ink station, and presses Enter when asked for its serial line."""
+
+    async def choose(self, *_: object) -> str:
+        return STATION.key
+
+    async def text(self, _question: str, default: str) -> str:
+        return default
+
+
+async def test_an_ink_device_without_a_serial_line_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    day = Day(Enter(), tmp_path / "rig.toml", HostClock(), armed=False)  # type: ignore[arg-type]
+    with pytest.raises(CannotTeach, match=r"no serial line was named\. Type its path"):
+        await BrushStep()._ink(day)

@@ -1,4 +1,4 @@
-"""Zero touch by force on the loopback brush: 200 touches against the truth, and what is refused."""
+"""Zero touch by force: hinges and first ink, 200 touches of the loopback brush, and what is refused."""
 
 from __future__ import annotations
 
@@ -7,14 +7,88 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config_touch import ForceTouchConfig
-from brushloop.collect.touch.force import Contact, Reading, touch_by_force
+from brushloop.collect.touch.camera import first_ink
+from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_by_force
 from brushloop.collect.touch.heights import SPAN_SIGMAS, Reach
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import Reaction
+
+HINGE_NOISE_N = 0.002
+
+
+def hinge(z_mm: np.ndarray, contact_mm: float, stiffness: float, offset_n: float = 0.0) -> np.ndarray:
+    return offset_n + stiffness * np.maximum(0.0, contact_mm - z_mm)
+
+
+@given(
+    contact_mm=st.floats(119.8, 120.3),
+    stiffness=st.floats(1e-3, 1.0),
+    offset_n=st.floats(-0.5, 0.5),
+    step_mm=st.sampled_from([0.05, 0.07, 0.1]),
+)
+def test_a_clean_hinge_is_found_exactly(contact_mm: float, stiffness: float, offset_n: float, step_mm: float) -> None:
+    z_mm = np.arange(120.6, 119.5, -step_mm)
+    found = find_contact(z_mm, hinge(z_mm, contact_mm, stiffness, offset_n), np.full(z_mm.size, 50), HINGE_NOISE_N)
+    assert found.z_mm == pytest.approx(contact_mm, abs=1e-5)
+    assert found.spring.n_mm == pytest.approx(stiffness, rel=1e-4)
+    assert found.samples == 50 * z_mm.size
+
+
+def test_an_offset_of_each_descent_is_no_force() -> None:
+    z_mm = np.array([120.3, 120.2, 119.9, 119.7, 120.1, 119.9, 119.8])
+    run = np.array([0, 0, 0, 0, 1, 1, 1])
+    force_n = hinge(z_mm, 120.0, 0.003) + 0.01 * run  # drifts by more than the whole push
+    found = find_contact(z_mm, force_n, np.full(7, 100), HINGE_NOISE_N, run)
+    assert found.z_mm == pytest.approx(120.0, abs=1e-6)
+    together = find_contact(z_mm, force_n, np.full(7, 100), HINGE_NOISE_N)
+    assert abs(together.z_mm - 120.0) > 0.05
+
+
+def test_the_standard_error_is_what_repeats_scatter_by() -> None:
+    rng = np.random.default_rng(3)
+    z_mm, samples = np.linspace(120.4, 119.6, 17), np.full(17, 400)
+    found = [
+        find_contact(
+            z_mm, hinge(z_mm, 120.013, 0.003) + rng.normal(0.0, HINGE_NOISE_N, 17) / 20.0, samples, HINGE_NOISE_N
+        )
+        for _ in range(300)
+    ]
+    errors = np.array([f.z_mm - 120.013 for f in found])
+    assert errors.std() == pytest.approx(float(np.mean([f.sigma_mm for f in found])), rel=0.15)
+    assert abs(errors.mean()) < 3.0 * errors.std() / np.sqrt(300)
+
+
+@pytest.mark.parametrize(
+    "force_n", [np.linspace(1.0, 0.0, 8), np.zeros(8)], ids=["falls on the way down", "does not change"]
+)
+def test_no_rise_is_no_contact(force_n: np.ndarray) -> None:
+    with pytest.raises(StepError, match="no contact"):
+        find_contact(np.arange(120.7, 119.95, -0.1)[:8], force_n, np.full(8, 10), HINGE_NOISE_N)
+
+
+def test_first_ink_is_between_the_last_clean_spot_and_the_first_inked_one() -> None:
+    edge = first_ink(np.array([0.01, -0.02, 0.9, 1.1]), 0.25)
+    assert (edge.clean, edge.inked) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("ink", "why"),
+    [
+        ([0.0, 0.1, 0.0], "nothing was touched"),
+        ([0.9, 1.0, 1.1], "higher than expected"),
+        ([0.0, 0.9, 0.1], "is the brush dry"),
+    ],
+)
+def test_a_row_that_does_not_tell_is_refused(ink: list[float], why: str) -> None:
+    with pytest.raises(StepError, match=why):
+        first_ink(np.array(ink), 0.25)
+
 
 NOISE_N = SimConfig().force_noise_n
 REACH = Reach(122.0, 120.0, 118.0)
@@ -115,16 +189,6 @@ async def test_three_touches_at_each_of_four_points_take_three_minutes(reaction:
     assert max(spans) < SPAN_SIGMAS * ForceTouchConfig().sigma_mm
 
 
-async def test_a_touch_that_begins_where_the_last_one_was_is_as_good(reaction: Reaction) -> None:
-    rng = np.random.default_rng(7)
-    first = await touch_by_force(Felt(reaction, 120.4, rng), REACH, ForceTouchConfig())
-    probes = [Felt(reaction, 120.4, rng) for _ in range(40)]
-    found = [await touch_by_force(probe, REACH, ForceTouchConfig(), first.spring, first.z_mm) for probe in probes]
-    errors = np.array([contact.z_mm for contact in found]) - 120.4
-    assert abs(errors.mean()) + 3.0 * errors.std(ddof=1) < 0.15
-    assert np.mean([probe.samples for probe in probes]) < 2000
-
-
 @pytest.mark.parametrize("moved_mm", [-0.7, -0.3, 0.3, 0.7])
 async def test_a_sheet_that_moved_since_the_last_touch_is_found(reaction: Reaction, moved_mm: float) -> None:
     rng = np.random.default_rng(3)
@@ -138,15 +202,6 @@ async def test_a_slow_drift_of_the_sensor_is_no_force(reaction: Reaction) -> Non
     # a tenth of a mN every 1000 samples: over a touch as much as the brush pushes at half a mm
     errors = [(await touched(reaction, seed, ForceTouchConfig(), drift_n=1e-7))[0] for seed in range(30)]
     assert abs(float(np.mean(errors))) < 0.03
-
-
-async def test_a_quieter_sensor_needs_fewer_samples(reaction: Reaction) -> None:
-    loud, quiet = (Felt(reaction, 120.0, np.random.default_rng(1)) for _ in range(2))
-    quiet.noise_n = NOISE_N / 4.0
-    await touch_by_force(loud, REACH, ForceTouchConfig())
-    contact = await touch_by_force(quiet, REACH, ForceTouchConfig())
-    assert quiet.samples < 0.6 * loud.samples
-    assert contact.z_mm == pytest.approx(120.0, abs=0.05)
 
 
 async def test_nothing_is_touched_within_the_travel(reaction: Reaction) -> None:

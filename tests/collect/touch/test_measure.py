@@ -1,8 +1,7 @@
-"""Zero touch as a whole on the loopback world: planes of sheets that lean, what is refused, and where the brush is."""
+"""Zero touch on the loopback world: sheets that lean, what is refused, patches used up, where the brush is."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 from dataclasses import replace
@@ -22,6 +21,12 @@ from brushloop.drivers.errors import MotionFailed
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench
+
+
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.paper import Sheet
+from brushloop.collect.touch.heights import Touch, at_one_point
+from brushloop.collect.touch.places import used_patches
 
 CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
 THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
@@ -69,13 +74,6 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(make_
     assert abs(float(np.mean(errors))) < 0.03
 
 
-async def test_the_plane_of_a_leaning_sheet_is_found_by_camera(make_bench: MakeBench) -> None:
-    bench = make_bench((0.7, -0.7), paper_z_mm=120.8)
-    result = await measured(bench, method="camera", **PATCHES)
-    assert worst_corner_mm(bench, result) < 0.15
-    assert bench.lifted
-
-
 async def test_the_result_goes_into_a_journal_with_its_residuals(make_bench: MakeBench) -> None:
     bench = make_bench((0.5, 0.5))
     four = [*THREE["points_mm"], (104.0, 76.0)]
@@ -113,20 +111,6 @@ async def test_nothing_within_the_travel_ends_with_the_brush_lifted(
     assert not bench.world.presses
 
 
-async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    four = [*THREE["points_mm"], (104.0, 76.0)]
-
-    def lower_over_the_bump(pose: Pose) -> Pose:
-        away_mm = math.dist(bench.world.to_paper(pose.x_mm, pose.y_mm), four[-1])
-        return replace(pose, z_mm=pose.z_mm - 1.5) if away_mm < 10.0 else pose
-
-    bench.bent = lower_over_the_bump
-    with pytest.raises(StepError, match="do not lie in a plane: residuals"):
-        await measured(bench, method="force", touches=1, points_mm=four, force={"sigma_mm": 0.05})
-    assert bench.lifted
-
-
 async def test_an_arm_that_failed_is_left_where_it_is(make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = make_bench()
     move = bench.move
@@ -140,24 +124,6 @@ async def test_an_arm_that_failed_is_left_where_it_is(make_bench: MakeBench, mon
     with pytest.raises(MotionFailed):
         await measured(bench, method="force")
     assert not bench.lifted
-
-
-async def test_an_arm_that_was_stopped_is_left_where_it_is(make_bench: MakeBench) -> None:
-    bench = make_bench()
-
-    async def stopped(_samples: int, _axis: tuple[float, float, float], _after_ns: int) -> tuple[float, float, int]:
-        raise asyncio.CancelledError
-
-    bench.tap.average = stopped  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(asyncio.CancelledError):
-        await measured(bench, method="force")
-    assert not bench.lifted
-
-
-async def test_the_taught_height_is_visited_as_ever(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    result = await measured(bench)
-    assert (result.method, result.plane.z0_mm, result.plane.slope_deg) == ("taught", 120.0, 0.0)
 
 
 def test_by_camera_three_points_are_needed() -> None:
@@ -214,17 +180,6 @@ async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench)
     assert bench.lifted
 
 
-async def test_a_jog_of_a_size_that_is_not_configured_is_refused(make_bench: MakeBench) -> None:
-    bench = make_bench()
-
-    async def far(_at: Jogged) -> float | None:
-        return -5.0
-
-    with pytest.raises(StepError, match=r"not one of 0\.02"):
-        await measure_plane(bench.rig, bench.effector, TouchConfig(method="jog"), next_jog=far)
-    assert bench.lifted
-
-
 async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBench) -> None:
     bench = make_bench()
     config = TouchConfig(method="jog")
@@ -232,3 +187,40 @@ async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBe
     with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
         await measure_plane(bench.rig, bench.effector, config, next_jog=nobody)
     assert bench.lifted
+
+
+@pytest.mark.parametrize(
+    ("sigma_mm", "second_mm", "repeats"),
+    [(None, 0.14, True), (None, 0.16, False), (0.02, 0.16, False), (0.04, 0.19, True), (0.04, 0.21, False)],
+)
+def test_touches_may_span_the_limit_or_five_of_their_standard_errors(
+    sigma_mm: float | None, second_mm: float, repeats: bool
+) -> None:
+    touches = [Touch(5.0, 5.0, 120.0, sigma_mm), Touch(5.0, 5.0, 120.0 + second_mm, sigma_mm)]
+    if repeats:
+        assert at_one_point(touches, TouchConfig(repeatability_mm=0.15)).span_mm == pytest.approx(second_mm)
+    else:
+        with pytest.raises(StepError, match="does not repeat"):
+            at_one_point(touches, TouchConfig(repeatability_mm=0.15))
+
+
+PAPER = PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(244.0, 172.0), touch_point_mm=(2.0, 2.0))
+SHEET = Sheet(PAPER)
+
+
+def used(**config: Any) -> set[int]:
+    return used_patches(SHEET, PAPER, TouchConfig(**config))
+
+
+def test_the_taught_height_and_touches_in_the_margin_cost_no_cell() -> None:
+    assert used() == set()
+    assert used(method="force") == set()
+    assert used(method="force", points_mm=[(2.0, 2.0), (242.0, 2.0), (122.0, 170.0)]) == set()
+
+
+def test_a_patch_costs_every_cell_that_it_may_reach() -> None:
+    corner = SHEET.patch(36)
+    patches = used(method="camera", points_mm=[(corner.x_mm + 4.0, corner.y_mm + 9.0), (124.0, 6.0), (6.0, 100.0)])
+    assert 36 in patches
+    assert 30 in patches, "it grows into the patch above"
+    assert len(patches) < SHEET.capacity / 3

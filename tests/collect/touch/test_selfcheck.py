@@ -105,12 +105,6 @@ async def test_marks_on_the_loopback_sheet_are_found_and_pass(make_bench: MakeBe
     assert bench.lifted
 
 
-async def test_old_ink_on_the_sheet_does_not_matter(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    await checked(bench, ((30.0, 20.0), (90.0, 20.0), (30.0, 60.0)))
-    await checked(bench)
-
-
 def in_paper(bench: Bench, change: Any) -> Any:
     """An arm that goes to `change(x, y)` of the paper frame when (x, y) is asked for, over the sheet only."""
 
@@ -143,13 +137,6 @@ async def test_an_arm_that_goes_elsewhere_is_refused(make_bench: MakeBench, chan
     assert bench.lifted
 
 
-async def test_swapped_axes_are_refused(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    bench.bent = in_paper(bench, lambda x, y: (y, x))
-    with pytest.raises(StepError, match="x and y are swapped"):
-        await checked(bench, ((12.0, 8.0), (75.0, 8.0), (12.0, 50.0)))
-
-
 async def test_a_dry_brush_leaves_no_marks(make_bench: MakeBench) -> None:
     bench = make_bench()
 
@@ -168,16 +155,6 @@ async def test_an_even_triangle_is_refused_before_anything_moves(make_bench: Mak
         with pytest.raises(StepError, match="too even, or too flat"):
             await checked(bench, places)
     assert bench.target == at
-
-
-def test_triangles_lie_in_one_cell_or_over_three(make_bench: MakeBench) -> None:
-    sheet = Sheet(make_bench().rig.config.paper)
-    patch = sheet.patch(0)
-    for x, y in triangle_in(patch, CONFIG):
-        assert patch.x_mm <= x <= patch.x_mm + patch.size_x_mm
-        assert patch.y_mm <= y <= patch.y_mm + patch.size_y_mm
-    corners = (sheet.patch(0), sheet.patch(sheet.columns - 1), sheet.patch(sheet.capacity - sheet.columns))
-    assert triangle_of(corners) == tuple(patch.anchor_mm for patch in corners)
 
 
 def paper(size_x_mm: float, size_y_mm: float) -> PaperConfig:
@@ -215,13 +192,6 @@ def whole_sheet(make_bench: MakeBench) -> tuple[Bench, Triangle]:
     bench = make_bench(whole=True)
     sheet = Sheet(bench.rig.config.paper)
     return bench, triangle_of((sheet.patch(0), *partners(sheet, sheet.patch(0), set())))
-
-
-async def test_a_sound_camera_passes_over_three_corners(make_bench: MakeBench) -> None:
-    bench, places = whole_sheet(make_bench)
-    check = await checked(bench, places)
-    assert check.scale == pytest.approx((1.0, 1.0), abs=0.003)
-    assert bench.lifted
 
 
 async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_not_in_one_cell(

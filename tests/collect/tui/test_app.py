@@ -1,24 +1,27 @@
-"""Keys of the run screen."""
+"""Keys of the run screen; and no arm is left unwatched: signals, lost terminals, defects of the screen."""
 
 from __future__ import annotations
 
 import asyncio
+import functools
+import os
 import re
+import signal
 from dataclasses import replace
 
 import pytest
+from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import FINAL, State
-from brushloop.collect.errors import ConfigError
-from brushloop.collect.operator import OperatorRequest
+from brushloop.collect.errors import CollectAborted, ConfigError
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.keys import RUN_KEYS
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT
+from brushloop.collect.tui.runner import ScreenCrashed, run_screen
 from brushloop.collect.tui.text import SOFTWARE_STOP
 from brushloop.collect.tui.widgets import HelpScreen
 from tests.collect.tui.fake import (
-    ERROR,
     FAILED,
     PAUSED,
     SPLIT,
@@ -44,17 +47,6 @@ async def test_space_pauses_and_resumes_and_says_which() -> None:
             assert "space resume" in await look(app, pilot)
             await pilot.press("space")
             assert engine.calls == ["resume"]
-
-
-async def test_a_poll_after_the_screens_have_closed_shows_nothing() -> None:
-    engine = FakeEngine(picture())
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
-    engine.now = picture(state=State.ASKING, prompt=SPLIT)
-    app.action_request(OperatorRequest.RETAKE.name)  # sends the request, then polls
-    assert engine.calls[-1].startswith("request")
-    assert app.screen_stack == []
 
 
 async def test_space_does_nothing_once_the_end_has_begun() -> None:
@@ -127,18 +119,6 @@ async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> 
             assert "red button: emergency stop" in text
 
 
-async def test_no_focus_keeps_a_key_for_itself() -> None:
-    engine = FakeEngine(picture(error=ERROR))
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
-        for focus in ("why-pane", "grid-pane", "log-pane"):
-            engine.calls.clear()
-            app.screen.query_one(f"#{focus}").focus()
-            await pilot.press("s", "ctrl+c")
-            assert engine.calls == ["stop", "stop"]
-
-
 async def test_q_asks_while_the_run_is_on_and_n_goes_back() -> None:
     engine = FakeEngine(picture())
     app = OperatorApp(engine)
@@ -163,17 +143,6 @@ async def test_y_parks_the_arm_and_leaves_only_then() -> None:
         while app.is_running:
             await asyncio.sleep(0.02)
     assert app.return_code == 0
-
-
-async def test_a_run_that_ends_takes_the_question_whether_to_leave_it_along() -> None:
-    engine = FakeEngine(picture())
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
-        await pilot.press("q")
-        engine.now = FAILED
-        assert "FAILED" in await look(app, pilot)
-        assert not isinstance(app.screen, Confirm)
 
 
 async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_is_named() -> None:
@@ -228,19 +197,6 @@ async def test_q_leaves_at_once_when_the_run_is_over_and_the_arm_parked(state: S
     assert engine.calls == []
 
 
-async def test_q_says_so_where_the_arm_rests_unparked() -> None:
-    engine = FakeEngine(picture(state=State.STOPPED, target_mm=(0.0, 0.0, 0.0)))
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
-        await pilot.press("q")
-        assert "not parked" in await look(app, pilot)
-        await pilot.press("n")
-        assert app.is_running
-        await pilot.press("q", "y")
-        assert not app.is_running
-
-
 async def test_help_names_every_key_and_goes_away() -> None:
     app = OperatorApp(FakeEngine(picture()))
     async with app.run_test(size=(80, 24)) as pilot:
@@ -252,22 +208,6 @@ async def test_help_names_every_key_and_goes_away() -> None:
         assert SOFTWARE_STOP in text
         await pilot.press("escape")
         assert not isinstance(app.screen, HelpScreen)
-
-
-async def test_the_palette_knows_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = FakeEngine(picture())
-    app = OperatorApp(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        names = {command.title for command in app.get_system_commands(app.screen)}
-        assert {"Stop the arm now", "Pause or go on", "Retake", "Leave", "Colours"} <= names
-        await pilot.press("ctrl+p")
-        await pilot.pause(0.3)
-        await pilot.press(*"pau", "enter")
-        await pilot.pause(0.3)
-        await pilot.press("enter")
-        await pilot.pause(0.3)
-        assert engine.calls == ["pause"]
 
 
 @pytest.mark.parametrize("state", [State.STOPPED, State.FAILED])
@@ -340,3 +280,67 @@ async def test_a_session_that_cannot_be_resumed_says_why() -> None:
             await look(app, pilot)
         assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
         assert app.engine is stopped
+
+
+def without_terminal(monkeypatch: pytest.MonkeyPatch, pilot: object) -> None:
+    monkeypatch.setattr(OperatorApp, "run", functools.partialmethod(OperatorApp.run, headless=True, auto_pilot=pilot))
+
+
+async def until_over(pilot: Pilot[None]) -> None:
+    while pilot.app.is_running:
+        await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_arm_and_ends_the_screen(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def send(pilot: Pilot[None]) -> None:
+        os.kill(os.getpid(), number)
+        await until_over(pilot)
+
+    without_terminal(monkeypatch, send)
+    engine = FakeEngine(picture())
+    before = signal.getsignal(number)
+    with pytest.raises(CollectAborted):
+        run_screen(engine)
+    assert engine.calls == ["start", "stop", "join"]
+    assert signal.getsignal(number) == before
+
+
+def test_a_lost_terminal_parks_the_arm_and_ends_the_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def hang_up(pilot: Pilot[None]) -> None:
+        os.kill(os.getpid(), signal.SIGHUP)
+        await until_over(pilot)
+
+    without_terminal(monkeypatch, hang_up)
+    engine = FakeEngine(picture())
+    with pytest.raises(CollectAborted):
+        run_screen(engine)
+    assert engine.calls == ["start", "park", "join"]
+
+
+def test_a_screen_that_breaks_stops_the_arm(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Broken(FakeEngine):
+        def snapshot(self):
+            if self.looks > 2:
+                raise ZeroDivisionError
+            return super().snapshot()
+
+    without_terminal(monkeypatch, until_over)
+    engine = Broken(picture())
+    with pytest.raises(ScreenCrashed):
+        run_screen(engine)
+    assert engine.calls == ["start", "stop", "join"]
+    assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_a_screen_that_cannot_begin_stops_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_app: OperatorApp) -> None:
+        raise OSError("no terminal")
+
+    monkeypatch.setattr(OperatorApp, "run", refuse)
+    engine = FakeEngine(picture())
+    with pytest.raises(OSError, match="no terminal"):
+        run_screen(engine)
+    assert engine.calls == ["start", "stop", "join"]

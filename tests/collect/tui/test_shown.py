@@ -1,8 +1,9 @@
-"""What the run screen shows: literal text, sizes, and how often it is drawn."""
+"""What the run screen shows: literal text, sizes, the grid, colours, marks; and how often it is drawn."""
 
 from __future__ import annotations
 
-import asyncio
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,24 +11,26 @@ from textual.geometry import Region
 from textual.widget import Widget
 from textual.widgets import Static
 
-from brushloop.collect.engine.control import FINAL, State
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.snapshot import CellCount, Snapshot
 from brushloop.collect.tui.app import OperatorApp
+from brushloop.collect.tui.panes import BAD, COMPLETE, LEFT_OUT, NEXT, NOW, grid_content
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, OVER
+from brushloop.collect.tui.terminal import DARK, theme_file
 from brushloop.collect.tui.text import SOFTWARE_STOP
-from brushloop.collect.tui.widgets import Line
+from brushloop.sessions.recording import remarks_of
+from brushloop.sessions.records import Condition
 from tests.collect.tui.fake import (
     DONE,
     ERROR,
     FAILED,
-    PAUSED,
     FakeEngine,
     full_picture,
     grid_of,
+    marked_grid,
     picture,
 )
 from tests.collect.tui.screen_text import has_picture, look, shown
-
-AT_WORK = sorted(set(State) - FINAL)
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
@@ -49,31 +52,6 @@ async def test_no_widget_can_hand_a_control_character_to_the_terminal() -> None:
         text = shown(app)
         assert "a]0;ownedb 31m ltr" in text
         assert not set(text) & set("\x1b\x07\x9b\u202e")
-
-
-async def test_chinese_takes_its_two_columns() -> None:
-    engine = FakeEngine(picture(session_id="永字八法", messages=("墨分五色 capture 1",), step="写 永"))
-    app = OperatorApp(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        for place in ("session", "figures", "log"):
-            widget = app.screen.query_one(f"#{place}")
-            strips = widget.render_lines(Region(0, 0, *widget.size))
-            assert {strip.cell_length for strip in strips} == {widget.size.width}
-        assert "永字八法" in shown(app)
-
-
-async def test_grid_counts_follow_the_snapshot() -> None:
-    engine = FakeEngine(picture(grid=grid_of(1)))
-    app = OperatorApp(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        before = await look(app, pilot)
-        assert before.count("1/2") == 1
-        assert before.count("✓") == 0
-        engine.now = picture(grid=grid_of(3))
-        after = await look(app, pilot)
-        assert after.count("2/2 ✓") == 1
-        assert after.count("1/2") == 1
 
 
 async def test_80_columns_by_24_rows_show_all_that_matters() -> None:
@@ -114,46 +92,6 @@ async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_fo
         assert "Log" in await look(app, pilot)
 
 
-async def test_missing_pose_and_eta_are_said() -> None:
-    app = OperatorApp(
-        FakeEngine(picture(tip_mm=None, eta_s=None, session_id="", source="", grid=(), strokes_planned=0))
-    )
-    async with app.run_test() as pilot:
-        text = await look(app, pilot)
-    for part in ("no pose", "no ETA yet", "no session yet", "not known yet", "no strokes planned", "no sheet yet"):
-        assert part in text
-
-
-async def test_the_log_follows_until_scrolled_away() -> None:
-    engine = FakeEngine(picture(messages=tuple(f"line {n}" for n in range(100))))
-    app = OperatorApp(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        assert "line 99" in await look(app, pilot)
-        engine.now = picture(messages=tuple(f"line {n}" for n in range(50, 150)))
-        assert "line 149" in await look(app, pilot)
-        await pilot.press("home")
-        assert "line 50" in await look(app, pilot)
-        engine.now = picture(messages=tuple(f"line {n}" for n in range(50, 151)))
-        assert "line 50" in await look(app, pilot)
-        await pilot.press("end")
-        assert "line 150" in await look(app, pilot)
-
-
-async def test_the_engine_is_asked_ten_times_a_second_and_nothing_is_drawn_twice(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    engine = FakeEngine(PAUSED)
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
-        drawn: list[Line] = []
-        monkeypatch.setattr(Line, "update", lambda line, *_args, **_options: drawn.append(line))
-        looks = engine.looks
-        await asyncio.sleep(1.0)
-        assert 5 <= engine.looks - looks <= 12
-        assert drawn == []
-
-
 async def test_an_error_of_the_engine_is_a_crash_not_a_blank() -> None:
     class Broken(FakeEngine):
         def snapshot(self):
@@ -183,3 +121,78 @@ async def test_what_did_not_change_is_not_drawn_again(monkeypatch: pytest.Monkey
         for _ in range(3):
             await look(app, pilot)
         assert drawn == []
+
+
+def test_tilts_go_down_where_the_width_allows() -> None:
+    lines = grid_content(grid_of(5), 78).plain.splitlines()
+    assert lines[0].split("  ") == ["α \\ H", "11 mm", "13 mm", "15 mm", "17 mm", "20 mm"]
+    assert [line.split()[0] for line in lines[1:]] == ["0°", "5°", "10°"]
+    assert lines[1].split()[1:3] == ["2/2", "✓"]
+    assert len({len(line) for line in lines}) == 1
+
+
+def test_every_state_has_a_sign_as_well_as_a_colour() -> None:
+    text = grid_content(marked_grid(), 78).plain
+    for sign in (COMPLETE, NOW, NEXT, BAD, LEFT_OUT):
+        assert text.count(sign) == (text.count("2/2") - 1 if sign is COMPLETE else 1), sign
+
+
+def test_a_cell_that_is_not_planned_is_a_dash() -> None:
+    cells = (CellCount(Condition(11.0, 0.0), 0, 2), CellCount(Condition(13.0, 5.0), 2, 2))
+    lines = grid_content(cells, 78).plain.splitlines()
+    assert lines[1].split() == ["0°", "0/2", "-"]
+    assert lines[2].split() == ["5°", "-", "2/2", "✓"]
+
+
+async def test_a_choice_of_colours_is_there_at_the_next_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    app = OperatorApp(FakeEngine(picture()), theme_file=theme_file())
+    async with app.run_test() as pilot:
+        assert (app.theme, theme_file().exists()) == (DARK, False)
+        [choose] = [command.callback for command in app.get_system_commands(app.screen) if command.title == "Colours"]
+        choose()
+        await pilot.pause()
+        await pilot.press(*"solarized-light", "enter")
+        await pilot.pause()
+    assert OperatorApp(FakeEngine(picture()), theme_file=theme_file()).theme == "solarized-light"
+
+
+def at(folder: Path, **changes: object) -> Snapshot:
+    return replace(full_picture(), folder=str(folder), **changes)  # type: ignore[arg-type]
+
+
+async def test_b_marks_the_last_capture_and_takes_it_back(tmp_path: Path) -> None:
+    engine = FakeEngine(at(tmp_path))
+    last = engine.now.last
+    assert last is not None
+    app = OperatorApp(engine)
+    async with app.run_test(size=(120, 40)) as pilot:
+        await pilot.press("b")
+        remark = remarks_of(tmp_path)[last.still]
+        assert (remark.stroke_id, remark.bad) == (last.press.stroke_id, True)
+        await pilot.press("b")
+        assert not remarks_of(tmp_path)[last.still].bad
+
+
+async def test_b_says_nothing_of_a_capture_that_does_not_count_nor_once_the_run_is_over(tmp_path: Path) -> None:
+    now = at(tmp_path)
+    assert now.last is not None
+    for silent in (
+        replace(now, last=replace(now.last, kept=False)),
+        replace(now, last=None),
+        at(tmp_path, state=State.DONE),
+    ):
+        app = OperatorApp(FakeEngine(silent))
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.press("b")
+        assert remarks_of(tmp_path) == {}
+
+
+async def test_a_disk_that_refuses_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = OperatorApp(FakeEngine(at(tmp_path / "gone")))
+    notices: list[str] = []
+    monkeypatch.setattr(app, "notify", lambda message, **_options: notices.append(message))
+    async with app.run_test(size=(120, 40)) as pilot:
+        await pilot.press("b")
+    [notice] = notices
+    assert "gone" in notice

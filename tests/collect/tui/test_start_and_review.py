@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from textual.app import App
 from textual.geometry import Size
 from textual.pilot import Pilot
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.dots import Cells
 from brushloop.collect.tui.finish_screen import FinishScreen, run_command, verdict_content
-from brushloop.collect.tui.pictures import CellPicture, ImagePicture, Pictures
+from brushloop.collect.tui.pictures import CellPicture, Pictures
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.collect.tui.text import plot, plot_title, scale_n, spark
@@ -57,44 +55,6 @@ async def test_the_start_screen_shows_what_is_finished_void_and_next() -> None:
         text = await ready(app, pilot)
         for part in ("✓ well    camera", "! trouble robot", "ProtectiveStop"):
             assert part in text
-
-
-async def test_the_first_day_says_what_to_do() -> None:
-    app = OperatorApp(browser=FakeBrowser(rows=()))
-    async with app.run_test(size=(80, 24)) as pilot:
-        text = await ready(app, pilot)
-        for part in ("No session yet", "brushloop rig new", "protocol-quick.toml", "d asks every device", "q leave"):
-            assert part in text
-        await pilot.press("s", "q")
-    assert app.return_code == 0
-
-
-async def test_health_says_its_age() -> None:
-    now_s = [100.0]
-    app = OperatorApp(browser=FakeBrowser(), now_s=lambda: now_s[0])
-    async with app.run_test(size=(80, 24)) as pilot:
-        await ready(app, pilot)
-        await pilot.press("d")
-        assert "Rig health, just now" in await ready(app, pilot)
-        now_s[0] += 185.0
-        assert isinstance(app.screen, StartScreen)
-        app.screen._show_health()
-        assert "Rig health, 3 min ago" in await ready(app, pilot)
-
-
-async def test_a_capture_of_the_review_is_shown_large(tmp_path: Path) -> None:
-    app = OperatorApp(browser=FakeBrowser())
-    async with app.run_test(size=(120, 40)) as pilot:
-        await ready(app, pilot)
-        app.push_screen(a_review(tmp_path))
-        await ready(app, pilot)
-        await pilot.press("enter")
-        text = await ready(app, pilot)
-        assert isinstance(app.screen, CaptureScreen)
-        for part in ("H13-a0-r01", "2 binarised", "no fit yet: run `brushloop fit`"):
-            assert part in text
-        assert "difference" not in text
-        assert "s STOP" not in text
 
 
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
@@ -139,22 +99,6 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too(
         assert "s2.toml" in await ready(app, pilot), "an emptied field leaves the file as it was"
     assert str(browser.paths.config) == "s2.toml"
     assert FakeBrowser().paths == browser.paths, "the next start knows the files"
-
-
-async def test_escape_leaves_the_files_as_they_were() -> None:
-    browser = FakeBrowser()
-    app = OperatorApp(browser=browser)
-    async with app.run_test(size=(80, 24)) as pilot:
-        before = browser.paths
-        await ready(app, pilot)
-        await pilot.press("e", *"xx")
-        assert "escape keep the old files" in await ready(app, pilot)
-        await pilot.press("escape")
-        text = await ready(app, pilot)
-        assert str(before.config) in text
-        assert f"{before.config}xx" not in text
-        assert "q leave" in text
-        assert browser.paths == before
 
 
 async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> None:
@@ -238,41 +182,9 @@ def test_a_session_that_cannot_be_calibrated_fitted_or_validated_says_why_and_th
         assert "nowhere" in said
 
 
-@pytest.mark.parametrize(("drawn_by", "kind"), [("SixelImage", ImagePicture), ("HalfcellImage", CellPicture)])
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:textual_image")
-def test_pixels_are_drawn_where_the_terminal_has_them(
-    monkeypatch: pytest.MonkeyPatch, drawn_by: str, kind: type[object]
-) -> None:
-    renderable = pytest.importorskip("textual_image.renderable")
-    monkeypatch.setattr(renderable, "Image", getattr(renderable, drawn_by))
-    assert isinstance(Pictures("auto").make("x"), kind)
-
-
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "textual_image", None)
     assert isinstance(Pictures("auto").make("x"), CellPicture)
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:textual_image")
-async def test_pictures_by_the_extra_are_shown_and_changed() -> None:
-    widget = pytest.importorskip("textual_image.widget").HalfcellImage
-    app: App[None] = App()
-    async with app.run_test(size=(80, 24)) as pilot:
-        shows = ImagePicture(widget, "x")
-        await app.screen.mount(shows)
-        for image in (np.zeros((20, 40), np.uint8), np.full((20, 40), 255, np.uint8), None):
-            shows.show(image)
-            await pilot.pause()
-        assert app.is_running
-
-
-def test_a_picture_fits_its_place_and_keeps_its_shape() -> None:
-    image = np.tile(np.arange(64, dtype=np.uint8) * 4, (32, 1))
-    codes = Cells(image, Size(40, 30)).codes
-    assert codes is not None
-    assert codes.shape == (10, 40)
-    assert Cells(None, Size(40, 30)).codes is None
-    assert Cells(image, Size(0, 0)).codes is None
 
 
 def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:

@@ -12,7 +12,6 @@ from contextlib import asynccontextmanager
 import pytest
 from textual.pilot import Pilot
 
-from brushloop.collect.errors import CollectAborted
 from brushloop.collect.teach.guide import Brought, JogStep, LeftOff, WentBack
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.teach_app import TeachApp
@@ -143,14 +142,3 @@ async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_ov
         assert isinstance(app.screen, Confirm)
         await pilot.press("s")
         await seen(app, pilot, lambda: asking.stopped_arm)
-
-
-async def test_what_ends_the_steps_ends_the_app() -> None:
-    async def broken(_: object) -> None:
-        raise CollectAborted("left off")
-
-    app = TeachApp(broken, "rig.toml")
-    async with app.run_test(size=SIZE):
-        await until(lambda: not app.is_running)
-    with pytest.raises(CollectAborted, match="left off"):
-        app.teaching.join()

@@ -1,4 +1,4 @@
-"""Two pictures show that the arm can leave the camera's picture; one alone is never believed."""
+"""Well, wash and park: a wipe that can be one, and an arm that can leave the camera's picture."""
 
 from __future__ import annotations
 
@@ -13,13 +13,86 @@ from brushloop.collect.operator import Choice
 from brushloop.collect.photograph.frames import Thumbnail
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Shown
-from brushloop.collect.teach.steps.places import VIEW, PlacesStep, text_of
-from brushloop.collect.teach.store import touch_of
+from brushloop.collect.teach.steps.places import VIEW, PlacesStep, check_pot, check_wipe, text_of
+from brushloop.collect.teach.store import Notebook, Taught, now_utc, touch_of
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
+
+WELL = (300.0, 40.0, 121.0)
+
+
+def taught_rim(rim: tuple[float, float, float]) -> Notebook:
+    """A well right of a level sheet of 240 x 160 mm at the origin of the base frame, and a side of its rim."""
+    values = {
+        "robot.tcp_offset_mm": [0.0, 0.0, 0.0],
+        "paper.origin_mm": [0.0, 0.0],
+        "paper.yaw_deg": 0.0,
+        "paper.size_mm": [240.0, 160.0],
+        "paper.touch_z_mm": 120.0,
+        "paper.touch_point_mm": [4.0, 4.0],
+        "aside.plane": [120.0, 0.0, 0.0],
+    }
+    notebook = Notebook().with_values(
+        {k: Taught(value=v, how="typed", at=now_utc(), step="tip") for k, v in values.items()}
+    )
+    touched = {"well 0": WELL, "well-rim 0": (300.0, 56.0, 132.0), "well-rim 1": rim, "park 0": (200.0, -300.0, 300.0)}
+    for name, place in touched.items():
+        notebook = notebook.with_touch(name, touch_of(brush_pose(*place)))
+    return notebook
+
+
+def test_a_wipe_goes_from_the_well_over_the_touched_rim_a_little_below_it() -> None:
+    notebook = taught_rim((316.0, 40.0, 133.0))
+    check_wipe(notebook)
+    found = PlacesStep().derived(notebook)
+    assert found["ink.wipe.rim_mm"].value == pytest.approx([322.0, 40.0])
+    assert found["ink.wipe.z_mm"].value == pytest.approx(131.5)
+    assert "touched there by hand" in found["ink.wipe.rim_mm"].how
+    safe_mm = found["motion.safe_z_mm"].value
+    assert isinstance(safe_mm, float)
+    assert safe_mm >= 133.0 + 15.0
+
+
+def test_without_a_second_touch_of_the_rim_there_is_no_wipe() -> None:
+    notebook = taught_rim((316.0, 40.0, 133.0))
+    touches = {name: touch for name, touch in notebook.touches.items() if name != "well-rim 1"}
+    found = PlacesStep().derived(notebook.model_copy(update={"touches": touches}))
+    assert not any(field.startswith("ink.wipe") for field in found)
+
+
+def test_the_arm_travels_above_the_rim_of_the_pot_of_water_too() -> None:
+    notebook, safe_mm = taught_rim((316.0, 40.0, 133.0)), []
+    for rim_z_mm in (150.0, 210.0):
+        for name, place in {"wash-rim 0": (120.0, 216.0, rim_z_mm), "wash-pot 0": (120.0, 200.0, 125.0)}.items():
+            notebook = notebook.with_touch(name, touch_of(brush_pose(*place)))
+        assert check_pot(notebook, "wash-rim 0", "wash-pot 0", "pot of water").startswith(
+            "pot of water of radius 16 mm"
+        )
+        found = PlacesStep().derived(notebook)
+        assert found["ink.wash.dip_z_mm"].value == pytest.approx(125.0)
+        safe_mm.append(found["motion.safe_z_mm"].value)
+    assert safe_mm == pytest.approx([180.0, 230.0]), "60 mm above the sheet, 20 mm above the highest rim"
+    drowned = notebook.with_touch("wash-pot 0", touch_of(brush_pose(120.0, 200.0, 220.0)))
+    with pytest.raises(CannotTeach, match="no deeper than the rim of the pot of water"):
+        check_pot(drowned, "wash-rim 0", "wash-pot 0", "pot of water")
+
+
+@pytest.mark.parametrize(
+    ("rim", "said"),
+    [
+        ((236.0, 40.0, 133.0), "would end over the sheet"),
+        ((420.0, 40.0, 133.0), "120 mm from the middle of the well"),
+        ((316.0, 40.0, 121.0), "no rim can be there"),
+    ],
+)
+def test_a_wipe_that_cannot_be_one_is_refused_with_the_way_out(rim: tuple[float, float, float], said: str) -> None:
+    with pytest.raises(CannotTeach, match=said) as refused:
+        check_wipe(taught_rim(rim))
+    assert "only this place is asked again" in refused.value.way_out
+
 
 PARK_MM, AWAY_MM, POT_MM = (250.0, -230.0, 260.0), (420.0, -260.0, 260.0), (300.0, 40.0, 121.0)
 
@@ -99,19 +172,3 @@ async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(server: ArcsServ
     day.save(day.notebook.without(field))
     await PlacesStep().teach(Day(Asked(), tmp_path / "rig.toml", HostClock(), armed=False))  # type: ignore[arg-type]
     assert defaults == [""]
-
-
-async def test_a_place_without_its_picture_is_asked_for_again(server: ArcsServer, tmp_path: Path) -> None:
-    class Asked(Exception):
-        pass
-
-    class Leaving(Watching):
-        async def bring(self, *_: object) -> None:
-            raise Asked
-
-    day = day_of(server.port, tmp_path, AWAY_MM, picture(arm=False), picture(arm=False))
-    day.save(day.notebook.without(VIEW["park"]))
-    resumed = Day(Leaving(), tmp_path / "rig.toml", HostClock(), armed=False)  # type: ignore[arg-type]
-    with pytest.raises(Asked):
-        await PlacesStep().teach(resumed)
-    assert "park 0" in resumed.notebook.touches, "kept until it is taught again"

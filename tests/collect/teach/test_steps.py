@@ -1,0 +1,318 @@
+"""Steps of the first day: what a cabinet, a hand or a camera says is checked, and nothing moves unasked."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.spec import BoardSpec, charuco_board, size_mm
+from brushloop.collect.errors import CannotTeach, ConfigError
+from brushloop.collect.operator import Choice
+from brushloop.collect.rig.check import brush_square
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.teach.arm_reader import Address, Cabinet, reading
+from brushloop.collect.teach.day import Day
+from brushloop.collect.teach.guide import Brought, Shown, Target
+from brushloop.collect.teach.maths.sheet_seen import Margins, check_seen, seen_margins, touched_margins
+from brushloop.collect.teach.steps import proof
+from brushloop.collect.teach.steps.arm import ArmStep
+from brushloop.collect.teach.steps.proof import ProofStep, folder_beside, slowly
+from brushloop.collect.teach.steps.sheet import BOARD, all_corners
+from brushloop.collect.teach.steps.tip import TipStep
+from brushloop.collect.teach.store import Notebook, Taught, Value, now_utc, touch_of
+from brushloop.collect.teach.watch import watched
+from brushloop.collect.tui.teach_guide import ScreenGuide
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.errors import ProtocolViolation
+from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.host import HostClock
+from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.lab.lab import truth
+from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.world import World
+from tests.collect.teach.unknown import InLab, in_lab
+
+
+async def cabinet_that_answers(getter: str, answer: object) -> Cabinet:
+    server = ArcsServer(World(SimConfig()))
+    server._methods[f"rob1.RobotConfig.{getter}"] = lambda _: answer
+    await server.start("127.0.0.1", 0)
+    try:
+        async with reading(Address("127.0.0.1", server.port), "sof") as reader:
+            return await reader.cabinet("sof")
+    finally:
+        await server.stop()
+
+
+@pytest.mark.parametrize("port", ["x", "0", "65536", "-1", "9" * 5000])
+def test_a_port_is_a_number_in_the_range_of_ports(port: str) -> None:
+    with pytest.raises(ValueError, match="is not a number from 1 to 65535"):
+        Address.of(f"192.0.2.7:{port}")
+
+
+@pytest.mark.parametrize(
+    ("getter", "answer"),
+    [
+        ("getPayload", [math.nan, [0.0, 0.0, 0.0]]),
+        ("getPayload", ["1.5", [0.0, 0.0, 0.0]]),
+        ("getCollisionLevel", None),
+        ("getTcpOffset", [0.0, 0.0, math.inf, 0.0, 0.0, 0.0]),
+    ],
+)
+async def test_an_answer_that_is_no_number_is_refused_by_its_getter(getter: str, answer: object) -> None:
+    with pytest.raises(ProtocolViolation, match=getter):
+        await cabinet_that_answers(getter, answer)
+
+
+def leaning(x_mm: float, y_mm: float, z_mm: float, toward_deg: float, tilt_deg: float, wrist_deg: float) -> Pose:
+    """The tip at a place, the brush leaning toward a side while the wrist stays as it is."""
+    toward = math.radians(toward_deg)
+    lean = Rotation.from_rotvec(math.radians(tilt_deg) * np.array([-math.sin(toward), math.cos(toward), 0.0]))
+    upright = Rotation.from_quat(brush_pose(0.0, 0.0, 0.0, heading_deg=wrist_deg).quaternion)
+    qx, qy, qz, qw = (float(v) for v in (lean * upright).as_quat())
+    return Pose(x_mm, y_mm, z_mm, qx, qy, qz, qw)
+
+
+async def slipped(person: InLab, target: Target, deg: float) -> Brought:
+    """The hand holds the brush as ever, but leaning."""
+    lab = person.lab
+    aim = lab._aims.tip(target.kind, target.index, target.corner)
+    lean = Rotation.from_rotvec([math.radians(deg), 0.0, 0.0]) * Rotation.from_quat(aim.quaternion)
+    qx, qy, qz, qw = (float(v) for v in lean.as_quat())
+    await person._in_lab(lab._hand.guide(Pose(*aim.position_mm, qx, qy, qz, qw), 0.0))
+    return Brought.DONE
+
+
+async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_path: Path) -> None:
+    with in_lab(41, rate=30.0, picture_px=(800, 600)) as person:
+        bring, hasty = person.bring, [6, 0, 0, 0]
+
+        async def hastily(target: Target, how: str) -> Brought:
+            if target.kind != "upright" or hasty[-1:] != [target.index]:
+                return await bring(target, how)
+            return await slipped(person, target, 9.0) if hasty.pop() == 6 else Brought.DONE  # still at the pin
+
+        person.bring = hastily
+        day = Day(person, tmp_path / "rig.toml", HostClock(), armed=False)
+        await ArmStep().teach(day)
+        await TipStep().teach(day)
+    warned = [line.removeprefix("warning: ")[:6] for line in person.lines if line.startswith("warning: Hold ")]
+    assert warned == ["Hold 1", "Hold 1", "Hold 1", "Hold 7"]
+    assert len(day.notebook.touched("upright")) == 12
+    taught = TipStep().derived(day.notebook)["robot.tcp_rotation_deg"]
+    assert "12 times" in taught.how
+    axis = Rotation.from_euler("ZYX", np.array(taught.value)[::-1], degrees=True).apply([0.0, 0.0, 1.0])
+    true = np.array(truth(person.lab.facts, None)["tool"]["brush_axis"])
+    assert math.degrees(math.acos(float(axis @ true))) < 0.2
+
+
+@pytest.mark.parametrize(("count", "tilt_deg"), [(0, 0.0), (2, 0.0), (8, 10.0)])
+def test_a_direction_that_too_few_or_scattered_holds_give_is_not_measured_and_not_plausible(
+    count: int, tilt_deg: float
+) -> None:
+    """A scatter of ten degrees must not make a square brush more likely."""
+    notebook = Notebook()
+    for number in range(8):
+        pin = leaning(320.0, 150.0, 90.0, 90.0 * number + 20.0 * (number // 4), 30.0, wrist_deg=0.0)
+        notebook = notebook.with_touch(f"pin {number}", touch_of(pin))
+    for number in range(count):
+        hold = leaning(320.0, 150.0, 90.0, 45.0 * number, tilt_deg, wrist_deg=90.0 * number)
+        notebook = notebook.with_touch(f"upright {number}", touch_of(hold))
+    taught = TipStep().derived(notebook)["robot.tcp_rotation_deg"]
+    assert (taught.value, taught.known) == ([0.0, 0.0, 0.0], "not measured")
+    assert brush_square((0.0, 0.0, 0.0)).verdict == "not measured"
+
+
+BOARD_MM = {"lower left": (0.0, 0.0), "lower right": (0.0, -312.0), "upper left": (240.0, 0.0)}
+"""From its lower left corner along the base axes: the board is turned by -90 deg."""
+
+
+def taught(value: Value) -> Taught:
+    return Taught(value=value, how="typed", at=now_utc(), step="tip")
+
+
+def touched_from(x_mm: float, y_mm: float) -> Notebook:
+    """All corners but the upper right one, the lower left one at (x, y)."""
+    notebook = Notebook().with_values(
+        {
+            "robot.tcp_offset_mm": taught([0.0, 0.0, 180.0]),
+            "board.squares": taught([26, 20]),
+            "board.square_mm": taught(12.0),
+            "board.marker_mm": taught(9.0),
+            "board.dictionary": taught("DICT_5X5_1000"),
+        }
+    )
+    for corner, (x, y) in BOARD_MM.items():
+        notebook = notebook.with_touch(f"{BOARD} 0 {corner}", touch_of(brush_pose(x_mm + x, y_mm + y, 300.0)))
+    return notebook
+
+
+@pytest.mark.parametrize(
+    ("lower_left_mm", "way_out"),
+    [
+        ((560.0, 312.0), "by 100 mm nearer to its foot, from which that corner is 800 mm,"),
+        ((-440.0, 312.0), "by 50 mm away from its foot, to which that corner is too near,"),
+        ((200.0, 312.0), "nearer to it, or turn its wrist the other way round,"),
+    ],
+)
+def test_a_corner_that_the_arm_does_not_reach_is_named_with_how_far_to_move_the_board(
+    lower_left_mm: tuple[float, float], way_out: str
+) -> None:
+    with pytest.raises(CannotTeach) as refused:
+        all_corners(touched_from(*lower_left_mm), BOARD, "board")
+    assert refused.value.what == "not touched: board upper right."
+    assert f"move the board with the sheet {way_out} and touch all corners again" in refused.value.way_out
+
+
+SPEC = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
+LAID = Margins(38.0, 27.0, 31.0, 35.0)
+PX_PER_MM = 3.0
+
+
+def photograph(laid: Margins) -> np.ndarray:
+    """The board with a plain sheet on it, slanted as a camera beside it sees it, with noise."""
+    width, height = size_mm(SPEC)
+    size = (round(width * PX_PER_MM), round(height * PX_PER_MM))
+    picture = charuco_board(SPEC, "").generateImage(size, marginSize=0)
+    left, right = round(laid.left * PX_PER_MM), size[0] - round(laid.right * PX_PER_MM)
+    upper, lower = round(laid.upper * PX_PER_MM), size[1] - round(laid.lower * PX_PER_MM)
+    picture[upper:lower, left:right] = 240
+    corners = np.array([[0, 0], [size[0], 0], [size[0], size[1]], [0, size[1]]], np.float32)
+    seen_at = np.array([[90, 60], [1020, 40], [1060, 800], [60, 780]], np.float32)
+    slanted = cv2.warpPerspective(picture, cv2.getPerspectiveTransform(corners, seen_at), (1120, 840), borderValue=150)
+    noisy = cv2.GaussianBlur(slanted, (0, 0), 0.8) + np.random.default_rng(1).normal(0.0, 3.0, slanted.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def test_the_edges_of_the_sheet_are_seen_to_half_a_mm() -> None:
+    picture = photograph(LAID)
+    seen = seen_margins(picture, find_board(picture, SPEC, "camera"), SPEC, LAID)
+    assert seen is not None
+    assert seen.off_mm(LAID.left, LAID.right, LAID.lower, LAID.upper) < 0.5
+    assert check_seen(seen, LAID) < 0.5
+
+
+def test_margins_follow_from_the_touched_board_and_sheet() -> None:
+    assert touched_margins((-38.0, -31.0), (247.0, 174.0), SPEC) == LAID
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        (Margins(27.0, 38.0, 35.0, 31.0), "turned by half a turn"),
+        (Margins(27.0, 38.0, 31.0, 35.0), "left and right corners were taken for one another, as in a mirror"),
+        (Margins(38.0, 27.0, 35.0, 31.0), "lower and upper corners were taken"),
+        (Margins(33.0, 32.0, 31.0, 35.0), r"left 3[78]\.\d mm \(33\.0 touched\)"),
+    ],
+)
+def test_a_sheet_that_was_named_or_touched_otherwise_is_recognised(named: Margins, said: str) -> None:
+    picture = photograph(LAID)
+    seen = seen_margins(picture, find_board(picture, SPEC, "camera"), SPEC, named)
+    assert seen is not None
+    with pytest.raises(CannotTeach, match=said) as refused:
+        check_seen(seen, named)
+    assert "touch" in refused.value.way_out.lower()
+
+
+def test_a_board_without_a_sheet_has_no_edges_to_be_seen() -> None:
+    bare = photograph(Margins(150.0, 150.0, 110.0, 110.0))
+    assert seen_margins(bare, find_board(bare, SPEC, "camera"), SPEC, LAID) is None
+
+
+def test_each_proof_is_recorded_in_a_new_folder_beside_the_rig(tmp_path: Path) -> None:
+    rig = tmp_path / "lab.toml"
+    first, second = folder_beside(rig), folder_beside(rig)
+    assert [first.name, second.name] == ["lab.proof-1", "lab.proof-2"]
+    assert first.is_dir()
+    assert second.is_dir()
+
+
+class Refusing:
+    """A person who leaves the arm where it is."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    async def show(self, what: Shown) -> None:
+        pass
+
+    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
+        self.asked.append(question)
+        return default
+
+
+@pytest.mark.parametrize(("armed", "said"), [(False, "with --arm"), (True, "left where it is")])
+async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators_key(
+    armed: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def no_run(*_: object, **__: object) -> Path:
+        raise AssertionError("the arm would have moved")
+
+    async def answered(*_: object) -> None:
+        pass
+
+    monkeypatch.setattr(ProofStep, "_run", no_run)
+    monkeypatch.setattr(ProofStep, "_doctor", answered)
+    monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
+    person = Refusing()
+    with pytest.raises(CannotTeach, match=said):
+        await ProofStep().teach(Day(person, tmp_path / "rig.toml", HostClock(), armed=armed))  # type: ignore[arg-type]
+    assert len(person.asked) == armed
+    assert all("The arm moves by itself, slower than 50 mm/s" in question for question in person.asked)
+
+
+@pytest.mark.parametrize("dry", [True, False])
+async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
+    dry: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_engine(*_: object, **__: object) -> None:
+        raise AssertionError("the arm would have moved")
+
+    text = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
+    low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
+    monkeypatch.setattr(proof, "_with_lens_at", lambda _: low)
+    monkeypatch.setattr(proof, "DryRunEngine" if dry else "Engine", no_engine)
+    day = Day(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)  # type: ignore[arg-type]
+    protocol = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
+    with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):
+        await ProofStep()._run(day, tmp_path, protocol, dry=dry)
+
+
+def test_every_move_of_the_proof_is_slower_than_50_mm_s(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0")))
+    rig = load_rig(path)
+    slow = slowly(rig)
+    assert rig.motion.travel_speed_mm_s > 50.0, "otherwise faster"
+    assert max(slow.motion.travel_speed_mm_s, slow.motion.press_speed_mm_s) < 50.0
+    assert slow.robot.limits.speed_mm_s <= 50.0, "the driver refuses more"
+
+
+async def test_the_flange_is_shown_and_the_tip_once_it_is_taught(tmp_path: Path) -> None:
+    server = ArcsServer(World(SimConfig()))
+    await server.start("127.0.0.1", 0)
+    guide = ScreenGuide()
+    day = Day(guide, tmp_path / "rig.toml", HostClock(), armed=False)
+    for field, value in (("host", "127.0.0.1"), ("port", server.port), ("framing", "sof")):
+        day.keep("arm", f"robot.{field}", value, "typed")
+    async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking), asyncio.timeout(20.0):
+        while guide.view.tip is None:
+            await asyncio.sleep(0.01)
+        assert not guide.view.tip_known
+        assert guide.view.tip.position_mm == pytest.approx((250.0, -230.0, 440.0), abs=0.01)
+        day.keep("tip", "robot.tcp_offset_mm", [0.0, 0.0, 180.0], "typed", unit="mm")
+        while not guide.view.tip_known:
+            await asyncio.sleep(0.01)
+        assert guide.view.tip.position_mm == pytest.approx((250.0, -230.0, 260.0), abs=0.01)
+    assert guide.view.tip is None
+    await server.stop()
