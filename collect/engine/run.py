@@ -147,8 +147,8 @@ class Run:
 
     async def _new_sheet(self) -> None:
         sheet = self.context.store.state.sheet
-        text = f"Put a new sheet in for sheet {sheet + 1}, then go on."
-        choices = (Choice(GO_ON, f"sheet {sheet + 2} is in, and blank"), KEEP_SHEET)
+        text = f"Replace sheet {sheet + 1} by a blank one, then go on."
+        choices = (Choice(GO_ON, f"the blank sheet lies there: it becomes sheet {sheet + 2}"), KEEP_SHEET)
         await self._once_arm_is_free(self._recover)
         if await self.context.asker.ask_or_default(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
             self.context.fresh_sheet()

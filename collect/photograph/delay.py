@@ -108,7 +108,8 @@ class CameraDelay:
 
     def __str__(self) -> str:
         delay_ms, resolution_ms, spread_ms = (1e3 * v for v in (self.delay_s, self.resolution_s, self.spread_s))
-        return f"{delay_ms:.0f} ± {resolution_ms:.0f} ms, varying by {spread_ms:.0f} ms over {len(self.looks)} trips"
+        trips = f"{len(self.looks)} trips, which differ by {spread_ms:.0f} ms"
+        return f"{delay_ms:.0f} ± {resolution_ms:.0f} ms (from {trips})"
 
 
 def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None:

@@ -269,5 +269,6 @@ def check_page(checks: list[Check]) -> Text:
         if check.remedy:
             page.append(f"{'':14}{check.remedy}\n", "dim")
     counts = Counter(check.verdict for check in checks)
-    page.append(", ".join(f"{counts[verdict]} {verdict}" for verdict in COLOURS))
+    plausible, contradicting, unknown = (counts[verdict] for verdict in COLOURS)
+    page.append(f"{plausible} values are plausible, {contradicting} contradict others, {unknown} were not measured")
     return page

@@ -118,9 +118,9 @@ def target_text(now: Snapshot) -> str:
 def _force(now: Snapshot, room: int) -> str:
     if now.force_n is None:
         return "not measured now" if now.state in FINAL else "no force sensor, or silent"
-    ceiling = "" if now.force_ceiling_n is None else f" of {now.force_ceiling_n:g} N at most"
+    ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
     force = f"{now.force_n:6.3f} N{ceiling}  "
-    scale = f"0 to {scale_n(now.trace_n[-LONGEST_TRACE:]):g} N "
+    scale = f"plotted to {scale_n(now.trace_n[-LONGEST_TRACE:]):g} N "
     width = max(0, min(room - len(force) - len(scale), LONGEST_TRACE))
     return force + (scale + spark(now.trace_n, width) if width else "")
 
@@ -253,7 +253,7 @@ class CapturePane(Vertical):
     def show(self, last: LastCapture | None) -> None:
         """Draw this capture if it is a new one."""
         if last is None:
-            self._words.show(Content.styled("nothing captured by this process yet", "dim"))
+            self._words.show(Content.styled("no photograph yet since this start", "dim"))
             return
         if last is not self._shown:
             self._since_s = self._now_s()

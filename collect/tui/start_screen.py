@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from brushloop.sessions.show import Details, Summary
 
 KEYS = (
-    ("enter", "resume or look"),
+    ("enter", "open"),
     ("n", "new session"),
     ("d", "rig health"),
     ("e", "files"),
@@ -124,7 +124,7 @@ class StartScreen(Screen[None]):
 
     def reread(self) -> None:
         """Read the list of sessions again and show it."""
-        self._title.show(f"brushloop   sessions in {one_line(str(self._browser.paths.root))}")
+        self._title.show(f"brushloop   folder of the sessions: {one_line(str(self._browser.paths.root))}")
         try:
             self._rows = self._browser.recent()
         except (SessionError, OSError) as error:

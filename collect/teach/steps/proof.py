@@ -131,7 +131,7 @@ class ProofStep(Step):
             day.keep("proof", "aside.plane", plane_mm, how, unit="mm", sigma=sigma)
             delay_ms = proven.delay_ms
             how = "the arm was seen to leave the picture later than it did"
-            known_to = f"varying by {proven.jitter_ms:.0f} ms"
+            known_to = f"trips differ by {proven.jitter_ms:.0f} ms"
             day.keep("proof", "camera.latency_ms", delay_ms, how, unit="ms", known=known_to)
         await day.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",

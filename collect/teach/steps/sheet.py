@@ -237,5 +237,6 @@ def in_words(fit: SheetFit) -> tuple[str, ...]:
         f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to {fit.origin_sigma_mm:.2f} mm "
         f"(goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} +- {fit.yaw_sigma_deg:.2f} deg, leaning by "
         f"{fit.plane.plane.slope_deg:.2f} deg",
-        f"largest residual: {worst}, {fit.residuals_mm[worst]:.2f} mm; board {100 * fit.scale:.2f} % of its print",
+        f"largest residual: {worst}, {fit.residuals_mm[worst]:.2f} mm; "
+        f"the board measures {100 * fit.scale:.2f} % of its printed size",
     )

@@ -91,8 +91,9 @@ class TipStep(Step):
             await day.say(f"{more} touches will show which one lies off.", tone="warning")
             return False
         await day.say(
-            f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, known to "
-            f"{fit.error_mm:.3f} mm (goal {GOOD_MM:g}); the touches scatter by {max(fit.residuals_mm):.2f} mm at most."
+            f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, with a standard "
+            f"error of {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm); "
+            f"no touch is more than {max(fit.residuals_mm):.2f} mm off."
         )
         return fit.error_mm <= GOOD_MM
 

@@ -154,7 +154,7 @@ def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> No
     engine = lab.engine(watched=True)
     engine.request(OperatorRequest.NEW_SHEET)
     engine.start()
-    answer(engine, "Put a new sheet in for sheet 1", "g")
+    answer(engine, "Replace sheet 1 by a blank one", "g")
     wait_for_end(engine)
     now = engine.snapshot()
     assert now.sheet is not None

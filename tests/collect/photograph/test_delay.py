@@ -78,7 +78,7 @@ def test_several_looks_are_reported_with_their_spread():
     assert delay.delay_s == pytest.approx(0.23)
     assert delay.spread_s == pytest.approx(0.06)
     assert delay.bound_s == pytest.approx(0.30)
-    assert str(delay) == "230 ± 21 ms, varying by 60 ms over 2 trips"
+    assert str(delay) == "230 ± 21 ms (from 2 trips, which differ by 60 ms)"
 
 
 def test_a_trip_in_which_the_computer_stalled_does_not_make_the_camera_later() -> None:

@@ -43,7 +43,7 @@ def test_the_loopback_rig_contradicts_nothing_and_what_is_missing_is_said(rig: P
     assert ran.returncode == 0
     assert "plausible     tool length" in ran.stdout
     assert "not measured  lens                        not calibrated" in ran.stdout
-    assert ran.stdout.rstrip().endswith("15 plausible, 0 contradicts, 7 not measured")
+    assert ran.stdout.rstrip().endswith("15 values are plausible, 0 contradict others, 7 were not measured")
 
 
 @pytest.mark.parametrize(
