@@ -185,6 +185,14 @@ def test_of_the_rig_only_numbers_and_fixed_words_are_sent(rig: Path) -> None:
     assert "usb-lab-7" not in json.dumps(sent)
 
 
+def test_an_archive_is_never_overwritten(rig: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.zip"
+    report.write_bytes(b"mine")
+    ran = brushloop("doctor", "--config", rig, "--report", report)
+    assert (ran.returncode, report.read_bytes()) == (2, b"mine")
+    assert "is not overwritten" in ran.stderr
+
+
 def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
     robot = load_rig(lab.folder / "rig.toml").robot
     rig, report = lab.folder / "new.toml", lab.folder / "report.zip"
