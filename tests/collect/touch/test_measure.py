@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 from dataclasses import replace
@@ -109,6 +110,32 @@ async def test_nothing_within_the_travel_ends_with_the_brush_lifted(
         await measured(bench, method=method, **PATCHES)
     assert bench.lifted
     assert not bench.world.presses
+
+
+async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
+    bench = make_bench()
+    four = [*THREE["points_mm"], (104.0, 76.0)]
+
+    def lower_over_the_bump(pose: Pose) -> Pose:
+        away_mm = math.dist(bench.world.to_paper(pose.x_mm, pose.y_mm), four[-1])
+        return replace(pose, z_mm=pose.z_mm - 1.5) if away_mm < 10.0 else pose
+
+    bench.bent = lower_over_the_bump
+    with pytest.raises(StepError, match="do not lie in a plane: residuals"):
+        await measured(bench, method="force", touches=1, points_mm=four, force={"sigma_mm": 0.05})
+    assert bench.lifted
+
+
+async def test_an_arm_that_was_stopped_is_left_where_it_is(make_bench: MakeBench) -> None:
+    bench = make_bench()
+
+    async def stopped(_samples: int, _axis: tuple[float, float, float], _after_ns: int) -> tuple[float, float, int]:
+        raise asyncio.CancelledError
+
+    bench.tap.average = stopped  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(asyncio.CancelledError):
+        await measured(bench, method="force")
+    assert not bench.lifted
 
 
 async def test_an_arm_that_failed_is_left_where_it_is(make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch) -> None:

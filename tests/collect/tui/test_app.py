@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import io
 import os
 import re
 import signal
@@ -19,6 +20,7 @@ from brushloop.collect.tui.keys import RUN_KEYS
 from brushloop.collect.tui.question_screens import Confirm
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT
 from brushloop.collect.tui.runner import ScreenCrashed, run_screen
+from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
 from brushloop.collect.tui.text import SOFTWARE_STOP
 from brushloop.collect.tui.widgets import HelpScreen
 from tests.collect.tui.fake import (
@@ -344,3 +346,24 @@ def test_a_screen_that_cannot_begin_stops_the_arm(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(OSError, match="no terminal"):
         run_screen(engine)
     assert engine.calls == ["start", "stop", "join"]
+
+
+def test_writes_to_a_lost_terminal_are_lost_and_hurt_nobody() -> None:
+    class Gone(io.StringIO):
+        def write(self, _text: str) -> int:
+            raise OSError(5, "Input/output error")
+
+        def flush(self) -> None:
+            raise OSError(5, "Input/output error")
+
+    file = _LostWrites(Gone())
+    assert file.write("abc") == 3
+    file.flush()
+
+
+def test_a_hang_up_does_not_start_the_driver_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[str] = []
+    monkeypatch.setattr(TerminalDriver, "start_application_mode", lambda _driver: started.append("start"))
+    driver = TerminalDriver.__new__(TerminalDriver)
+    driver.resume_application_mode()
+    assert started == []
