@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target
+from brushloop.sessions.errors import InputError
 
 
 def test_a_target_has_the_ending_of_what_is_written_and_is_not_what_is_read(tmp_path: Path) -> None:
@@ -45,7 +46,7 @@ def test_where_it_is_to_be_written_is_looked_at_before_any_work(
     with monkeypatch.context() as patch:
         patch.setattr("brushloop.calibrate.writing.plan.pressed", None)  # not called: it takes minutes
         ran = CliRunner().invoke(app, [*words])
-    assert isinstance(ran.exception, CalibrationError)
+    assert isinstance(ran.exception, InputError)
     assert str(ran.exception) == f"{tmp_path / 'taken'}: is a file; a folder is needed"
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 

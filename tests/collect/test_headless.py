@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def wait_for_presses(lab: Lab, count: int) -> None:
-    wait_until(lambda: len(lab.rig.world.presses) >= count, f"{count} presses")
+    wait_until(lambda: len(lab.rig.world.presses) >= count, f"{count} presses", process=lab.processes[-1])
 
 
 def test_a_signal_stops_the_arm_and_the_same_command_goes_on(lab: Lab) -> None:
