@@ -134,7 +134,7 @@ def leave_cell_out(
     published = FittedPress(radius_mm, length_mm)
     left_out = leave_out(cells)
     jobs = [Refit.of(others, grid, radius_mm, length_mm, prior) for _, others in left_out]
-    with threads() as scheduler:
+    with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
         presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
     predicted, errors = list[Predicted](), [np.empty((0, 2))]
     for (fold, _), job, press in zip(left_out, jobs, presses, strict=True):
