@@ -14,11 +14,11 @@ from typer.core import TyperGroup
 
 import brushloop.calibrate.cli
 import brushloop.calibrate.cli_camera
+import brushloop.calibrate.cli_train
 import brushloop.calibrate.validate.cli
 import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
 import brushloop.collect.cli_rig
-import brushloop.model.generator.cli
 import brushloop.sessions.cli
 import brushloop.twin.cli
 from brushloop.calibrate.path_or_command import PathOrCommand
@@ -34,7 +34,7 @@ EXIT_CODES = {
     5: "finished, but a required score was missed (`validate --gate`), the camera drifted, or the rig's settings "
     "contradict each other",
     6: "a recording is damaged: `brushloop sessions repair`",
-    130: "interrupted by Ctrl-C; `collect`, `train` and `sim` end in order instead, with a code from above",
+    130: "interrupted by Ctrl-C; `collect` and `sim` end in order instead, with a code from above",
 }
 """What each exit code of every command means."""
 
@@ -131,7 +131,7 @@ write.command("learn")(brushloop.calibrate.writing.cli.learn)
 write.command("practice")(brushloop.calibrate.writing.cli.practice)
 write.command("fit")(brushloop.calibrate.writing.cli.fit)
 app.add_typer(write, name="write")
-app.add_typer(brushloop.model.generator.cli.app, name="train", result_callback=brushloop.calibrate.cli.training_page)
+app.add_typer(brushloop.calibrate.cli_train.app, name="train")
 
 
 @app.command()

@@ -108,14 +108,6 @@ def preprocess(
     say(str(out))
 
 
-def training_page(folder: Path | None, **_: object) -> None:
-    """Write the page of a finished training; `folder` is what the commands of `brushloop train` return."""
-    if folder is not None:
-        from brushloop.calibrate.pages.training import write_training_page
-
-        say(f"Page: {write_training_page(folder)}")
-
-
 def fit(
     session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
     mm_per_px: Annotated[

@@ -1,4 +1,7 @@
-"""The page of a training: held-out strokes as the network draws them, losses, and what the generator is."""
+"""What is written beside a trained generator: its card in Markdown, and the page of its training.
+
+The page shows held-out strokes as the network draws them, and the losses.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
-    Image,
     Point,
     dress,
     ink_uri,
@@ -22,68 +25,58 @@ from brushloop.calibrate.report import (
     shortened,
     write_page,
 )
-from brushloop.model.generator.card import NUMBERS, load_samples, read_curves
-from brushloop.model.generator.config import INPUTS, TrainConfig
-from brushloop.model.generator.data import sha256
-from brushloop.model.generator.stroke import read_generator
+from brushloop.model.generator.config import INPUTS
+from brushloop.model.generator.data import TuningFiles, sets, sha256
+from brushloop.model.generator.stroke import GeneratorFile, read_generator
 from brushloop.model.similarity import csim
 
 PAGE = "training.html"
+SAMPLES = 12
 SMOOTH_STEPS = 50
 MAX_POINTS = 2000
 """Points of the loss curve that are drawn, evenly chosen from all."""
 MUCH_ABOVE = 1.5
 """Times its lowest value that the last validation loss may be."""
-EXACT = "exact images of a stroke model"
+NUMBERS = (("MSE", "mse", ".3g"), ("PSNR, dB", "psnr_db", ".2f"), ("IoU", "iou", ".5f"), ("CSIM", "csim", ".5f"),
+           ("SSIM, mean", "ssim", ".5f"), ("SSIM, least", "ssim_min", ".5f"))  # fmt: skip
+"""Label, name and format of the numbers of a report."""
 
 
-def write_training_page(folder: Path) -> Path:
-    """Write the page of the finished training in `folder`; returns its path.
+def write_training(path: Path, tuning: TuningFiles | None = None) -> Path:
+    """Write card and page of a generator that `run_training` has finished; returns the page's path.
 
-    Raises TrainError for a folder that holds no finished training, and OSError.
+    Raises TrainError for captures that it was not tuned on, and OSError.
     """
-    path = folder / "generator.safetensors"
     file = read_generator(path)
-    config, report = file.config, file.report
-    losses, checks = read_curves(folder)
-    label = config.tuning.source if config.tuning else EXACT
+    losses, checks = (
+        np.loadtxt(path.with_name(name), delimiter=",", skiprows=1, ndmin=2) for name in ("loss.csv", "validation.csv")
+    )
+    label = file.config.tuning.source if file.config.tuning else "exact images of a stroke model"
+    facts, trust = list(_facts(file, path)), list(_trust(file, checks))
+    write_whole(path.with_suffix(".md"), _card(path.name, facts, trust))
     return write_page(
-        folder / PAGE,
+        path.with_name(PAGE),
         "training.html.j2",
         label=label,
-        note=_note(config),
-        samples=list(_samples(folder)),
-        images=f"{config.target.size_px} × {config.target.size_px} pixels of {config.target.px_mm:g} mm",
-        verdict=list(_verdict(config, report)),
-        trust=list(_trust(config, report, checks)),
+        note="captured strokes: tuned on some of them, judged by the others"
+        if file.config.tuning
+        else "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated",
+        samples=sorted(_samples(file, tuning), key=lambda sample: sample["csim"]),
+        trust=trust,
         losses=_losses(losses, checks, label),
-        likeness=_likeness(checks, label) if len(checks) > 1 else "",
-        tuned=config.tuning is not None,
-        numbers=list(_numbers(report)),
-        inputs=(
-            ("depth_mm", "mm", config.target.depth_mm, "H, how far the tip is pressed below the paper"),
-            ("tilt_deg", "deg", config.target.tilt_deg, "alpha, the brush axis from the vertical"),
-        ),
-        facts=list(_facts(config, report, path)),
+        facts=facts,
     )
 
 
-def _note(config: TrainConfig) -> str:
-    if config.tuning:
-        return "captured strokes: tuned on some of them, judged by the others"
-    return "the network learns to draw what a closed-form model draws: no ink, neither real nor simulated"
-
-
-def _samples(folder: Path) -> Iterator[dict[str, Any]]:
-    """Target, network and difference of each stroke that the training kept, the worst first."""
-    samples = load_samples(folder)
-    targets, images = (list(np.asarray(stack, np.float32)) for stack in (samples.targets, samples.drawn))
-    scores = [_score(target, drawn) for target, drawn in zip(targets, images, strict=True)]
-    for k in sorted(range(len(scores)), key=lambda k: scores[k]):
-        target, drawn = targets[k], images[k]
+def _samples(file: GeneratorFile, tuning: TuningFiles | None) -> Iterator[dict[str, Any]]:
+    """Target, network and difference of some held-out strokes, spread evenly over them."""
+    _, held_out = sets(file.config, tuning)
+    chosen = np.linspace(0, len(held_out) - 1, min(SAMPLES, len(held_out))).round().astype(int)
+    inputs, targets = held_out.pick(chosen)
+    for values, target, drawn in zip(inputs, targets, file.images(inputs), strict=True):
         yield {
-            "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, samples.inputs[k], strict=True)),
-            "csim": f"{100.0 * scores[k]:.2f}",
+            "name": ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, values, strict=True)),
+            "csim": 100.0 * csim(target, drawn) if target.any() and drawn.any() else 0.0,
             "images": {
                 "target": ink_uri(target),
                 "network": ink_uri(drawn),
@@ -92,28 +85,14 @@ def _samples(folder: Path) -> Iterator[dict[str, Any]]:
         }
 
 
-def _score(target: Image, drawn: Image) -> float:
-    return csim(target, drawn) if target.any() and drawn.any() else 0.0
-
-
-def _verdict(config: TrainConfig, report: dict[str, Any]) -> Iterator[str]:
-    end = f"{report.get('steps')} steps: {report.get('end')}"
-    yield f"The network has {config.weight_count:,} weights and was trained for {end}."
-    score = report.get("csim")
-    if isinstance(score, int | float):
-        which = "captured strokes that were held out" if config.tuning else "strokes that it was not trained on"
-        yield f"On {report.get('images')} {which} its images reach a CSIM of {100.0 * score:.2f} %."
-
-
-def _trust(config: TrainConfig, report: dict[str, Any], checks: NDArray[np.float64]) -> Iterator[Point]:
-    if config.tuning:
-        words = f"Tuned on captures of: {config.tuning.source}. Captures of the same kind are not an independent test."
+def _trust(file: GeneratorFile, checks: NDArray[np.float64]) -> Iterator[Point]:
+    """What to know of it; `checks` (k, 2) are step and MSE of each validation."""
+    if file.config.tuning:
+        yield Point(None, "Tuned on captures: others of the same kind are not an independent test.")
     else:
-        words = "It has seen no ink, so on paper it is no better than the closed-form model that it learned."
-    yield Point(None, words)
+        yield Point(None, "It has seen no real ink, so on paper it is no better than the closed-form model it learned.")
     if len(checks) > 1:
-        best = int(np.argmin(checks[:, 1]))
-        last, lowest = checks[-1, :2], checks[best, :2]
+        last, lowest = checks[-1], checks[np.argmin(checks[:, 1])]
         if last[1] > MUCH_ABOVE * lowest[1]:
             words = f"was lowest at step {lowest[0]:.0f} and is {last[1] / lowest[1]:.1f} times that at the end"
             yield Point(False, f"The validation loss {words}: the network memorises its training strokes.")
@@ -125,45 +104,56 @@ def _trust(config: TrainConfig, report: dict[str, Any], checks: NDArray[np.float
 def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str) -> str:
     """Training loss of the steps with its running mean, and the validation losses: the paper's figure 9."""
     figure, axis = plot(1, 1, (10.0, 3.8))
-    steps = np.arange(1, len(losses) + 1)
+    steps, losses = losses.T
     every = slice(None, None, max(1, -(-len(losses) // MAX_POINTS)))
     axis.semilogy(steps[every], losses[every], color="0.75", lw=0.6, label="training, Eq. 6, each step")
     if len(losses) > 10 * SMOOTH_STEPS:
         mean = np.convolve(losses, np.full(SMOOTH_STEPS, 1.0 / SMOOTH_STEPS), "valid")
-        axis.semilogy(
-            steps[SMOOTH_STEPS - 1 :][every], mean[every], color=BLUE, lw=1.2, label=f"mean of {SMOOTH_STEPS} steps"
-        )
-    if len(checks):
-        axis.semilogy(checks[:, 0], checks[:, 1], ".-", color=ORANGE, lw=1.2, label="validation, MSE")
+        label_of_mean = f"mean of {SMOOTH_STEPS} steps"
+        axis.semilogy(steps[SMOOTH_STEPS - 1 :][every], mean[every], color=BLUE, lw=1.2, label=label_of_mean)
+    axis.semilogy(*checks.T, ".-", color=ORANGE, lw=1.2, label="validation, MSE")
     dress(axis, f"losses ({shortened(label, 60)})", "step", "loss", legend=True)
     return plot_uri(figure)
 
 
-def _likeness(checks: NDArray[np.float64], label: str) -> str:
-    figure, axis = plot(1, 1, (6.4, 3.4))
-    for column, name, colour in ((3, "CSIM", BLUE), (2, "IoU", ORANGE)):
-        axis.plot(checks[:, 0], 100.0 * checks[:, column], ".-", color=colour, lw=1.2, label=name)
-    dress(axis, f"likeness on held-out strokes ({shortened(label, 60)})", "step", "percent", legend=True)
-    return plot_uri(figure)
-
-
-def _numbers(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for label, name, form in NUMBERS:
-        value = report.get(name)
-        if isinstance(value, int | float):
-            yield label, format(value, form)
-
-
-def _facts(config: TrainConfig, report: dict[str, Any], path: Path) -> Iterator[tuple[str, str]]:
-    target = config.target
+def _facts(file: GeneratorFile, path: Path) -> Iterator[tuple[str, str]]:
+    config, report, target, tuning = file.config, file.report, file.config.target, file.config.tuning
+    side_mm = target.size_px * target.px_mm
+    yield "generator", f"{path.name}, sha256 {sha256(path)}"
+    yield "learned from", f"exact area coverage of the stroke model {target.model}"
+    if tuning:
+        yield "tuned on", f"captures of {tuning.source}, sha256 {tuning.captures_sha256}"
+        yield "started from", f"sha256 {tuning.start_sha256}"
+    fitted = " (fitted to captures)" if target.fitted_brush else ""
+    yield "brush", f"R {target.radius_mm:g} mm, L {target.length_mm:g} mm, lambda {target.lam:.5g}{fitted}"
+    low, high = zip(target.depth_mm, target.tilt_deg, strict=True)
+    yield "inputs", f"H from {low[0]:g} to {high[0]:g} mm, alpha from {low[1]:g} to {high[1]:g} deg"
     yield (
-        "stroke model",
-        f"{target.model}, R {target.radius_mm:g} mm, L {target.length_mm:g} mm, λ {target.lam:.5g}",
+        "image",
+        f"{target.size_px} x {target.size_px} px of {target.px_mm:g} mm ({side_mm:g} mm a side), ink 1 on 0, "
+        f"placement {target.placement}, heading 0",
     )
-    yield "network", ", ".join(f"{name} {value}" for name, value in config.layers.model_dump().items())
-    yield "training", f"{config.batch} images a step, seed {config.seed}, highest rate {config.learning_rate:g}"
-    if config.tuning:
-        yield "captures", f"{config.tuning.source}, sha256 {config.tuning.captures_sha256}"
-        yield "started from", f"sha256 {config.tuning.start_sha256}"
-    yield "CPU time", f"{report.get('cpu_s')} s since the last start; torch {report.get('torch')}"
-    yield "generator", f"{path.name}, sha256 {sha256(path)}; its card is {path.with_suffix('.md').name}"
+    layers = ", ".join(f"{name} {value}" for name, value in config.layers.model_dump().items())
+    yield "network", f"{config.weight_count:,} weights; {layers}"
+    yield (
+        "training",
+        f"{report.get('steps')} steps of {config.batch}, seed {config.seed}, highest rate {config.learning_rate:g}: "
+        f"{report.get('end')}; torch {report.get('torch')}",
+    )
+    images = "captured strokes that were held out" if tuning else "exact images that it was not trained on"
+    yield "judged by", f"{report.get('images')} {images}; {report.get('ssim_settings')}"
+    for name, key, form in NUMBERS:
+        if isinstance(value := report.get(key), int | float):
+            yield name, format(value, form)
+
+
+def _card(name: str, facts: list[tuple[str, str]], trust: list[Point]) -> str:
+    """The card as Markdown, without characters of other people's texts that Markdown or HTML would interpret."""
+    lines = [f"# {name}", "", "A network that draws the press of a brush.", "", "| | |", "|---|---|"]
+    lines += [f"| {what} | {_plain(text)} |" for what, text in facts]
+    lines += ["", "## Limits", "", *(f"- {_plain(point.text)}" for point in trust if not point.good)]
+    return "\n".join(lines) + "\n"
+
+
+def _plain(text: str) -> str:
+    return "".join(c if c.isalnum() or c in " .,;-_()/:+" else "?" for c in text)

@@ -144,30 +144,28 @@ def tuned_by_cell(
                 write_captures(aligned, captures, fold, fit)
             what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
 
-            def stepped(step: int, *_: float, what: str = what, before: int = number * steps) -> None:
+            def stepped(step: int, what: str = what, before: int = number * steps) -> None:
                 progress(what, before + step, len(folds) * steps)
 
-            _tune(folder, captures, generator, str(session.header.source), steps, stepped)
+            _tune(folder, captures, generator, steps, stepped)
         files |= dict.fromkeys(fold, path)
     return files
 
 
-def _tune(folder: Path, captures: Path, generator: Path, source: str, steps: int, stepped: Callable[..., None]) -> None:
+def _tune(folder: Path, captures: Path, generator: Path, steps: int, stepped: Callable[[int], None]) -> None:
     from brushloop.model.generator.data import TuningFiles
     from brushloop.model.generator.train import run_training
 
     files = TuningFiles(generator, captures)
     config = files.config(
-        source,
         HELD_OUT,
         steps=steps,
         learning_rate=LEARNING_RATE,
         seed=0,
-        validate_every=steps,
+        validate_every=max(1, steps // 4),
         picture_every=steps,
-        checkpoint_every=max(1, steps // 4),
     )
-    run_training(config, folder, stepped, lambda: False, files)
+    run_training(config, folder, stepped, files)
 
 
 def _placed(prepared: Prepared, target: Target) -> Image:

@@ -13,7 +13,7 @@ SHIPPED_GENERATOR = Path(__file__).parent / "data" / "generator.safetensors"
 
 
 class TrainError(Exception):
-    """A generator, a checkpoint, a configuration or a set of captures that cannot be used."""
+    """A generator, checkpoint, configuration or captures that cannot be used, or a training that fails with them."""
 
     exit_code: ClassVar[int] = 2
 
@@ -21,13 +21,3 @@ class TrainError(Exception):
         self.path = str(path)
         self.what = what
         super().__init__(f"{path}: {what}")
-
-
-class TrainingStopped(Exception):
-    """Training cannot usefully continue, or was asked to stop, at `step`; the last checkpoint is complete."""
-
-    exit_code: ClassVar[int] = 4
-
-    def __init__(self, step: int, what: str) -> None:
-        self.step = step
-        super().__init__(f"step {step}: {what}")

@@ -163,7 +163,7 @@ class TrainConfig(_Table):
     picture_every: Annotated[int, Field(ge=1)] = 1_000
     """m of Algorithm 1."""
     validate_every: Annotated[int, Field(ge=1)] = 250
-    checkpoint_every: Annotated[int, Field(ge=1)] = 250
+    """Steps from one validation, after which the checkpoint is written, to the next."""
     learning_rate: Annotated[float, Field(gt=0, le=1)] = 5e-3
     """Peak: the rate rises over `warmup_steps`, then falls along half a cosine to 0 at the last step."""
     warmup_steps: Annotated[int, Field(ge=0)] = 50
@@ -171,14 +171,8 @@ class TrainConfig(_Table):
     """w of Eq. 6 where the target is ink; w is 1 where it is paper."""
     target_mse: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Converged when the validation MSE is at most this; 0 disables."""
-    patience: Annotated[int, Field(ge=0)] = 0
-    """Converged after this many validations in a row without a gain of 1 %; 0 disables."""
-    blank_after: Annotated[int, Field(ge=1)] = 2
-    """Number of validations in a row with blank output that ends the training."""
     tuning: Tuning | None = None
     """Origin of weights and images when training on captures."""
-    threads: Annotated[int, Field(ge=1, le=256)] = 1
-    """Threads of torch; a different number changes the last bits of the weights."""
     device: Literal["cpu", "cuda"] = "cpu"
     """The device that trains: the CPU, or the first NVIDIA GPU."""
 
@@ -201,11 +195,11 @@ PRESETS: dict[str, Target] = {
 """Both draw the paper's presses (section IV-B): `press` centred, `anchored` on the validation's millimetre field."""
 
 
-def preset(name: str, **changes: Any) -> TrainConfig:
-    """Make the configuration of a preset with fields changed. Raises TrainError for an unknown name or bad field."""
+def preset(name: str) -> TrainConfig:
+    """The configuration of a preset. Raises TrainError for an unknown name."""
     if name not in PRESETS:
         raise TrainError(name, f"no such target; known: {', '.join(PRESETS)}")
-    return checked(f"target {name}", {"target": PRESETS[name], **changes})
+    return TrainConfig(target=PRESETS[name])
 
 
 def load_config(path: Path) -> TrainConfig:

@@ -54,18 +54,26 @@ class TuningFiles:
     start: Path
     captures: Path
 
-    def config(self, source: str, held_out: float, **changes: Any) -> TrainConfig:
+    def config(self, held_out: float, **changes: Any) -> TrainConfig:
         """The configuration of the generator to start from, with fields changed. Raises TrainError."""
+        start = read_generator(self.start).config
+        _, source = load_captures(self.captures, start.target)
         hashes = {"start_sha256": sha256(self.start), "captures_sha256": sha256(self.captures)}
         tuning = {**hashes, "source": source, "held_out": held_out}
-        return checked("tune", read_generator(self.start).config.model_dump() | changes | {"tuning": tuning})
+        return checked("tune", start.model_dump() | changes | {"tuning": tuning})
 
 
-def exact_sets(config: TrainConfig) -> tuple[Images, Images]:
-    """The training and the validation set of a configuration."""
+def sets(config: TrainConfig, tuning: TuningFiles | None = None) -> tuple[Images, Images]:
+    """The training and the validation set of a configuration. Raises TrainError for captures that are not its own."""
     target, seed = config.target, config.seed
-    training = target.draw(config.training_images, (seed, _TRAINING))
-    return Images(target, training), Images(target, target.draw(config.validation_images, (seed, _VALIDATION)))
+    if config.tuning is None:
+        training = target.draw(config.training_images, (seed, _TRAINING))
+        return Images(target, training), Images(target, target.draw(config.validation_images, (seed, _VALIDATION)))
+    if tuning is None:
+        raise TrainError("captures", "this training learns from captures; name their file")
+    if sha256(tuning.captures) != config.tuning.captures_sha256:
+        raise TrainError(tuning.captures, "is not the file that this training learns from")
+    return split(load_captures(tuning.captures, target)[0], seed, config.tuning.held_out)
 
 
 def split(captures: Images, seed: int, held_out: float) -> tuple[Images, Images]:

@@ -79,25 +79,18 @@ class GeneratorModel(StrokeModel):
 
 
 def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorModel:
-    """Load `generator.safetensors` as a stroke model.
+    """Load `generator.safetensors` as a stroke model: the paper's CCD-BSMG for CCD-BSM, else `<model>-generator`.
 
-    Raises TrainError for a file that cannot be used, and if it was trained for another brush than this.
+    It is `fitted` if it was tuned on captures, or its brush was fitted to some. Raises TrainError for a file that
+    cannot be used, and if it was trained for another brush than this.
     """
     file = read_generator(Path(path))
+    target, is_tuned = file.config.target, file.config.tuning is not None
     if brush is not None:
         for name in ("radius_mm", "length_mm"):
-            trained, wanted = getattr(file.config.target, name), float(as_numpy(getattr(brush, name)))
+            trained, wanted = getattr(target, name), float(as_numpy(getattr(brush, name)))
             if wanted != trained:
                 raise TrainError(path, f"was trained for a brush with {name} = {trained:g}, not {wanted:g}")
-    return generator_model(file)
-
-
-def generator_model(file: GeneratorFile) -> GeneratorModel:
-    """The stroke model of a generator: the paper's CCD-BSMG for CCD-BSM, else called `<model>-generator`.
-
-    It is `fitted` if it was tuned on captures, or its brush was fitted to some.
-    """
-    target, is_tuned = file.config.target, file.config.tuning is not None
     learned = target.stroke_model
     paper = learned.name == "ccd-bsm"
     tuned = ", then tuned on captured strokes" if is_tuned else ""
@@ -153,7 +146,9 @@ def read_generator(path: Path) -> GeneratorFile:
     metadata, tensors = read_tensors(path, 4 * MAX_WEIGHTS + 2**26)
     if metadata.get("format") != FORMAT:
         raise TrainError(path, f"format is {metadata.get('format', 'missing')[:60]!r}, expected {FORMAT!r}")
-    config = checked(path, _table(path, "config", metadata.get("config", "")))
+    fields = _table(path, "config", metadata.get("config", ""))
+    # What only steered the training of an earlier version says nothing about the images.
+    config = checked(path, {name: value for name, value in fields.items() if name in TrainConfig.model_fields})
     wanted = config.layers.shapes(config.target.size_px)
     for name in sorted(wanted.keys() ^ tensors.keys()):
         raise TrainError(path, f"tensor {name[:100]!r} is {'missing' if name in wanted else 'not known'}")

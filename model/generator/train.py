@@ -6,9 +6,9 @@ in pixels, positive inside, with coverage = clamp(1/2 + field, 0, 1). The field 
 where coverage jumps, and pixels far from the boundary are exactly 0 or 1, so the network spends no capacity on them.
 `model.generator.stroke` computes the same images in numpy.
 
-The algorithm samples H and alpha, draws the stroke, compares and updates, until convergence. A folder holds
-`checkpoint.pt` during and after training, `generator.safetensors` with its card `generator.md` at the end, and what
-`model.generator.card` writes. The same training started again resumes at the last checkpoint.
+The algorithm samples H and alpha, draws the stroke, compares and updates. A folder holds `checkpoint.pt` during and
+after training, pictures, the losses as CSV (the paper's figure 9), and at the end `generator.safetensors`. The same
+training started again resumes at the last checkpoint.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import io
 import json
 import math
 import pickle
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from filelock import FileLock, Timeout
@@ -30,37 +30,17 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 from torch import Tensor, nn
 
-from brushloop.model.generator import TrainError, TrainingStopped
-from brushloop.model.generator.card import (
-    Samples,
-    likeness,
-    report_of,
-    save_samples,
-    write_card,
-    write_curves,
-    write_pictures,
-)
+from brushloop.model.generator import TrainError
 from brushloop.model.generator.config import INPUTS, Layers, Target, TrainConfig, differences
-from brushloop.model.generator.data import (
-    Images,
-    TuningFiles,
-    batch_numbers,
-    exact_sets,
-    load_captures,
-    sha256,
-    split,
-    write_whole,
-)
+from brushloop.model.generator.data import Images, Singles, TuningFiles, batch_numbers, sets, write_whole
 from brushloop.model.generator.stroke import FORMAT, read_generator
+from brushloop.model.similarity import SSIM_SETTINGS, binary_scores, csim, ssim
 
-Progress = Callable[[int, float, float], None]
-"""Called after each step with its number, Eq. 6 of its batch, and the MSE of the last validation (NaN before one)."""
-BLANK_SHARE = 0.05
-"""Output is blank if its ink, or its paper, is less than this share of the targets' ink or paper."""
+BLANK_SHARE, BLANKS = 0.05, 2
+"""Output is blank if its ink, or its paper, is less than this share of the targets' ink or paper; so many blank
+validations in a row end the training."""
 SHOWN = 8
 """Validation strokes in a picture."""
-MOST_SAMPLES = 12
-_GAIN = 0.99
 
 
 class Generator(nn.Module):
@@ -145,18 +125,25 @@ def squared_error(field: Tensor, target: Tensor, ink_weight: float = 1.0) -> Ten
     return total
 
 
+def likeness(drawn: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
+    """MSE, IoU and CSIM of (B, N, N) images in [0, 1], (B, 3); IoU counts the pixels that are mostly ink.
+
+    A blank image has a CSIM of 0.
+    """
+    mse = np.square(np.subtract(drawn, target, dtype=np.float64)).mean((1, 2))
+    iou = binary_scores(drawn > 0.5, target > 0.5)[:, 1]
+    alike = [csim(a, b) if a.any() and b.any() else 0.0 for a, b in zip(drawn, target, strict=True)]
+    return np.column_stack((mse, iou, alike))
+
+
 def run_training(
-    config: TrainConfig,
-    folder: Path,
-    progress: Progress,
-    stopping: Callable[[], bool] = lambda: False,
-    tuning: TuningFiles | None = None,
+    config: TrainConfig, folder: Path, stepped: Callable[[int], object], tuning: TuningFiles | None = None
 ) -> Path:
     """Train to the end, from the folder's checkpoint if it has one; return the generator's path.
 
-    Sets torch's threads to `config.threads`. Raises TrainError for "cuda" without a GPU and if the folder holds another
-    training or is in use; TrainingStopped if the output stays blank, the loss is no longer a number, or `stopping`
-    returns true.
+    `stepped` is called after each step with its number. torch computes in one thread. Raises TrainError for "cuda"
+    without a GPU, if the folder holds another training or is in use, and if the output stays blank or the loss is no
+    longer a number.
     """
     if config.device == "cuda" and not torch.cuda.is_available():
         raise TrainError("device", "cuda was asked for, but this machine has no usable GPU")
@@ -164,29 +151,17 @@ def run_training(
     path = folder / "generator.safetensors"
     try:
         with FileLock(folder / ".lock", timeout=0):
-            torch.set_num_threads(config.threads)
-            run = _Training(config, folder, progress, _sets(config, tuning))
+            torch.set_num_threads(1)
+            run = _Training(config, folder, *sets(config, tuning))
             run.start(tuning)
-            if run.ended and path.exists():
-                return path
-            began = time.process_time()
-            run.train(stopping)
-            run.finish(path, time.process_time() - began)
+            while not run.ended:
+                run.advance()
+                stepped(run.step)
+            if not path.exists():
+                run.finish(path)
     except Timeout as error:
         raise TrainError(folder, "another training writes here") from error
     return path
-
-
-def _sets(config: TrainConfig, tuning: TuningFiles | None) -> tuple[Images, Images]:
-    """Training and validation images."""
-    if config.tuning is None:
-        return exact_sets(config)
-    if tuning is None:
-        raise TrainError("captures", "this training learns from captures; name their file")
-    if sha256(tuning.captures) != config.tuning.captures_sha256:
-        raise TrainError(tuning.captures, "is not the file that this training learns from")
-    captures, _ = load_captures(tuning.captures, config.target)
-    return split(captures, config.seed, config.tuning.held_out)
 
 
 def new_network(config: TrainConfig) -> Generator:
@@ -202,30 +177,17 @@ def learning_rate(config: TrainConfig, step: int) -> float:
     return config.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * step / config.steps))
 
 
-def converged(config: TrainConfig, errors: list[float]) -> bool:
-    """Whether the validation errors so far meet the target or stopped improving."""
-    if not errors:
-        return False
-    if errors[-1] <= config.target_mse:
-        return True
-    patience = config.patience
-    if not patience or len(errors) <= patience:
-        return False
-    return min(errors[-patience:]) > _GAIN * min(errors[:-patience])
-
-
 @dataclass(slots=True, eq=False)
 class _Training:
-    """A training after `step` steps, with Eq. 6 of every step and the validations so far."""
+    """A training after `step` steps, with Eq. 6 of every step and (step, MSE) of each validation."""
 
     config: TrainConfig
     folder: Path
-    progress: Progress
-    sets: tuple[Images, Images]
+    training: Images
+    held_out: Images
     step: int = 0
     losses: list[float] = field(default_factory=list[float])
-    validations: list[tuple[int, float, float, float]] = field(default_factory=list[tuple[int, float, float, float]])
-    """(step, MSE, IoU, CSIM)."""
+    validations: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])
     blanks: int = 0
     network: Generator = field(init=False)
     optimiser: torch.optim.Adam = field(init=False)
@@ -237,7 +199,8 @@ class _Training:
     @property
     def ended(self) -> bool:
         """Whether all steps are done, or the training has converged."""
-        return self.step == self.config.steps or converged(self.config, [row[1] for row in self.validations])
+        converged = bool(self.validations) and self.validations[-1][1] <= self.config.target_mse
+        return self.step == self.config.steps or converged
 
     def start(self, tuning: TuningFiles | None) -> None:
         """Continue from the folder's checkpoint, or begin with the weights of the generator to tune."""
@@ -250,26 +213,19 @@ class _Training:
                 raise TrainError(tuning.start, f"is another generator: {difference}")
             self.network.load_state_dict({name: torch.from_numpy(value) for name, value in file.weights.items()})
 
-    def train(self, stopping: Callable[[], bool]) -> None:
-        """Make the steps that are left, and what falls due between them."""
-        config, saved = self.config, self.step
-        while not self.ended:
-            stop = stopping()
-            self._update()
-            last = self.step == config.steps
-            if last or self.step % config.validate_every == 0:
-                self._validate()
-            if last or self.step % config.picture_every == 0:
-                self._show()
-            if stop or self.ended or self.step % config.checkpoint_every == 0:
-                saved = self.step
-                self._save()
-            if stop and not last:
-                raise TrainingStopped(saved, "stopped as requested; the same command resumes here")
+    def advance(self) -> None:
+        """Make one step, and what falls due after it."""
+        self._update()
+        last = self.step == self.config.steps
+        if last or self.step % self.config.picture_every == 0:
+            self._show()
+        if last or self.step % self.config.validate_every == 0:
+            self._validate()
+            self._save()
 
     def _update(self) -> None:
         """Make one update by Eq. 6 over the step's batch."""
-        config, images = self.config, self.sets[0]
+        config, images = self.config, self.training
         inputs, target = images.pick(batch_numbers(len(images), config.batch, config.seed, self.step))
         values, wanted = (torch.from_numpy(part).to(config.device) for part in (inputs, target))
         for options in self.optimiser.param_groups:
@@ -280,42 +236,45 @@ class _Training:
         value = float(loss.detach())
         self.step += 1
         if not math.isfinite(value):  # the last good weights stay in the checkpoint
-            raise TrainingStopped(self.step, "the loss is no longer a number; train again with a smaller learning_rate")
+            self._fail("the loss is no longer a number; train again with a smaller learning_rate")
         self.optimiser.step()
         self.losses.append(value)
-        self.progress(self.step, value, self.validations[-1][1] if self.validations else math.nan)
 
     def _validate(self) -> None:
-        """Compute means over the validation set; raise TrainingStopped if the output was blank too often."""
-        sums = np.zeros(5)
-        for drawn, target in self._drawn(self.sets[1]):
-            shares = (images.mean((1, 2)).sum() for images in (drawn, target))
-            sums += [*likeness(drawn, target).sum(0), *shares]
-        mse, iou, csim, ink, wanted = (sums / len(self.sets[1])).tolist()
-        self.validations.append((self.step, mse, iou, csim))
+        """Compute the MSE over the validation set; raise TrainError if the output was blank too often."""
+        sums = np.zeros(3)
+        for drawn, target in self._drawn():
+            sums += (
+                np.square(np.subtract(drawn, target, dtype=np.float64)).mean((1, 2)).sum(),
+                *(images.mean((1, 2)).sum() for images in (drawn, target)),
+            )
+        mse, ink, wanted = (sums / len(self.held_out)).tolist()
+        self.validations.append((self.step, mse))
         is_blank = ink < BLANK_SHARE * wanted or 1 - ink < BLANK_SHARE * (1 - wanted)
         self.blanks = self.blanks + 1 if is_blank else 0
-        if self.blanks >= self.config.blank_after:
+        if self.blanks >= BLANKS:
             what = f"the generator draws {ink:.2%} ink where the targets hold {wanted:.2%}"
-            advice = "train again in a new folder with a smaller learning_rate or a larger ink_weight"
-            raise TrainingStopped(self.step, f"{what}; {advice}")
+            self._fail(f"{what}; train again in a new folder with a smaller learning_rate or a larger ink_weight")
 
-    def _drawn(self, images: Images) -> Any:
-        """(drawn, target) batches of a set, each (n, N, N)."""
-        for numbers in np.array_split(np.arange(len(images)), -(-len(images) // self.config.batch)):
-            inputs, target = images.pick(numbers)
-            yield self._images(inputs), target
+    def _fail(self, what: str) -> None:
+        raise TrainError(self.folder, f"step {self.step}: {what}")
 
-    def _images(self, inputs: NDArray[np.float32]) -> NDArray[np.float32]:
-        with torch.no_grad():
-            return self.network(torch.from_numpy(inputs).to(self.config.device)).cpu().numpy()
+    def _drawn(self) -> Iterator[tuple[Singles, Singles]]:
+        """(drawn, target) batches of the validation set, each (n, N, N)."""
+        count = len(self.held_out)
+        for numbers in np.array_split(np.arange(count), -(-count // self.config.batch)):
+            inputs, target = self.held_out.pick(numbers)
+            with torch.no_grad():
+                drawn = self.network(torch.from_numpy(inputs).to(self.config.device))
+            yield drawn.cpu().numpy(), target
 
     def _show(self) -> None:
-        """Write the picture of Algorithm 1: some validation strokes, and what the network draws for them."""
-        inputs, target = self.sets[1].pick(np.arange(min(SHOWN, len(self.sets[1]))))
+        """Write the picture of Algorithm 1: some validation strokes above what the network draws for them."""
+        drawn, target = (np.hstack(list(images[:SHOWN])) for images in next(self._drawn()))
+        ink = np.rint(255 * (1 - np.vstack((target, drawn)))).astype(np.uint8)
         pictures = self.folder / "pictures"
         pictures.mkdir(exist_ok=True)
-        write_pictures(pictures / f"step-{self.step:07d}.png", Samples(inputs, target, self._images(inputs)))
+        write_whole(pictures / f"step-{self.step:07d}.png", cv2.imencode(".png", ink)[1].tobytes())
 
     @property
     def _checkpoint(self) -> Path:
@@ -344,18 +303,30 @@ class _Training:
             why = f"{type(error).__name__}: {error}".splitlines()[0][:200]
             raise TrainError(path, f"is not a checkpoint of this training: {why}") from error
 
-    def finish(self, path: Path, cpu_s: float) -> None:
-        """Write the generator, its card, the curves and the samples."""
-        config = self.config
-        report = report_of(self._drawn(self.sets[1]))
-        report |= {"steps": self.step, "end": "all steps done" if self.step == config.steps else "converged"}
-        report |= {"cpu_s": round(cpu_s, 1), "torch": torch.__version__}
+    def finish(self, path: Path) -> None:
+        """Write the losses, and last the generator with a report of its images of the validation strokes."""
+        for name, head, rows in (
+            ("loss.csv", "step,loss", enumerate(self.losses, 1)),
+            ("validation.csv", "step,mse", self.validations),
+        ):
+            lines = (head, *(f"{step},{value}" for step, value in rows))
+            write_whole(self.folder / name, ("\n".join(lines) + "\n").encode())
+        report = _report(self._drawn())
+        report |= {"steps": self.step, "end": "all steps done" if self.step == self.config.steps else "converged"}
         state: dict[str, Tensor] = self.network.state_dict()
         weights = {name: np.ascontiguousarray(value.cpu().numpy()) for name, value in state.items()}
-        metadata = {"format": FORMAT, "config": config.model_dump_json(), "report": json.dumps(report)}
-        write_whole(path, save(weights, metadata))
-        write_curves(self.folder, self.losses, self.validations)
-        numbers = np.linspace(0, len(self.sets[1]) - 1, min(MOST_SAMPLES, len(self.sets[1]))).round().astype(int)
-        inputs, targets = self.sets[1].pick(numbers)
-        save_samples(self.folder, Samples(inputs, targets, self._images(inputs)))
-        write_card(path, config, report)
+        report = json.dumps(report | {"torch": torch.__version__})
+        write_whole(path, save(weights, {"format": FORMAT, "config": self.config.model_dump_json(), "report": report}))
+
+
+def _report(pairs: Iterable[tuple[Singles, Singles]]) -> dict[str, Any]:
+    """Means over (drawn, target) batches, and the least SSIM."""
+    rows: list[NDArray[np.float64]] = []
+    structures: list[float] = []
+    for drawn, target in pairs:
+        rows.append(likeness(drawn, target))
+        structures += [ssim(a, b) for a, b in zip(drawn, target, strict=True)]
+    mse, iou, alike = np.concatenate(rows).mean(0).tolist()
+    psnr_db = 10 * math.log10(1 / mse) if mse else math.inf
+    report = {"images": len(structures), "mse": mse, "psnr_db": psnr_db, "iou": iou, "csim": alike}
+    return report | {"ssim": float(np.mean(structures)), "ssim_min": min(structures), "ssim_settings": SSIM_SETTINGS}

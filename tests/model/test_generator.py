@@ -18,11 +18,10 @@ from safetensors.numpy import load_file, save_file
 
 from brushloop.model.ccdbsm import Brush, DomainError, ccdbsm
 from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
-from brushloop.model.generator.card import likeness
 from brushloop.model.generator.config import MAX_WEIGHTS, PRESETS, Layers, Target, preset
-from brushloop.model.generator.data import exact_sets, sha256
+from brushloop.model.generator.data import sets, sha256
 from brushloop.model.generator.stroke import load_generator, read_generator, traced
-from brushloop.model.generator.train import Generator, covered, squared_error
+from brushloop.model.generator.train import Generator, covered, likeness, squared_error
 from brushloop.model.raster import centred_origin, coverage
 
 MOST_BYTES = 10_000_000
@@ -119,7 +118,7 @@ def test_the_shipped_generator_is_small_and_the_one_that_its_card_describes() ->
     assert "It has seen no real ink" in card
     assert f"{file.report['mse']:.3g}" in card
     assert file.config == preset("anchored")  # the documented command trains it
-    held_out = exact_sets(file.config.model_copy(update={"seed": 1, "training_images": 1, "validation_images": 64}))[1]
+    held_out = sets(file.config.model_copy(update={"seed": 1, "training_images": 1, "validation_images": 64}))[1]
     inputs, target = held_out.pick(np.arange(64))
     mse = float(np.square(file.images(inputs) - target).mean())
     assert 0.5 * file.report["mse"] < mse < 2.0 * file.report["mse"]

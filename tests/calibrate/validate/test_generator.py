@@ -28,7 +28,6 @@ training_images = 400
 validation_images = 16
 batch = 32
 validate_every = 125
-checkpoint_every = 125
 picture_every = 250
 learning_rate = 0.01
 [target]
