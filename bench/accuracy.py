@@ -37,6 +37,7 @@ from bench.prior import BRISTLE
 from brushloop.calibrate.compare.paper import TABLE_2
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
+from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
@@ -69,7 +70,9 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     """Points below the ceiling of the fitted brush, each condition predicted from all others: `n` brushes (seven)."""
     results: list[Result] = []
     for name, captures, prior in _pressed(n, seed):
-        rows, _ = leave_cell_out(captures.strokes, captures.grid, captures.radius_mm, captures.length_mm, prior)
+        brush = captures.radius_mm, captures.length_mm
+        press = fit_presses(captures.strokes, captures.grid, *brush, prior=prior)
+        rows, _ = leave_cell_out(captures.strokes, captures.grid, press, prior)
         csim = {row.model: row.csim for row in rows}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
         gap, presses = csim[CEILING] - csim[FITTED], len(captures.strokes)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.files import replacing
 
-VERSION = "5"
+VERSION = "6"
 """Part of every key. Increase it when the result of some work for the same input changes."""
 FOLDER = "work"
 """Folder of a session that holds its finished work."""

@@ -184,9 +184,8 @@ def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
 def fit_session(captures: Captures, view: Field, progress: Progress = unseen) -> Fitted:
     """Fit, leave each cell out in turn, and measure the marks."""
     grid, strokes = captures.grid, captures.strokes
-    brush = captures.radius_mm, captures.length_mm
-    press = fit_parameters(strokes, grid, *brush)
-    held_out, errors = leave_cell_out(strokes, grid, *brush, progress=progress, store=captures.session.store)
+    press = fit_parameters(strokes, grid, captures.radius_mm, captures.length_mm)
+    held_out, errors = leave_cell_out(strokes, grid, press, progress=progress, store=captures.session.store)
     fit = BrushFit(
         session_id=captures.session.header.session_id,
         source=captures.session.header.source,

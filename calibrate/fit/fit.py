@@ -63,18 +63,21 @@ def fit_presses(
     *,
     residual: bool = True,
     prior: Prior | None = None,
+    start: Floats | None = None,
 ) -> FittedPress:
     """Fit the parameters, then the residual that they cannot express. By default the prior is `learned`.
 
     The cost has several minima. Of two descents, one from the prior and one that fits size and place of the marks
-    first, the lower one counts. Parameters that the strokes do not determine have the values that the prior expects.
-    Raises ValueError without a stroke.
+    first, the lower one counts; with `start` (17,), the parameters of a fit to nearly the same strokes, one descent
+    from there. Parameters that the strokes do not determine have the values that the prior expects. Raises ValueError
+    without a stroke.
     """
     prior = learned() if prior is None else prior
-    expected = FittedPress(radius_mm, length_mm, prior.values)
-    sized, _ = _minimise(expected, SCALE, strokes, grid, prior)
-    descents = [_minimise(start, ALL, strokes, grid, prior) for start in (expected, sized)]
-    press, _ = min(descents, key=itemgetter(1))
+    expected = FittedPress(radius_mm, length_mm, prior.values if start is None else start)
+    starts = [expected]
+    if start is None:
+        starts.append(_minimise(expected, SCALE, strokes, grid, prior)[0])
+    press, _ = min((_minimise(begin, ALL, strokes, grid, prior) for begin in starts), key=itemgetter(1))
     return fit_residual(press, strokes, grid) if residual else press
 
 

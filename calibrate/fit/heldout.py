@@ -71,7 +71,7 @@ def _without(cells: Mapping[C, Sequence[T]], fold: Sequence[C]) -> list[T]:
 
 @dataclass(frozen=True, slots=True)
 class Refit:
-    """A fit of the brush to some presses of a session, from the prior: it knows no other press of theirs."""
+    """A fit of the brush to some presses of a session."""
 
     strokes: tuple[Pressed, ...]
     """In 256 levels, cut to the rows with ink, so that equal presses are equal work for every command."""
@@ -79,28 +79,39 @@ class Refit:
     radius_mm: float
     length_mm: float
     prior: Prior | None = None
+    start: tuple[float, ...] | None = None
+    """Parameters of the fit to all presses, where the descent begins; None searches from the prior."""
 
     @classmethod
     def of(
-        cls, strokes: Sequence[Pressed], grid: Grid, radius_mm: float, length_mm: float, prior: Prior | None = None
+        cls,
+        strokes: Sequence[Pressed],
+        grid: Grid,
+        radius_mm: float,
+        length_mm: float,
+        prior: Prior | None = None,
+        start: FittedPress | None = None,
     ) -> Refit:
         """The fit to these presses, whose ink is on the grid."""
         rows = inked_rows([stroke.ink for stroke in strokes], grid.px_mm)
         inks = (to_pixels(np.asarray(stroke.ink[rows], np.float32)) / 255.0 for stroke in strokes)
         cut = tuple(replace(stroke, ink=ink) for stroke, ink in zip(strokes, inks, strict=True))
-        return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior)
+        values = None if start is None else tuple(start.values.tolist())
+        return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior, values)
 
     @property
     def key(self) -> str:
         """Key in the store of finished work."""
         prior = () if self.prior is None else (self.prior.mean, self.prior.precision)
         presses = (part for stroke in self.strokes for part in (stroke.depth_mm, stroke.tilt_deg, stroke.ink))
-        return key_of("refit", self.radius_mm, self.length_mm, self.grid.x_mm, self.grid.y_mm, *prior, *presses)
+        grid = self.grid.x_mm, self.grid.y_mm
+        return key_of("refit", self.radius_mm, self.length_mm, *grid, *prior, self.start, *presses)
 
 
 def refit(job: Refit) -> Arrays:
     """The numbers of the fitted brush."""
-    press = fit_presses(job.strokes, job.grid, job.radius_mm, job.length_mm, prior=job.prior)
+    start = None if job.start is None else np.array(job.start)
+    press = fit_presses(job.strokes, job.grid, job.radius_mm, job.length_mm, prior=job.prior, start=start)
     return {"values": press.values, "edges": press.edges, "ends": press.ends}
 
 
@@ -117,28 +128,28 @@ def refits(
 def leave_cell_out(
     strokes: Sequence[Pressed],
     grid: Grid,
-    radius_mm: float,
-    length_mm: float,
+    press: FittedPress,
     prior: Prior | None = None,
     progress: Progress = unseen,
     store: Store | None = None,
 ) -> tuple[list[HeldOut], Floats]:
     """Score each cell as predicted by fits to other cells, and find its `zero_touches` for them, (cells, 2) mm.
 
-    `brushloop validate` uses the same fits, which the store keeps. Both are empty for a single cell. Models without
-    enough data are left out: the ceiling needs two strokes of a cell, a regressed Bezier two depths and two tilts among
-    the others. Nothing moved between these presses, so every difference of a zero touch is an error of the model or of
-    a press.
+    The fits descend from `press`, the fit to all cells. `brushloop validate` uses the same fits, which the store keeps.
+    Both are empty for a single cell. Models without enough data are left out: the ceiling needs two strokes of a cell,
+    a regressed Bezier two depths and two tilts among the others. Nothing moved between these presses, so every
+    difference of a zero touch is an error of the model or of a press.
     """
     cells = by_cell(strokes)
-    published = FittedPress(radius_mm, length_mm)
+    brush = press.radius_mm, press.length_mm
+    published = FittedPress(*brush)
     left_out = leave_out(cells)
-    jobs = [Refit.of(others, grid, radius_mm, length_mm, prior) for _, others in left_out]
+    jobs = [Refit.of(others, grid, *brush, prior, press) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
         presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
     predicted, errors = list[Predicted](), [np.empty((0, 2))]
-    for (fold, _), job, press in zip(left_out, jobs, presses, strict=True):
-        outlines: dict[str, Draw] = {FITTED: press.outline, UNCALIBRATED: published.outline}
+    for (fold, _), job, refitted in zip(left_out, jobs, presses, strict=True):
+        outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
             outlines[BEZIER] = refit_bezier(job.strokes, job.grid).outline
         for cell in fold:
@@ -147,7 +158,7 @@ def leave_cell_out(
                 with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
                     images[name] = image_of(outline(*cell), grid)
             predicted.append((cells[cell], images))
-            errors.append(zero_touches(press, cells[cell], grid))
+            errors.append(zero_touches(refitted, cells[cell], grid))
     return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED)), np.concatenate(errors)
 
 

@@ -190,8 +190,8 @@ def _refitted(
     """The brush fitted without each cell; empty for a session that was not fitted."""
     if session.fit is None:
         return {}
-    brush, grid = brush_of(session.header), grid_of(view)
-    jobs = [Refit.of(others, grid, float(brush.radius_mm), float(brush.length_mm)) for _, others in left_out]
+    start, grid = session.fit.press(), grid_of(view)
+    jobs = [Refit.of(others, grid, start.radius_mm, start.length_mm, start=start) for _, others in left_out]
     what = f"{session.header.session_id}: cells left out in turn"
     presses = refits(jobs, session.store, scheduler, what, progress)
     return {cell: press for (fold, _), press in zip(left_out, presses, strict=True) for cell in fold}

@@ -74,8 +74,9 @@ def test_a_correction_knows_how_far_the_earlier_fit_may_be_off() -> None:
     brush.edges[:, 1, 3] = 0.6
     before = presses(brush, CELLS, noise=0.1)
     now = presses(brush, [(13.0, 5.0)], noise=0.1, seed=1)
-    touches_mm = zero_touches(fit_presses(before, GRID, 6.0, 48.0), now, GRID)
-    _, errors_mm = leave_cell_out(before, GRID, 6.0, 48.0)
+    fit = fit_presses(before, GRID, 6.0, 48.0)
+    touches_mm = zero_touches(fit, now, GRID)
+    _, errors_mm = leave_cell_out(before, GRID, fit)
     assert errors_mm.shape == (len(CELLS), 2)
     for estimate in touch_estimates(touches_mm, errors_mm):
         assert estimate.low < 0.0 < estimate.high
@@ -128,7 +129,7 @@ def test_edges_that_the_profile_does_not_have_are_found() -> None:
 
 def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
     strokes = presses(a_brush(), CELLS * 3, noise=0.05)
-    rows = {row.model: row for row in leave_cell_out(strokes, GRID, 6.0, 48.0)[0]}
+    rows = {row.model: row for row in leave_cell_out(strokes, GRID, fit_presses(strokes, GRID, 6.0, 48.0))[0]}
     assert rows[FITTED].n == rows[CEILING].n == 15
     assert rows["uncalibrated"].csim + 5.0 < rows[FITTED].csim <= 100.0
     below = rows[FITTED].below
@@ -143,10 +144,10 @@ def test_held_out_cells_are_scored_beside_the_ceiling() -> None:
 def test_two_presses_of_a_cell_are_enough_for_the_ceiling_and_one_is_not() -> None:
     for repeats, known in ((2, True), (1, False)):
         strokes = presses(a_brush(), CELLS[:3] * repeats, noise=0.05)
-        rows = {row.model: row for row in leave_cell_out(strokes, GRID, 6.0, 48.0)[0]}
+        rows = {row.model: row for row in leave_cell_out(strokes, GRID, fit_presses(strokes, GRID, 6.0, 48.0))[0]}
         assert (CEILING in rows) is known
         assert (rows[FITTED].below is not None) is known
-    rows, errors_mm = leave_cell_out(presses(a_brush(), CELLS[:1] * 2), GRID, 6.0, 48.0)
+    rows, errors_mm = leave_cell_out(presses(a_brush(), CELLS[:1] * 2), GRID, a_brush())
     assert rows == []
     assert errors_mm.shape == (0, 2)
     with pytest.raises(ValueError, match="at least one stroke"):
