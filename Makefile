@@ -22,13 +22,14 @@ $(STAMP)-dev: requirements/run.lock requirements/dev.lock requirements/install.p
 	$(BIN)/python requirements/install.py dev --torch $(TORCH)
 	@touch $(STAMP) $@
 
+# Bytecode is kept, whatever the shell says: without it each of the demo's processes compiles some 600 modules again.
 demo: $(STAMP)  ## press, calibrate, press again and validate on the loopback rig; `brushloop demo --full` does more
-	$(BIN)/brushloop demo
+	PYTHONDONTWRITEBYTECODE= $(BIN)/brushloop demo
 
 test: $(STAMP)-dev  ## lint, layers, types, and the tests; types are checked beside the tests
 	@$(MAKE) --no-print-directory --jobs 2 lint types suite
 
-# Bytecode is kept, whatever the shell says: workers and the processes that tests start compile each module once.
+# The workers and the processes that tests start keep bytecode as well.
 suite: $(STAMP)-dev
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 6 --dist loadgroup --no-loadscope-reorder
 
