@@ -72,7 +72,7 @@ def fit(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     for name, captures, prior in _pressed(n, seed):
         brush = captures.radius_mm, captures.length_mm
         press = fit_presses(captures.strokes, captures.grid, *brush, prior=prior)
-        rows, _ = leave_cell_out(captures.strokes, captures.grid, press, prior)
+        rows = leave_cell_out(captures.strokes, captures.grid, press, prior)
         csim = {row.model: row.csim for row in rows}
         where = f"simulated; ceiling {csim[CEILING]:.2f}, refitted Bezier {csim[BEZIER]:.2f} %; {machine()}"
         gap, presses = csim[CEILING] - csim[FITTED], len(captures.strokes)

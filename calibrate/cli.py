@@ -115,8 +115,6 @@ def fit(
         typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
     ] = None,
     calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
-    correction: Annotated[bool, typer.Option("--correction", help="Print the change of the zero touch.")] = False,
-    reference: Annotated[Path | None, typer.Option(help="An earlier fit of this brush; for --correction.")] = None,
     drags: Annotated[
         bool, typer.Option("--drags", help="Fit bristle lag to drags; writes dragfit/<hash>.json.")
     ] = False,
@@ -130,18 +128,14 @@ def fit(
     """Fit the stroke model to a session's presses; writes an immutable brushfit/<hash>.json and its page."""
     if (prior is not None and not drags) or (strokes is not None and prior is None):
         raise typer.BadParameter("--prior needs --drags, and --strokes needs --prior")
-    if correction != (reference is not None):
-        raise typer.BadParameter("--correction and --reference go together: ink alone does not show the zero touch")
     if drags:
-        if correction:
-            raise typer.BadParameter("--correction and --reference are for presses, not for --drags")
         _fit_drags(session, mm_per_px, calibration, prior, strokes)
         return
 
     from brushloop.calibrate.fit.brush import FitRequest, fit_presses
     from brushloop.sessions.terminal import shown
 
-    request = FitRequest(session, mm_per_px or MM_PER_PX, calibration, reference)
+    request = FitRequest(session, mm_per_px or MM_PER_PX, calibration)
     with shown() as progress:
         fitted = fit_presses(request, progress)
     say(*fitted.lines())

@@ -10,15 +10,12 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate.artefact import SessionFit, load_artefact, made_by, put_to_use
+from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import Field
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.captures import (
     FEWEST_CELLS,
     Captures,
-    Estimate,
-    Floats,
     Size,
     by_cell,
     middle,
@@ -26,19 +23,15 @@ from brushloop.calibrate.fit.captures import (
     sizes_of,
 )
 from brushloop.calibrate.fit.fit import fit_presses as fit_parameters
-from brushloop.calibrate.fit.fit import zero_touches
 from brushloop.calibrate.fit.heldout import HeldOut, leave_cell_out
 from brushloop.calibrate.fit.report import write_fit_page
 from brushloop.calibrate.report import framed, source_label, source_note
-from brushloop.calibrate.stats import student_95
 from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "brushfit"
 """Folder of a session that holds its fits."""
-PLANE = 3
-"""Numbers of a plane in depth and tilt."""
 
 
 class BrushFit(SessionFit):
@@ -52,8 +45,6 @@ class BrushFit(SessionFit):
     mm_per_px: float
     parameters: dict[str, float]
     """They describe a mark together; on its own none is comparable between brushes. See docs/brushfit.md."""
-    touch_errors_mm: tuple[tuple[float, float], ...]
-    """Depth and place along the heading of the zero touch of each cell, for a fit to the others; empty for one cell."""
     edges_mm: tuple[tuple[tuple[float, ...], ...], ...]
     ends_mm: tuple[tuple[float, ...], ...]
     csim_percent: dict[str, float]
@@ -82,28 +73,6 @@ class FitRequest:
     """Scale of the images."""
     calibration: Path | None = None
     """Artefact; None is the one in use."""
-    reference: Path | None = None
-    """An earlier fit of the same brush, relative to which the zero touch is corrected."""
-
-
-@dataclass(frozen=True, slots=True)
-class Correction:
-    """Difference between the zero touch that the ink shows and that of an earlier fit of the same brush."""
-
-    lift_mm: Estimate
-    """Add to `paper.touch_z_mm`: positive if the paper is higher than the rig believes."""
-    along_mm: Estimate
-    """Offset of the ink along the heading from where it should lie."""
-    reference: str
-    """The session of the earlier fit."""
-
-    def lines(self) -> Iterator[str]:
-        """What the command prints."""
-        yield f"Zero touch relative to the fit of {self.reference}, with all else of the brush held:"
-        yield f"  paper.touch_z_mm: add {self.lift_mm} mm, 95 % interval in brackets"
-        yield f"  along the heading: the ink is off by {self.along_mm} mm"
-        if self.lift_mm.low <= 0.0 <= self.lift_mm.high:
-            yield "  The interval includes 0: leave rig.toml as it is."
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +120,6 @@ class FitResult:
     fitted: Fitted
     path: Path
     page: Path
-    correction: Correction | None
 
     @property
     def fit(self) -> BrushFit:
@@ -161,8 +129,6 @@ class FitResult:
     def lines(self) -> Iterator[object]:
         """What the command prints: lines and tables."""
         yield from self.fitted.lines()
-        if self.correction is not None:
-            yield from self.correction.lines()
         yield f"Fit: {self.path}"
         yield f"Page: {self.page}"
 
@@ -172,20 +138,19 @@ class FitResult:
 
 def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
     """Fit the brush to the presses of a session, put the fit to use and write its page. Raises `CalibrationError`."""
-    reference = load_artefact(request.reference, BrushFit) if request.reference is not None else None
     view = Field(mm_per_px=request.mm_per_px)
     captures = read_presses(request.session, view, request.calibration, progress)
     fitted = fit_session(captures, view, progress)
     path = put_to_use(fitted.fit, Recording(request.session).path.parent, FOLDER)
     page = write_fit_page(captures, fitted.fit.press(), fitted.sizes, fitted.held_out, path)
-    return FitResult(fitted, path, page, None if reference is None else correction(captures, reference))
+    return FitResult(fitted, path, page)
 
 
 def fit_session(captures: Captures, view: Field, progress: Progress = unseen) -> Fitted:
     """Fit, leave each cell out in turn, and measure the marks."""
     grid, strokes = captures.grid, captures.strokes
     press = fit_parameters(strokes, grid, captures.radius_mm, captures.length_mm)
-    held_out, errors = leave_cell_out(strokes, grid, press, progress=progress, store=captures.session.store)
+    held_out = leave_cell_out(strokes, grid, press, progress=progress, store=captures.session.store)
     fit = BrushFit(
         session_id=captures.session.header.session_id,
         source=captures.session.header.source,
@@ -198,38 +163,8 @@ def fit_session(captures: Captures, view: Field, progress: Progress = unseen) ->
         cells=tuple(by_cell(strokes)),
         mm_per_px=view.mm_per_px,
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
-        touch_errors_mm=tuple((lift, along) for lift, along in errors.tolist()),
         edges_mm=tuple(tuple(tuple(terms) for terms in side) for side in press.edges.tolist()),
         ends_mm=tuple(tuple(terms) for terms in press.ends.tolist()),
         csim_percent={row.model: row.csim for row in held_out},
     )
     return Fitted(captures, fit, sizes_of(strokes, grid), held_out)
-
-
-def correction(captures: Captures, reference: BrushFit) -> Correction:
-    """Correction of the rig's zero touch relative to an earlier fit of the same brush.
-
-    Raises `CalibrationError` if that was fitted to too few cells.
-    """
-    errors = np.array(reference.touch_errors_mm)
-    if len(errors) < FEWEST_CELLS:
-        what = f"was fitted to {len(errors)} combinations of depth and tilt: {FEWEST_CELLS} are needed"
-        raise CalibrationError(f"fit of {reference.session_id}", what)
-    touches = zero_touches(reference.press(), captures.strokes, captures.grid)
-    return Correction(*touch_estimates(touches, errors), reference.session_id)
-
-
-def touch_estimates(touches_mm: Floats, errors_mm: Floats) -> tuple[Estimate, Estimate]:
-    """Depth and place of the zero touch from those of M cells (M, 2) and the errors (N, 2) of the earlier fit's cells.
-
-    A cell's error is taken to be as large in both sessions: N + M - 1 degrees of freedom. The earlier fit may be off by
-    a plane in depth and tilt, whose three numbers come from its cells.
-    """
-    moved = touches_mm.mean(axis=0)
-    cells, before = len(touches_mm), len(errors_mm)
-    freedom = before + cells - 1
-    square = (np.sum(errors_mm**2, axis=0) + np.sum((touches_mm - moved) ** 2, axis=0)) / freedom
-    variance = square * (1.0 / cells + PLANE / before)
-    factor = student_95(freedom)
-    lift, along = (Estimate.of(float(v), float(s), factor) for v, s in zip(moved, variance, strict=True))
-    return lift, along

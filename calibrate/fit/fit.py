@@ -21,8 +21,8 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed, by_cell
-from brushloop.calibrate.fit.prior import Prior, about, learned, spreads
+from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed
+from brushloop.calibrate.fit.prior import Prior, learned, spreads
 from brushloop.model.damped import Damping, Equations, descend
 from brushloop.model.fitted import MODES, NAMES, PARAMETERS, TERMS, FittedPress, chance_within, command_terms, modes
 
@@ -37,8 +37,6 @@ STEP = 1e-4
 """Step of a derivative, as a share of the parameter's spread."""
 STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
 """Standard deviations by which single presses of a brush differ: about 5 % of width and lengths, 0.3 mm of place."""
-TOUCH = (NAMES.index("h0_mm"), NAMES.index("origin_mm"))
-"""Depth and place of the zero touch among the parameters."""
 
 TERM_SCALE = (1.0, 1.0, 0.8, 0.8, 0.8, 0.8)
 """Expected sizes of the terms: the first in units of the constant's scale, the rest in units of the others' scale."""
@@ -79,18 +77,6 @@ def fit_presses(
         starts.append(_minimise(expected, SCALE, strokes, grid, prior)[0])
     press, _ = min((_minimise(begin, ALL, strokes, grid, prior) for begin in starts), key=itemgetter(1))
     return fit_residual(press, strokes, grid) if residual else press
-
-
-def zero_touches(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> Floats:
-    """How far depth and place of the zero touch lie from those of an earlier fit, with all else of it held.
-
-    (cells, 2) mm, for each depth and tilt of the strokes on its own.
-    """
-    touches: list[Floats] = []
-    for held in by_cell(strokes).values():
-        moved, _ = _minimise(press, TOUCH, held, grid, about(press.values))
-        touches.append((moved.values - press.values)[list(TOUCH)])
-    return np.array(touches)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +151,7 @@ def _minimise(
     def feasible(vector: Floats) -> Floats | None:
         """Within the bounds; None if a press would not reach the paper."""
         clipped = np.clip(vector, low, high)
-        h0_mm = at_values(clipped).values[TOUCH[0]]
+        h0_mm = at_values(clipped).values[NAMES.index("h0_mm")]
         return None if any(s.depth_mm + h0_mm <= 0.1 for s in strokes) else clipped
 
     lowest = descend(

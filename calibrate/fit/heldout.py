@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.compare.place import SIZE_PX, Alignment, draw_loop, to_pixels
 from brushloop.calibrate.compare.score import similarity
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell, inked_rows
-from brushloop.calibrate.fit.fit import fit_presses, zero_touches
+from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.prior import Prior
 from brushloop.calibrate.pool import Scheduler, finished, threads
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
@@ -132,13 +132,12 @@ def leave_cell_out(
     prior: Prior | None = None,
     progress: Progress = unseen,
     store: Store | None = None,
-) -> tuple[list[HeldOut], Floats]:
-    """Score each cell as predicted by fits to other cells, and find its `zero_touches` for them, (cells, 2) mm.
+) -> list[HeldOut]:
+    """Score each cell as predicted by fits to other cells; empty for a single cell.
 
     The fits descend from `press`, the fit to all cells. `brushloop validate` uses the same fits, which the store keeps.
-    Both are empty for a single cell. Models without enough data are left out: the ceiling needs two strokes of a cell,
-    a regressed Bezier two depths and two tilts among the others. Nothing moved between these presses, so every
-    difference of a zero touch is an error of the model or of a press.
+    Models without enough data are left out: the ceiling needs two strokes of a cell, a regressed Bezier two depths and
+    two tilts among the others.
     """
     cells = by_cell(strokes)
     brush = press.radius_mm, press.length_mm
@@ -147,7 +146,7 @@ def leave_cell_out(
     jobs = [Refit.of(others, grid, *brush, prior, press) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
         presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
-    predicted, errors = list[Predicted](), [np.empty((0, 2))]
+    predicted: list[Predicted] = []
     for (fold, _), job, refitted in zip(left_out, jobs, presses, strict=True):
         outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
@@ -158,8 +157,7 @@ def leave_cell_out(
                 with contextlib.suppress(DomainError):  # so light that the brush leaves no mark
                     images[name] = image_of(outline(*cell), grid)
             predicted.append((cells[cell], images))
-            errors.append(zero_touches(refitted, cells[cell], grid))
-    return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED)), np.concatenate(errors)
+    return held_out_scores(predicted, (FITTED, BEZIER, UNCALIBRATED))
 
 
 def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> list[HeldOut]:

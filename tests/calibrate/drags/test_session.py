@@ -134,7 +134,6 @@ def test_an_edited_file_and_presses_are_refused_with_one_line(
     ran = CliRunner().invoke(app, ["fit", str(session)])
     assert ran.exit_code != 0
     assert "drags" in str(ran.exception)
-    assert CliRunner().invoke(app, ["fit", str(session), "--drags", "--correction"]).exit_code == 2
 
 
 def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:

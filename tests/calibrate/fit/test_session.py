@@ -11,7 +11,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import FOLDER, BrushFit, correction, fit_session
+from brushloop.calibrate.fit.brush import FOLDER, BrushFit, fit_session
 from brushloop.calibrate.fit.captures import read_presses
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.validate.report import load_report
@@ -54,14 +54,6 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
     mean = {name: report.stat(name) for name in ("ccd-bsm", NAME)}
     assert mean[NAME].csim.avg > mean["ccd-bsm"].csim.avg + 5.0
 
-    ran = narrow.invoke(app, ["fit", str(session), "--mm-per-px", "0.4", "--correction", "--reference", str(path)])
-    assert ran.exit_code == 0, ran.output
-    assert "paper.touch_z_mm: add" in ran.output
-    assert "The interval includes 0" in ran.output
-    same = correction(read_presses(session, VIEW), fit)
-    assert same.lift_mm.value == pytest.approx(0.0, abs=0.3)
-    assert same.lift_mm.low < 0.0 < same.lift_mm.high
-    assert same.reference == "presses"
     with pytest.raises(CalibrationError, match="holds presses, which `fit` takes without --drags"):
         open_session(session, kind="drag")
 
@@ -71,18 +63,9 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
         load_artefact(edited, BrushFit)
 
 
-def test_ink_alone_gives_no_correction_of_the_zero_touch(tmp_path: Path) -> None:
-    ran = CliRunner().invoke(app, ["fit", str(tmp_path / "not-read"), "--correction"])
-    assert ran.exit_code == 2
-    assert "--reference" in ran.output
-    assert "not-read" not in ran.output, "refused before the session is opened"
-
-
-def test_a_reference_of_few_cells_gives_no_correction(session: Path) -> None:
+def test_a_single_cell_gives_neither_intervals_nor_held_out_scores(session: Path) -> None:
     captures = read_presses(session, VIEW)
     del captures.strokes[1:]
     fitted = fit_session(captures, VIEW)
     assert fitted.held_out == []
     assert fitted.sizes == []
-    with pytest.raises(CalibrationError, match="5 are needed"):
-        correction(captures, fitted.fit)
