@@ -13,7 +13,6 @@ import typer
 from typer.core import TyperGroup
 
 import brushloop.calibrate.cli
-import brushloop.calibrate.cli_camera
 import brushloop.calibrate.cli_train
 import brushloop.calibrate.validate.cli
 import brushloop.calibrate.writing.cli
@@ -31,8 +30,7 @@ EXIT_CODES = {
     3: "finished, but strokes were left out, or a repair lost something",
     4: "stopped or aborted, also by a full disk, too little memory or an output that was closed; once the cause has "
     "been removed, the same command continues",
-    5: "finished, but a required score was missed (`validate --gate`), the camera drifted, or the rig's settings "
-    "contradict each other",
+    5: "finished, but a required score was missed (`validate --gate`), or the rig's settings contradict each other",
     6: "a recording is damaged: `brushloop sessions repair`",
     130: "interrupted by Ctrl-C; `collect` and `sim` end in order instead, with a code from above",
 }
@@ -106,7 +104,7 @@ app.add_typer(brushloop.collect.cli.app, name="collect")
 app.command("doctor")(brushloop.collect.cli.doctor)
 app.add_typer(brushloop.collect.cli_rig.app, name="rig")
 app.add_typer(brushloop.calibrate.cli.app, name="calibrate")
-app.add_typer(brushloop.calibrate.cli_camera.app, name="camera")
+app.add_typer(brushloop.calibrate.cli.camera, name="camera")
 app.add_typer(brushloop.calibrate.validate.cli.app, name="validate")
 app.command("fit")(brushloop.calibrate.cli.fit)
 app.command("twin")(brushloop.twin.cli.twin)

@@ -132,5 +132,5 @@ def pointed(data: bytes, where: str) -> str:
 
 def _choose(session: Path, folder: str) -> str:
     if folder == FOLDER:
-        return f"choose with `brushloop calibrate apply {session / folder}/<hash>.json {session}`"
+        return f"calibrate again with `brushloop calibrate {session}`"
     return f"choose with `--fit {session / folder}/<hash>.json`, or fit again"

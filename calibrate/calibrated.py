@@ -1,34 +1,59 @@
-"""`brushloop calibrate SESSION` as a function: the calibration of a session and its page; and another one applied."""
+"""`brushloop calibrate SESSION` as a function: the calibration of a session, and its page.
+
+The page shows the corners over the photograph with residual arrows, and the scale across the photograph.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from brushloop.calibrate.artefact import load_artefact, made_by, put_to_use
-from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import rms
-from brushloop.calibrate.board.view import (
-    NO_BOARD,
-    board_of,
-    board_stills,
-    calibration_plane,
-    known_lens,
-    paper_mm,
-    rig_of,
-)
-from brushloop.calibrate.calibration import FITTED, Calibration, Foreign
+import numpy as np
+from numpy.typing import NDArray
+
+from brushloop.calibrate.artefact import made_by, put_to_use
+from brushloop.calibrate.board.detect import BoardView, find_board
+from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX, read_lens
+from brushloop.calibrate.board.lens import Floats, Gray, rms
+from brushloop.calibrate.board.pix2len import local_scale
+from brushloop.calibrate.board.spec import describe
+from brushloop.calibrate.board.view import board_of, paper_mm, rig_of, see_board_and_lens
+from brushloop.calibrate.calibration import FITTED, Calibration
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.pages.camera import write_calibration_page
-from brushloop.calibrate.report import framed
+from brushloop.calibrate.report import (
+    BLUE,
+    ORANGE,
+    Point,
+    about,
+    dress,
+    framed,
+    photograph_uri,
+    plot,
+    plot_uri,
+    recording_facts,
+    source_point,
+    write_page,
+)
 from brushloop.calibrate.stroke.params import Params
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.terminal import Progress, unseen
+from brushloop.sessions.terminal import Progress, counted, unseen
 
-STEPS = "steps done: read the session, fit the plane, check the file"
+MOVED_PX = 0.5
+"""Median distance of the board's corners from where they were before, above which camera or board was touched."""
+LEAST_PX_PER_MM = 4.0
+"""Below this a tip of 0.5 mm is two pixels wide."""
+WORST_INTERVAL = 5e-4
+"""Relative half width of pix2len's interval: 0.01 mm over 20 mm."""
+ARROW_SHARE = 0.4
+"""Length of a typical arrow, as a share of the distance between corners."""
+SIDE_POINTS = 9
+SCALE_GRID = (17, 13)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +72,18 @@ class Calibrated:
     calibration: Calibration
     path: Path
     page: Path
+    moved: tuple[str, ...]
+    """Earlier photographs in which the board lies elsewhere."""
 
     def lines(self) -> list[str]:
         """What the command prints."""
         calibration = self.calibration
         low, high = calibration.mm_per_px_low, calibration.mm_per_px_high
         return [
-            *(f"warning: {flag}" for flag in calibration.flags),
+            *(f"warning: {problem}" for problem in (*calibration.flags, *self.moved)),
             f"pix2len {calibration.mm_per_px:.5f} mm/px (95 %: {low:.5f} to {high:.5f}), "
             f"board residual {calibration.rms_px:.3f} px over {calibration.corners} corners, {calibration.source}",
-            f"lens: {calibration.lens.source if calibration.lens else 'none'}",
+            f"lens: {calibration.lens.source}",
             str(self.path),
             f"Page: {self.page}",
         ]
@@ -66,22 +93,22 @@ class Calibrated:
 
 
 def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) -> Calibrated:
-    """Calibrate a session, use the result from now on, and write its page.
+    """Calibrate a session by its last view of the board, use the result from now on, and write its page.
 
     Raises `CalibrationError`, also for an unknown lens that visibly distorts.
     """
     recording = Recording(request.session)
-    if recording.header.source.imported:
-        raise CalibrationError(str(recording.path), "is an import and has its own scale: continue with `validate`")
     where = str(recording.path)
-    spec, known = board_of(recording), known_lens(recording, request.lens)
-    progress(STEPS, 0, 3)
-    stills = [still for _, still in recording.stills_of("board")]
-    progress(STEPS, 1, 3)
+    if recording.header.source.imported:
+        raise CalibrationError(where, "is an import and has its own scale: continue with `validate`")
+    spec, rig = board_of(recording), rig_of(recording)
+    known = rig.lens if request.lens is None else read_lens(request.lens)
+    stills = list(recording.stills_of("board"))
     if not stills:
-        raise CalibrationError(where, NO_BOARD)
-    plane = calibration_plane(decode_gray(stills[-1], where), spec, known, where, rig_of(recording).sheet_mm)
-    progress(STEPS, 2, 3)
+        raise CalibrationError(where, "holds no view of the board (a `board` step)")
+    *earlier, (last_ns, still) = stills
+    image = decode_gray(still, where)
+    view, plane = see_board_and_lens(image, spec, known, where, rig.sheet_mm)
     low, high = plane.interval_mm_per_px
     calibration = Calibration(
         session_id=recording.header.session_id,
@@ -100,59 +127,166 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
         middle_px=plane.middle_px,
         board=spec,
         flags=plane.flags,
-        still_sha256=hashlib.sha256(stills[-1]).hexdigest(),
+        still_sha256=hashlib.sha256(still).hexdigest(),
     )
+    looked_at = counted(earlier, "earlier photographs of the board compared", len(earlier), progress)
+    compared = [_moved(calibration, before, (last_ns - t_ns) / 60e9, where) for t_ns, before in looked_at]
+    moved = tuple(filter(None, compared))
     path = put_to_use(calibration, recording.path.parent)
-    progress(STEPS, 3, 3)
-    return Calibrated(calibration, path, write_calibration_page(recording, path))
+    return Calibrated(calibration, path, _write_page(recording, calibration, path, image, view, moved), moved)
 
 
-def apply_calibration(path: Path, session: Path, *, force: bool = False) -> Path:
-    """Use a calibration for a session from now on; returns its path.
-
-    A calibration of another recording is refused without `force`; with it, a new artefact names the origin and the
-    error of this session's board under it. Raises `CalibrationError`.
-    """
-    recording, other = Recording(session), load_artefact(path, Calibration)
-    folder = recording.path.parent
-    if recording.header.source.imported:
-        raise CalibrationError(str(recording.path), "is an import and has its own scale: no calibration can be applied")
-    if other.recording_sha256 == recording.sha256:
-        return put_to_use(other, folder)
-    if force:
-        return put_to_use(_labelled(other, recording), folder)
-    problem = f"belongs to another recording ({other.session_id}); --force applies it, and labels every result"
-    raise CalibrationError(str(path), problem)
+def _moved(calibration: Calibration, still: bytes, minutes: float, where: str) -> str:
+    """What an earlier photograph of the board says against the calibration; empty where the board lay in its place."""
+    before = f"{minutes:.0f} min before the last view of the board"
+    try:
+        view = find_board(decode_gray(still, where), calibration.board, where)
+    except CalibrationError as error:
+        return f"{before}, it is not seen: {error.what}"
+    off = np.linalg.norm(view.pixels - calibration.to_image(paper_mm(view, calibration.board)), axis=1)
+    off_px = float(np.median(off))
+    if off_px <= MOVED_PX:
+        return ""
+    off_mm = off_px * calibration.mm_per_px
+    return f"{before}, it lay {off_px:.1f} px ({off_mm:.2f} mm) away: camera or board was touched, and strokes are off"
 
 
-def _labelled(other: Calibration, recording: Recording) -> Calibration:
-    origin = other.foreign or Foreign(
-        digest=other.digest,
-        session_id=other.session_id,
-        source=other.source,
-        recording_sha256=other.recording_sha256,
-        board_off_mm=None,
+def _write_page(
+    recording: Recording, calibration: Calibration, path: Path, image: Gray, view: BoardView, moved: Sequence[str]
+) -> Path:
+    """Write the page of the calibration at `path`, which was measured on this photograph, beside it."""
+    expected = calibration.to_image(paper_mm(view, calibration.board))
+    off = view.pixels - expected
+    dropped = np.zeros(len(off), np.bool_)
+    dropped[np.argsort(-np.linalg.norm(off, axis=1))[: calibration.corners_dropped]] = True
+    sheet_mm = rig_of(recording).sheet_mm
+    sheet = None if sheet_mm is None else _outline(calibration, sheet_mm)
+    frame = about(recording.header)
+    lens = f"{calibration.lens.source}; k1 {calibration.lens.distortion[0]:+.4f}"
+    return write_page(
+        path.with_suffix(".html"),
+        "calibration.html.j2",
+        **frame,
+        session=recording.header.session_id,
+        picture=_picture(image, view.pixels, expected, dropped, sheet),
+        verdict=list(_verdict(calibration)),
+        trust=[source_point(recording.header.source), *_trust(calibration, moved)],
+        residuals=_residuals(off[~dropped], frame["label"]),
+        scale=_scale(calibration, image.shape[1], image.shape[0], sheet, frame["label"]),
+        facts=[
+            *recording_facts(recording.header, recording.path.name, recording.sha256, calibration),
+            ("board", describe(calibration.board)),
+            ("photograph of the board", f"sha256 {calibration.still_sha256}"),
+            ("lens in use", lens),
+            ("calibrated with", calibration.software),
+        ],
     )
-    return other.model_copy(
-        update={
-            "schema_version": type(other).model_fields["schema_version"].default,
-            "session_id": recording.header.session_id,
-            "source": recording.header.source,
-            "recording_sha256": recording.sha256,
-            "foreign": origin.model_copy(update={"board_off_mm": _board_off_mm(other, recording)}),
-        }
+
+
+def _picture(
+    image: Gray, seen: Floats, expected: Floats, dropped: NDArray[np.bool_], sheet: Floats | None
+) -> dict[str, Any]:
+    """What the template draws over the photograph, in its pixels."""
+    height, width = image.shape
+    off = seen - expected
+    times = _times(expected, off[~dropped])
+    ends = expected + times * off
+    rows = zip(seen.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
+    corners = [
+        {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*residual)), 2), "dropped": bool(out)}
+        for (at, start, end), residual, out in zip(rows, off, dropped, strict=True)
+    ]
+    return {
+        "uri": photograph_uri(image),
+        "width": width,
+        "height": height,
+        "unit": round(width / 1000, 2),
+        "times": f"{times:g}",
+        "corners": corners,
+        "sheet": [] if sheet is None else sheet.round(1).tolist(),
+    }
+
+
+def _times(expected: Floats, off: Floats) -> float:
+    """How much longer than a residual its arrow is: 1, 2 or 5 times a power of ten."""
+    apart = np.linalg.norm(expected[:, None] - expected[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    wanted = max(1.0, ARROW_SHARE * float(np.median(apart.min(axis=1))) / max(rms(off), 1e-6))
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted)
+
+
+def _outline(calibration: Calibration, sheet_mm: tuple[float, float]) -> Floats:
+    """(n, 2) points of the sheet's edge in the photograph; its sides are bent where the lens bends them."""
+    x, y = sheet_mm
+    corners = np.array([[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]])
+    along = np.linspace(0.0, 1.0, SIDE_POINTS)[:-1, None]
+    sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    return calibration.to_image(np.concatenate(sides))
+
+
+def _verdict(calibration: Calibration) -> Iterator[str]:
+    reach = _reach(calibration)
+    yield (
+        f"One pixel is {calibration.mm_per_px:.5f} mm of paper in the middle of the board, known to "
+        f"±{100 * reach:.3f} % (95 %, if the board is printed to scale): 20 mm are known to ±{20 * reach:.4f} mm."
+    )
+    yield (
+        f"{calibration.corners} corners lie {calibration.rms_px:.2f} px "
+        f"({calibration.rms_px * calibration.mm_per_px:.3f} mm) from where the fitted plane puts them "
+        "(root mean square)."
     )
 
 
-def _board_off_mm(other: Calibration, recording: Recording) -> float | None:
-    """Root mean square error of this session's last board under the calibration; None if none is seen."""
-    spec, where = board_of(recording), str(recording.path)
-    off_mm: float | None = None
-    for _, image in board_stills(recording):
-        other.lens.check_size(image, where)
-        try:
-            view = find_board(image, spec, where)
-        except CalibrationError:
-            continue
-        off_mm = rms(other.to_paper(view.pixels) - paper_mm(view, spec))
-    return off_mm
+def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
+    flat = "a flat, sharp, still board gives 0.1 to 0.3 px"
+    residual = f"The residual is {calibration.rms_px:.2f} px; {flat}, and above {RMS_LIMIT_PX:g} px it warns."
+    yield Point(calibration.rms_px <= RMS_LIMIT_PX, residual)
+    reach = _reach(calibration)
+    yield Point(reach <= WORST_INTERVAL, f"Scale known to ±{100 * reach:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
+    sharp = 1.0 / calibration.mm_per_px
+    yield Point(sharp >= LEAST_PX_PER_MM, f"{sharp:.1f} px/mm; at least {LEAST_PX_PER_MM:g} are needed.")
+    out = calibration.corners_dropped
+    yield Point(not out, f"Corners that are left out, because they do not lie on the plane of the others: {out}.")
+    if calibration.lens.source == FITTED:
+        words = "No lens file: k1 was fitted on this one board and is known only where corners were seen."
+        yield Point(None, words)
+    else:
+        yield Point(True, f"Seen through the {calibration.lens.source}; k1 was refitted for this focus.")
+    for problem in (*calibration.flags, *moved):
+        yield Point(False, f"{problem[0].upper()}{problem[1:]}.")
+    if not moved:
+        yield Point(True, "The board lay in the same place in every photograph of it.")
+
+
+def _reach(calibration: Calibration) -> float:
+    return (calibration.mm_per_px_high - calibration.mm_per_px_low) / (2.0 * calibration.mm_per_px)
+
+
+def _residuals(off: Floats, label: str) -> str:
+    """Every kept corner as a point, with circles of one and two times the root mean square."""
+    figure, axis = plot(1, 1, (4.6, 4.4))
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    for circle in (rms(off), 2.0 * rms(off)):
+        axis.plot(circle * np.cos(turn), circle * np.sin(turn), color="0.6", lw=0.8)
+    axis.plot(off[:, 0], off[:, 1], ".", ms=4, alpha=0.6, color=ORANGE)
+    axis.set_aspect("equal")
+    axis.invert_yaxis()
+    dress(axis, f"residual of each corner ({label})", "to the right, px", "down, px")
+    return plot_uri(figure)
+
+
+def _scale(calibration: Calibration, width: int, height: int, sheet: Floats | None, label: str) -> str:
+    """Contours of mm per pixel across the photograph."""
+    figure, axis = plot(1, 1, (5.6, 4.4))
+    across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
+    scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
+    lines = axis.contour(across, down, scale, levels=8, colors=BLUE, linewidths=0.9)
+    axis.clabel(lines, fontsize=8, fmt="%.4f")
+    if sheet is not None:
+        axis.plot(*np.vstack([sheet, sheet[:1]]).T, color="0.5", lw=1.2)
+    axis.set_xlim(0, width)
+    axis.set_ylim(height, 0)
+    axis.set_aspect("equal")
+    dress(axis, f"mm per pixel across the photograph ({label})", "px", "px", grid="")
+    return plot_uri(figure)

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.artefact import Artefact, Frozen
+from brushloop.calibrate.artefact import Artefact
 from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.board.pix2len import apply
 from brushloop.calibrate.board.spec import BoardSpec
@@ -16,22 +16,10 @@ FITTED = "k1 fitted on the board"
 """Source of a lens where no lens file was given and none was needed."""
 
 
-class Foreign(Frozen):
-    """Origin of a calibration that was made for another session and applied by force, and its error here."""
-
-    digest: str
-    """Digest of the applied artefact."""
-    session_id: str
-    source: str
-    recording_sha256: str
-    board_off_mm: float | None
-    """Root mean square error of this session's own board under it; None if no board is seen."""
-
-
 class Calibration(Artefact):
     """Scale and paper plane, the recording they come from and the software. Equal inputs give an equal file."""
 
-    schema_version: Literal[2] = 2
+    schema_version: Literal[3] = 3
     session_id: str
     source: str
     """`loopback rig` or `real capture`, as the recording says."""
@@ -58,7 +46,6 @@ class Calibration(Artefact):
     """sha256 of the encoded photograph of the board that this was measured on."""
     flags: tuple[str, ...] = ()
     """What was wrong with that photograph: partly hidden, saturated."""
-    foreign: Foreign | None = None
 
     def homography(self) -> NDArray[np.float64]:
         """`image_to_paper` as (3, 3)."""
@@ -72,18 +59,3 @@ class Calibration(Artefact):
     def to_paper(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
         return apply(self.homography(), self.lens.undistorted(pixels))
-
-    @property
-    def named(self) -> str:
-        """Name for reports: the digest, and the label if there is one."""
-        return f"{self.digest}, {self.label}" if self.label else self.digest
-
-    @property
-    def label(self) -> str:
-        """Note that every result must carry; empty for a session's own calibration."""
-        if self.foreign is None:
-            return ""
-        off = (
-            "" if self.foreign.board_off_mm is None else f", its board lies {self.foreign.board_off_mm:.2f} mm off here"
-        )
-        return f"foreign calibration: {self.foreign.digest} of {self.foreign.session_id} ({self.foreign.source}){off}"

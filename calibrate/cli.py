@@ -1,4 +1,4 @@
-"""`brushloop calibrate SESSION` with show, diff, apply and preprocess; `fit`, export, `invert` and `loop compare`.
+"""`brushloop calibrate`, `camera`, `fit`, `invert`, `loop compare` and `sessions export`.
 
 Heavy imports wait until a command runs.
 """
@@ -6,13 +6,16 @@ Heavy imports wait until a command runs.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
+
+if TYPE_CHECKING:
+    from brushloop.calibrate.board.spec import Board
 
 LEFT_OUT = 3
 """Exit code of an export that left strokes out."""
@@ -33,79 +36,8 @@ def calibrate(
     show_work(calibrate_session, CalibrateRequest(session, lens))
 
 
-app = typer.Typer(
-    cls=PathOrCommand,
-    help="Fit scale and paper plane of a SESSION (`brushloop calibrate SESSION`), or examine artefacts and captures.",
-)
+app = typer.Typer(cls=PathOrCommand, help="Fit scale and paper plane of a SESSION from the board in view.")
 app.command("session")(calibrate)
-
-
-@app.command()
-def show(
-    artefact: Annotated[Path, typer.Argument(help="A calibration, lens, registration or brush fit, or a session.")],
-) -> None:
-    """Show the contents of an artefact, or of the calibration that a session uses."""
-    from brushloop.calibrate.describe import described, read_any
-
-    path, made = read_any(artefact)
-    say(str(path), *described(made))
-
-
-@app.command()
-def diff(
-    one: Annotated[Path, typer.Argument(help="An artefact, or a session: the calibration that it uses.")],
-    other: Annotated[Path, typer.Argument(help="Another of the same kind.")],
-) -> None:
-    """Show how two artefacts differ, and for calibrations what that means on the paper."""
-    from brushloop.calibrate.describe import differences, read_any
-
-    lines = differences(read_any(one)[1], read_any(other)[1])
-    say(*(lines or ["they are equal"]))
-
-
-@app.command("apply")
-def apply_to(
-    calibration: Annotated[Path, typer.Argument(help="A calibration/<hash>.json.")],
-    session: Annotated[Path, typer.Argument(help="The session that shall use it.")],
-    force: Annotated[
-        bool, typer.Option(help="Allow another session's calibration; every result is then labelled.")
-    ] = False,
-) -> None:
-    """Use a calibration for a session from now on; another session's needs --force."""
-    from brushloop.calibrate.artefact import load_artefact
-    from brushloop.calibrate.calibrated import apply_calibration
-    from brushloop.calibrate.calibration import Calibration
-
-    path = apply_calibration(calibration, session, force=force)
-    if label := load_artefact(path, Calibration).label:
-        say(f"warning: {label}")
-    say(str(path))
-
-
-@app.command()
-def preprocess(
-    capture: Annotated[Path, typer.Argument(help="A session (folder or .mcap), or a photograph.")],
-    stroke: Annotated[str, typer.Option(help="Name of a stroke; default: the first.")] = "",
-    px_per_mm: Annotated[float | None, typer.Option(help="Scale of a photograph.")] = None,
-    before: Annotated[Path | None, typer.Option(help="Photograph of the page before the stroke.")] = None,
-    out: Annotated[Path, typer.Option(help="The picture; the numbers go beside it as .json.")] = Path("stages.png"),
-) -> None:
-    """Show every stage of one capture in one picture, and write each fitted number to a JSON file."""
-    from brushloop.calibrate.files import check_target
-    from brushloop.calibrate.stages import show_photograph, show_stroke
-    from brushloop.sessions.terminal import shown
-
-    check_target(out, ".png", capture, before)
-    if capture.suffix.lower() in (".png", ".jpg", ".jpeg"):
-        trace = show_photograph(capture, px_per_mm, before, out)
-    else:
-        with shown() as progress:
-            trace = show_stroke(capture, stroke, out, progress)
-    for name, value in trace.log.items():
-        say(f"{name} {value:.6g}")
-    for flag in trace.flags:
-        say(f"flag: {flag}")
-    say(str(out))
 
 
 def fit(
@@ -253,3 +185,84 @@ def compare_loop(
     from brushloop.sessions.terminal import show_work
 
     show_work(run, CompareRequest(original, again, out, " ".join(["brushloop", *sys.argv[1:]]), fit, mm_per_px))
+
+
+camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)
+
+Corners = Annotated[str, typer.Option("--checkerboard", help="Inner corners of a checkerboard, as 9x6.")]
+Squares = Annotated[str, typer.Option("--charuco", help="Squares of a ChArUco board, as 26x20.")]
+Square = Annotated[float, typer.Option(min=0.5, max=1000.0, help="Side of a square, measured on the print.")]
+Marker = Annotated[float, typer.Option(min=0.0, max=1000.0, help="Side of a marker; 0: three quarters of a square.")]
+Dictionary = Annotated[str, typer.Option(help="Markers of the ChArUco board.")]
+
+
+@camera.command("board")
+def print_board(
+    out: Annotated[Path, typer.Argument(help="The new PDF.")],
+    checkerboard: Corners = "",
+    charuco: Squares = "",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
+) -> None:
+    """Write a printable board as a PDF at true scale, with a ruler to check the print."""
+    from brushloop.calibrate.board.spec import describe, write_pdf
+
+    board = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    say(f"{write_pdf(board, out, page)}: {describe(board)}")
+
+
+@camera.command()
+def intrinsics(
+    photographs: Annotated[list[Path], typer.Argument(help="Photographs of one board, held in many ways.")],
+    checkerboard: Corners = "",
+    charuco: Squares = "",
+    square_mm: Square = 12.0,
+    marker_mm: Marker = 0.0,
+    dictionary: Dictionary = "DICT_5X5_1000",
+    limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
+    out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
+) -> None:
+    """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
+    import hashlib
+
+    from brushloop.calibrate.board.detect import BoardView, find_board
+    from brushloop.calibrate.board.intrinsics import fit_lens
+    from brushloop.calibrate.board.spec import describe
+    from brushloop.calibrate.errors import CalibrationError
+    from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
+    from brushloop.sessions.terminal import counted, shown
+
+    board = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)
+    seen, unusable, digests = list[BoardView](), dict[str, str](), dict[str, str]()
+    with shown() as progress:
+        for path in counted(photographs, "photographs searched for the board", len(photographs), progress):
+            image = read_gray(path)
+            digests[str(path)] = hashlib.sha256(read_bounded(path, MAX_PHOTOGRAPH_BYTES)).hexdigest()
+            try:
+                seen.append(find_board(image, board, str(path)))
+            except CalibrationError as error:
+                unusable[str(path)] = error.what
+    lens = fit_lens(seen, describe(board), digests, unusable, limit_px)
+    say(*lens.lines(), str(lens.save(out)))
+
+
+def _board(checkerboard: str, charuco: str, square_mm: float, marker_mm: float, dictionary: str) -> Board:
+    from pydantic import ValidationError
+
+    from brushloop.calibrate.board.spec import BoardSpec, Checkerboard
+    from brushloop.calibrate.errors import CalibrationError, invalid
+
+    if bool(checkerboard) == bool(charuco):
+        raise CalibrationError(
+            "board", "give one of --checkerboard (inner corners) and --charuco (squares), such as 9x6"
+        )
+    size = (checkerboard or charuco).lower().split("x")
+    try:
+        if checkerboard:
+            return Checkerboard.model_validate({"inner_corners": size, "square_mm": square_mm})
+        marker = {"marker_mm": marker_mm or 0.75 * square_mm, "dictionary": dictionary, "origin_mm": (0.0, 0.0)}
+        return BoardSpec.model_validate({"squares": size, "square_mm": square_mm} | marker)
+    except ValidationError as error:
+        raise invalid("board", error) from None

@@ -23,10 +23,11 @@ class CalibrationError(Exception):
         super().__init__(f"{where}: {what}")
 
 
-def invalid(where: str, error: ValidationError, *table: str) -> CalibrationError:
-    """An error for the first invalid field of a file, or of a table in it, in one line that names the field."""
+def invalid(where: str, error: ValidationError) -> CalibrationError:
+    """An error for the first invalid field of a file, in one line that names the field."""
     first = error.errors()[0]
-    return CalibrationError(where, f"{'.'.join(map(str, (*table, *first['loc'])))}: {first['msg']}")
+    field = ".".join(map(str, first["loc"]))
+    return CalibrationError(where, f"{field}: {first['msg']}" if field else first["msg"])
 
 
 def one_line(error: BaseException) -> str:

@@ -151,7 +151,7 @@ def recording_facts(
     scale = ""
     if calibration is not None:
         low, high = calibration.mm_per_px_low, calibration.mm_per_px_high
-        scale = f"{calibration.named}: pix2len {calibration.mm_per_px:.5f} mm/px (95 % {low:.5f} to {high:.5f}), "
+        scale = f"{calibration.digest}: pix2len {calibration.mm_per_px:.5f} mm/px (95 % {low:.5f} to {high:.5f}), "
         scale += f"board residual {calibration.rms_px:.3f} px"
     facts = (
         ("session", header.session_id),

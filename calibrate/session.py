@@ -8,19 +8,13 @@ from typing import Literal
 
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.lens import Lens
-from brushloop.calibrate.board.view import (
-    rig_of,
-)
+from brushloop.calibrate.board.view import rig_of
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.store import FOLDER as FINISHED
 from brushloop.calibrate.store import Store
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Stroke
-
-FITTED = "k1 fitted on the board"
-STEPS = "steps done: read the session, fit the plane, check the file"
-
 
 Kind = Literal["press", "drag"]
 OTHER_KIND = {
@@ -82,9 +76,7 @@ def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path
         )
     calibration = load_artefact(path, Calibration)
     if calibration.recording_sha256 != digest:
-        problem = (
-            f"belongs to another recording ({calibration.session_id}): `brushloop calibrate apply --force` labels it"
-        )
+        problem = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate` makes its own"
         raise CalibrationError(str(path), problem)
     return calibration
 

@@ -60,7 +60,7 @@ class Solved:
 def solve(views: Sequence[BoardView], where: str) -> Solved:
     """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` if none fits the views."""
     size = views[0].size_px
-    objects = [_flat(view).astype(np.float32) for view in views]
+    objects = [np.column_stack([view.board_mm, np.zeros(len(view.board_mm))]).astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
     try:
         rms, matrix, distortion, turns, _, _, _, per_view = cv2.calibrateCameraExtended(
@@ -71,20 +71,6 @@ def solve(views: Sequence[BoardView], where: str) -> Solved:
     normals = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in turns])
     normals = np.asarray(np.where(normals[:, 2:] < 0.0, -normals, normals), np.float64)
     return Solved(Lens.of_opencv(matrix, distortion, size), float(rms), np.ravel(per_view).astype(np.float64), normals)
-
-
-def _flat(view: BoardView) -> Floats:
-    """(n, 3) corners of a view in its board's own plane, z = 0."""
-    return np.column_stack([view.board_mm, np.zeros(len(view.board_mm))])
-
-
-def residuals(lens: Lens, view: BoardView) -> Floats:
-    """(n, 2) px from where the lens puts each corner to where it was found, at the pose of the board that fits best."""
-    board, optics = _flat(view), (lens.camera, lens.coefficients)
-    _, turn, shift = cv2.solvePnP(board, view.pixels, *optics)
-    turn, shift = cv2.solvePnPRefineLM(board, view.pixels, *optics, turn, shift)
-    seen, _ = cv2.projectPoints(board, turn, shift, *optics)
-    return view.pixels - np.asarray(seen, np.float64).reshape(-1, 2)
 
 
 class LensFile(Artefact):
@@ -124,6 +110,25 @@ class LensFile(Artefact):
             return None
         reach = student_95(min(self.ways, MOST_LEFT_OUT) - 1)
         return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
+
+    def lines(self) -> list[str]:
+        """What the command prints: every photograph, the lens, and what to do."""
+        fx, fy, cx, cy = self.lens.matrix
+        reach = self.focal_reach_px
+        across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
+        return [
+            *(
+                f"{name}: {px:.3f} px, slanted by {self.slants_deg[name]:.0f} deg"
+                for name, px in self.residuals_px.items()
+            ),
+            *(f"{name}: {px:.3f} px, dropped: it does not fit the others" for name, px in self.dropped.items()),
+            *(f"{name}: {why}" for name, why in self.unusable.items()),
+            f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
+            f"centre {cx:.1f}, {cy:.1f} px, k1 {self.lens.distortion[0]:+.4f}",
+            f"residual {self.rms_px:.3f} px over {len(self.residuals_px)} views, the board held in {self.ways} ways",
+            *(f"warning: {warning}" for warning in self.warnings),
+            *(f"to do: {advice}" for advice in self.guidance),
+        ]
 
 
 def read_lens(path: Path) -> Lens:
@@ -237,20 +242,6 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
             f"slant the board by {LEAST_SLANT_DEG:.0f} to 45 deg in at least 4 photographs ({slanted} so far)"
         )
     return tuple(wanted)
-
-
-def named(photographs: Sequence[Path]) -> dict[str, Path]:
-    """Photographs by unique name: the file's, with its folder if there are several, and a number if repeated."""
-    folders = len({path.parent for path in photographs})
-    paths: dict[str, Path] = {}
-    for path in photographs:
-        name = plain = f"{path.parent.name}/{path.name}" if folders > 1 else path.name
-        number = 1
-        while name in paths:
-            number += 1
-            name = f"{plain} ({number})"
-        paths[name] = path
-    return paths
 
 
 def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:

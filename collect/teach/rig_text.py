@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from brushloop.calibrate.board.register import free_name
 from brushloop.calibrate.files import write_whole
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_file import refusal
@@ -60,11 +60,17 @@ def write_rig(rig_path: Path, notebook: Notebook) -> tuple[Path, Path | None]:
         old = rig_path.read_text(encoding="utf-8")
         if old == text:
             return rig_path, None
-        kept = free_name(rig_path)
+        kept = _free_name(rig_path)
         with kept.open("x", encoding="utf-8") as file:
             file.write(old)
     write_whole(rig_path, text)
     return rig_path, kept
+
+
+def _free_name(path: Path) -> Path:
+    """An unused name beside the file."""
+    names = (path.with_name(f"{path.name}.bak{number}") for number in ("", *(f"-{n}" for n in itertools.count(2))))
+    return next(name for name in names if not name.exists() and not name.is_symlink())
 
 
 def _flat(notebook: Notebook, rig_path: Path) -> dict[str, Value]:

@@ -56,7 +56,6 @@ def test_where_it_is_to_be_written_is_looked_at_before_any_work(
     [
         ("invert", "{s}", "--out", "{s}"),
         ("validate", "captures", "{s}", "--generator", "g.safetensors", "--out", "{s}"),
-        ("calibrate", "preprocess", "{s}", "--out", "{s}"),
     ],
 )
 def test_a_recording_is_not_overwritten_by_what_comes_of_it(tmp_path: Path, words: tuple[str, ...]) -> None:

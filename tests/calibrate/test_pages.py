@@ -13,14 +13,11 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.board.detect import BoardView
-from brushloop.calibrate.board.intrinsics import fit_lens
-from brushloop.calibrate.board.lens import Gray, Lens
+from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
 from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts
 from brushloop.calibrate.loop.report import write_loop
-from brushloop.calibrate.pages.camera import thumbnail, write_lens_page
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import printable, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
@@ -69,31 +66,10 @@ def pages(photographed: Photographed, tmp_path_factory: pytest.TempPathFactory) 
     session = photographed(folder / "2026-03-02-board-01", SPEC, [board()], sheet_mm=(100.0, 80.0))
     return {
         "calibrate": run("calibrate", session),
-        "camera": _lens(folder),
         "loop": _loop(folder),
         "write": _written(folder),
         "fit": run("fit", _pressed(folder), "--mm-per-px", "0.8"),
     }
-
-
-def _lens(folder: Path) -> str:
-    """The page of a lens from six views of a board in the left half of the image, and one photograph of nothing."""
-    true = Lens(size_px=(640, 480), matrix=(800.0, 805.0, 322.0, 236.0), distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))
-    ids = np.arange(54)
-    board_mm = np.column_stack([ids % 9 + 1.0, ids // 9 + 1.0]) * 10.0
-    views: list[BoardView] = []
-    for number, turn in enumerate(
-        ((0.4, 0, 0), (-0.4, 0, 0), (0, 0.4, 0), (0, -0.4, 0), (0.4, 0.4, 0), (0.3, -0.5, 1))
-    ):
-        place = np.array([-150.0, -60.0 + 10.0 * number, 480.0])
-        flat = np.column_stack([board_mm, np.zeros(54)])
-        seen, _ = cv2.projectPoints(flat, np.array(turn, np.float64), place, true.camera, true.coefficients)
-        noise = np.random.default_rng(number).normal(0.0, 0.1, (54, 2))
-        views.append(BoardView(f"{number}<u>.png", (640, 480), seen.reshape(-1, 2) + noise, board_mm, ids))
-    photographs = {f"{n}<u>.png": "ab" for n in range(6)} | {"7.png": "cd"}
-    file = fit_lens(views, "a board", photographs, {"7.png": "is blank"})
-    small = {"0<u>.png": thumbnail(board()), "7.png": thumbnail(board())}
-    return write_lens_page(file.save(folder), file, views, small).read_text(encoding="utf-8")
 
 
 def _loop(folder: Path) -> str:
@@ -190,14 +166,6 @@ def test_the_page_of_a_fit_draws_both_outlines_over_the_ink_of_each_cell(pages: 
     assert "H 11 mm, α 0° · 1 press · CSIM" in page
     assert "held out" in page
     assert "imported photographs" in page
-
-
-def test_the_page_of_a_lens_shades_what_no_board_covered_and_names_each_photograph(pages: dict[str, str]) -> None:
-    page = pages["camera"]
-    assert "To do: bring the board into the" in page
-    assert page.count('class="part empty"') == page.count(">no corner<") > 0
-    assert "7.png: not used: is blank" in page
-    assert "0&lt;u&gt;.png: 0." in page
 
 
 def test_a_page_of_a_twin_says_whose_twin_on_every_figure(pages: dict[str, str]) -> None:

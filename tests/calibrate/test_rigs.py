@@ -7,9 +7,9 @@ import pytest
 
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import fit_lens
-from brushloop.calibrate.board.lens import Lens
-from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.board.view import see_board_and_lens
+from brushloop.calibrate.board.lens import Lens, unknown_lens
+from brushloop.calibrate.board.pix2len import Plane, fit_plane
+from brushloop.calibrate.board.view import paper_mm
 from brushloop.calibrate.stroke.params import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify_distorted
@@ -33,11 +33,17 @@ soak = pytest.mark.soak
 half_an_hour = pytest.mark.timeout(1800)
 
 
+def plane_of(shot: Shot) -> Plane:
+    """The plane by a lens of which nothing is known."""
+    view = find_board(shot.image, shot.board, "rig")
+    return fit_plane(view.pixels, paper_mm(view, shot.board), unknown_lens(view.size_px), "rig")
+
+
 def draws(rig: int, count: int, seed: int = 0) -> list[tuple[float, bool]]:
     """(relative error of pix2len, whether the interval holds the truth) for the camera aimed again each time."""
     aimed: list[tuple[float, bool]] = []
     for shot in boards(rig, count, seed):
-        plane = see_board_and_lens(shot.image, shot.board)
+        plane = plane_of(shot)
         truth = true_scale(shot, plane.middle_px)
         low, high = plane.interval_mm_per_px
         aimed.append((plane.mm_per_px / truth - 1.0, low <= truth <= high))
@@ -47,7 +53,7 @@ def draws(rig: int, count: int, seed: int = 0) -> list[tuple[float, bool]]:
 def strokes(rig: int, presses: int) -> tuple[list[float], float]:
     """IoU of every stroke's mask with the ink that is really there, and how far off the worst anchor is put, mm."""
     shot = sheet(rig, presses)
-    plane = see_board_and_lens(shot.image, shot.board)
+    plane = plane_of(shot)
     anchors = np.array(shot.anchors_mm)
     off_mm = np.linalg.norm(plane.to_paper(shot.optics.image_of(anchors)) - anchors, axis=1)
     return [overlap(shot, plane, anchor) for anchor in shot.anchors_mm], float(off_mm.max())

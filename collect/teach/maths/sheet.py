@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from brushloop.calibrate.board.register import mixed_up
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.paper import PlaneFit, fit_plane
@@ -24,6 +24,8 @@ WORST_CORNER_MM = 3.0
 """A corner that is off by more than this was not merely touched inaccurately."""
 WORST_SCALE = 0.004
 """Relative error of the board's size from which the print is doubted: 1 mm over a page."""
+EXPLAINED, LEAST_MM = 0.2, 0.3
+"""Names were mixed up if that explains all but this share of the largest misfit, or leaves no more than this."""
 ASKEW_DEG = 0.5
 """A sheet that is turned by more against its board must be laid straight: `rig.toml` has one turn for both."""
 
@@ -61,7 +63,7 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
     """
     printed = corners_of(*size_mm(spec))
     touched = np.array([np.mean(board[name], axis=0)[:2] for name in CORNERS])
-    if problem := mixed_up(CORNERS, touched, printed):
+    if problem := _mixed_up(touched, printed):
         raise CannotTeach(
             f"the corners of the board {problem}.",
             "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
@@ -83,6 +85,28 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
             "Print it again at 100 %, without `fit to page`, or measure ten squares with calipers and teach the camera "
             "again with that size.",
         )
+
+
+def _mixed_up(touched: Floats, printed: Floats) -> str:
+    """Why the corners do not fit: a mirror, or two names that were exchanged; empty if nothing explains it."""
+    as_named = max(_distances(printed, touched))
+    if as_named <= WORST_CORNER_MM:
+        return ""
+    enough_mm = max(LEAST_MM, EXPLAINED * as_named)
+    if max(_distances(printed, touched * [1.0, -1.0])) <= enough_mm:
+        return (
+            f"fit only as in a mirror (off by {as_named:.1f} mm otherwise): were they named from the other side, or is "
+            "the photograph mirrored?"
+        )
+    exchanges = list[tuple[float, str]]()
+    for a, b in itertools.combinations(range(len(CORNERS)), 2):
+        exchanged = touched.copy()
+        exchanged[[a, b]] = touched[[b, a]]
+        exchanges.append((max(_distances(printed, exchanged)), f"{CORNERS[a]} and {CORNERS[b]}"))
+    off_mm, pair = min(exchanges)
+    if off_mm > enough_mm:
+        return ""
+    return f"fit only if {pair} are swapped (off by {as_named:.1f} mm otherwise): one was touched in the other's place"
 
 
 def expected_mm(touched: Mapping[str, Sequence[Point]], name: str, spec: BoardSpec) -> tuple[float, float]:

@@ -9,7 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from brushloop.__main__ import app
 from brushloop.calibrate.board.detect import BoardView, find_board
 from brushloop.calibrate.board.intrinsics import LensFile, guidance
 from brushloop.calibrate.board.intrinsics import fit_lens as fit
@@ -177,3 +179,25 @@ def test_what_is_seen_but_not_as_it_should_be_is_flagged() -> None:
     assert "partly hidden" in find_board(half, CHARUCO, "half").flags[0]
     bright = np.where(charuco() > 100, 255, 40).astype(np.uint8)
     assert "saturated" in find_board(bright, CHARUCO, "bright").flags[0]
+
+
+def test_the_command_says_of_every_photograph_why_it_was_of_no_use(tmp_path: Path) -> None:
+    blank, mirrored, torn = (tmp_path / name for name in ("blank.png", "mirrored.png", "torn.png"))
+    cv2.imwrite(str(blank), np.full((480, 640), 235, np.uint8))
+    cv2.imwrite(str(mirrored), np.ascontiguousarray(charuco()[:, ::-1]))
+    torn.write_bytes(blank.read_bytes()[:100])
+    board = ("--charuco", "5x7", "--square-mm", "40", "--marker-mm", "20", "--dictionary", "DICT_6X6_250")
+
+    def refused(*photographs: Path, options: Sequence[str] = board) -> str:
+        words = ["camera", "intrinsics", *map(str, photographs), *options, "--out", str(tmp_path / "out")]
+        ran = CliRunner().invoke(app, words)
+        assert isinstance(ran.exception, CalibrationError), ran.output
+        assert not (tmp_path / "out").exists()
+        return str(ran.exception)
+
+    why = refused(blank, mirrored)
+    assert why.startswith(f"2 photographs: 0 usable views of the board, at least 4 needed; {blank}: is blank")
+    assert f"{mirrored}: the photograph is mirrored" in why
+    assert "not a complete PNG or JPEG" in refused(torn)
+    assert "inner_corners.1: Field required" in refused(blank, options=("--checkerboard", "9"))
+    assert "give one of --checkerboard" in refused(blank, options=())

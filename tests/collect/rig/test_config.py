@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate.board.register import read_rig
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.collect.protocols.config import load_protocol
@@ -167,11 +165,10 @@ READERS = [
     (load_rig, ConfigError),
     (lambda path: load_brush(path, 1), SimFileError),
     (load_config, TrainError),
-    (read_rig, CalibrationError),
 ]
 
 
-@pytest.mark.parametrize(("read", "refused"), READERS, ids=["protocol", "rig", "brush", "training", "board of a rig"])
+@pytest.mark.parametrize(("read", "refused"), READERS, ids=["protocol", "rig", "brush", "training"])
 def test_a_number_of_ten_thousand_digits_is_refused(tmp_path: Path, read: object, refused: type[Exception]) -> None:
     assert callable(read)
     path = tmp_path / "a.toml"

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from brushloop.calibrate.board.register import mixed_up, register
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.teach.jog import hull
 from brushloop.collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
@@ -198,17 +196,6 @@ def test_a_sheet_that_lies_askew_is_refused() -> None:
     _, askew = laid(32.0, (405.0, -104.0))
     with pytest.raises(CannotTeach, match=r"turned by \+2\.0 deg on its board"):
         fit_sheet(board, askew, BOARD)
-
-
-def test_points_of_a_registration_that_were_swapped_are_named() -> None:
-    robot = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 60.0], [0.0, 60.0], [50.0, 20.0]])
-    seen = robot + 5.0
-    names = ("a", "b", "c", "d", "e")
-    with pytest.raises(CalibrationError, match="fit only if b and e are swapped"):
-        register(names, robot[[0, 4, 2, 3, 1]], seen, "test", (0.0, 0.0))
-    with pytest.raises(CalibrationError, match="fit only as in a mirror"):
-        register(names, robot * [1.0, -1.0], seen, "test", (0.0, 0.0))
-    assert mixed_up(names, robot, seen) == ""
 
 
 # Limits
