@@ -1,4 +1,7 @@
-"""`Inverter` recovers depth H, tilt alpha and place from images of presses, each with its interval and flags.
+"""`Inverter` recovers depth H and tilt alpha from images of presses whose place is known, with intervals and flags.
+
+The shape of a mark does not determine alpha: 1 % error of R or lambda moves it by 4.4 deg. It follows from how far the
+mark lies from the zero-touch point.
 
 A fit starts at the press of a table whose area, position and spread are nearest to the image's: from the middle of the
 range it can end in a wrong local minimum. It then minimises -log likelihood = (N - P) / 2 log(r'r) + prior / 2, with r
@@ -29,9 +32,9 @@ from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
 Images = NDArray[np.float32]
-PARAMETERS = ("depth_mm", "tilt_deg", "x_mm", "y_mm", "heading_deg")
-"""What a press may be recovered in. x and y are the zero-touch point, from the left and top edge: the brush tilts about
-its tip, then descends, so the mark's origin lies H tan(alpha) ahead."""
+PARAMETERS = ("depth_mm", "tilt_deg", "x_mm", "y_mm")
+"""What a press is recovered in. x and y are the zero-touch point, from the left and top edge: the brush tilts about its
+tip, then descends, so the mark's origin lies H tan(alpha) ahead. They move only if the point is uncertain."""
 TABLE_DEPTHS, TABLE_TILTS = 32, 7
 BLOCK_PX = 16
 EDGE_INK = 0.3
@@ -40,9 +43,9 @@ MIN_INK_MM2 = 0.5
 """An image with less ink than this has no mark."""
 _FAINT = 0.25  # fainter pixels count as blank in moments: noise far from the mark would outweigh the mark itself
 _LEAST_NOISE = 1e-6  # error of the rasteriser in a pixel: a clean image is no more accurate than this
-_STEP = np.array([2.0, 4.0, 2.0, 2.0, 10.0])  # longest step of a parameter
-_NUDGE = np.array([1e-3, 5e-3, 1e-3, 1e-3, 1e-2])  # for derivatives
-_STILL = np.array([1e-4, 1e-3, 1e-4, 1e-4, 1e-3])  # a step that counts as none
+_STEP = np.array([2.0, 4.0, 2.0, 2.0])  # longest step of a parameter
+_NUDGE = np.array([1e-3, 5e-3, 1e-3, 1e-3])  # for derivatives
+_STILL = np.array([1e-4, 1e-3, 1e-4, 1e-4])  # a step that counts as none
 _NEAR = 0.1  # share of a standard deviation: a step that is shorter counts as none, too
 _ROUNDS = 60
 
@@ -50,8 +53,6 @@ _ROUNDS = 60
 class Flag(StrEnum):
     """Warning about a recovered press."""
 
-    ALPHA_UNKNOWN = "alpha_unknown"
-    """No zero-touch anchor: shape does not determine alpha, since 1 % error of R or lambda moves it by 4.4 deg."""
     AT_BOUND = "at_bound"
     """H, alpha or place lies at the limit of its range; its interval is valid on one side at most."""
     UPRIGHT = "upright"
@@ -79,9 +80,9 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """B recovered presses. `values` (B, 5) are the `PARAMETERS`, mm and degrees.
+    """B recovered presses: `PARAMETERS` as `values` (B, 4) with standard deviations `sigma`, mm and degrees.
 
-    `sigma` are standard deviations, 0 for known values and NaN where the image does not determine the value.
+    A deviation is 0 for a known value, and NaN where the image does not determine the value.
     """
 
     values: Floats
@@ -97,7 +98,7 @@ class Recovered:
 
     @property
     def tilt_deg(self) -> Floats:
-        """alpha, (B,). Check the flags before using it."""
+        """alpha, (B,)."""
         return self.values[:, 1]
 
     def interval(self, name: str, z: float = 1.96) -> tuple[Floats, Floats]:
@@ -108,45 +109,26 @@ class Recovered:
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Moments of B images: area (mm^2), centroid (B, 2) as column and row (mm), and central second and third moments.
+    """Moments of B images: area (mm^2), centroid (B, 2) as column and row (mm), and central second moments (B, 3).
 
-    second (B, 3) holds xx, xy, yy and third (B, 4) xxx, xxy, xyy, yyy, both per area, x along columns, y along rows.
+    The second moments are xx, xy, yy per area, x along columns, y along rows.
     """
 
     area: Floats
     centroid: Floats
     second: Floats
-    third: Floats
 
     @classmethod
     def of(cls, images: Images, px_mm: float) -> Moments:
         """The moments of (B, N, N) images; blank ones have area 0 and a centroid in the corner."""
         ink = np.where(images > _FAINT, images, 0).astype(np.float64)
-        powers = np.vander((np.arange(images.shape[1]) + 0.5) * px_mm, 4, increasing=True)
-        sums = powers.T @ ink @ powers  # [b, p, q] is the sum of ink y^p x^q
-        sums = np.moveaxis(sums, 0, -1)
-        area = np.maximum(sums[0, 0], 1e-12)
-        (_, x, xx, xxx), (y, xy, xxy, _), (yy, xyy, _, _), (yyy, *_) = sums / area
-        second = (xx - x * x, xy - x * y, yy - y * y)
-        third = (
-            xxx - 3 * x * xx + 2 * x**3,
-            xxy - 2 * x * xy - y * xx + 2 * x * x * y,
-            xyy - 2 * y * xy - x * yy + 2 * x * y * y,
-            yyy - 3 * y * yy + 2 * y**3,
-        )
-        return cls(sums[0, 0] * px_mm**2, *(np.stack(parts, axis=-1) for parts in ((x, y), second, third)))
+        powers = np.vander((np.arange(images.shape[1]) + 0.5) * px_mm, 3, increasing=True)
+        sums = np.moveaxis(powers.T @ ink @ powers, 0, -1)  # [p, q, b] is the sum of ink y^p x^q
+        (_, x, xx), (y, xy, _), (yy, _, _) = sums / np.maximum(sums[0, 0], 1e-12)
+        second = np.stack((xx - x * x, xy - x * y, yy - y * y), axis=-1)
+        return cls(sums[0, 0] * px_mm**2, np.stack((x, y), axis=-1), second)
 
-    def heading_deg(self) -> Floats:
-        """Direction of the thick end, (B,): along the longer axis, away from the long thin tail."""
-        xx, xy, yy = self.second.T
-        angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-        c, s = np.cos(angle), np.sin(angle)
-        xxx, xxy, xyy, yyy = self.third.T
-        skew = c**3 * xxx + 3 * c * c * s * xxy + 3 * c * s * s * xyy + s**3 * yyy
-        # Rows grow downwards, headings counter-clockwise.
-        return -np.degrees(np.where(skew > 0, angle + np.pi, angle))
-
-    def spread(self, heading_deg: Floats) -> tuple[Floats, Floats]:
+    def spread(self, heading_deg: Floats | float) -> tuple[Floats, Floats]:
         """Standard deviations along and across a heading, mm."""
         c, s = directions(heading_deg).T
         xx, xy, yy = self.second.T
@@ -154,7 +136,7 @@ class Moments:
         return np.sqrt(np.maximum(along, 0)), np.sqrt(np.maximum(xx + yy - along, 0))
 
 
-def directions(heading_deg: Floats) -> Floats:
+def directions(heading_deg: Floats | float) -> Floats:
     """Unit vectors (..., 2) of headings as columns and rows, which grow downwards."""
     turn = np.radians(heading_deg)
     return np.stack((np.cos(turn), -np.sin(turn)), axis=-1)
@@ -181,14 +163,11 @@ class Inverter:
     def __post_init__(self) -> None:
         if not (0 <= self.anchor_sigma_mm < math.inf):
             raise ValueError(f"anchor_sigma_mm = {self.anchor_sigma_mm:g}: expected at least 0")
-        depths, tilts = (
-            np.geomspace(*self.within.depth_mm, TABLE_DEPTHS),
-            np.linspace(*self.within.tilt_deg, TABLE_TILTS),
-        )
+        depths = np.geomspace(*self.within.depth_mm, TABLE_DEPTHS)
+        tilts = np.linspace(*self.within.tilt_deg, TABLE_TILTS)
         table = np.stack(np.meshgrid(depths, tilts, indexing="ij"), axis=-1).reshape(-1, 2)
-        places = np.broadcast_to([self.side_mm, self.side_mm, 0.0], (len(table), 3))
         # Twice the image's size at half the resolution, so that no mark is cut, wherever its place lies.
-        marks = self.predict(np.column_stack((table, places)), 2 * self.px_mm)
+        marks = self.predict(np.column_stack((table, np.full_like(table, self.side_mm))), 0.0, 2 * self.px_mm)
         object.__setattr__(self, "table", table)
         object.__setattr__(self, "drawn", Moments.of(marks, 2 * self.px_mm))
 
@@ -200,110 +179,93 @@ class Inverter:
     def __call__(
         self,
         images: NDArray[np.floating[Any]],
-        place_mm: Floats | tuple[float, float] | None = None,
+        place_mm: Floats | tuple[float, float],
         heading_deg: Floats | float = 0.0,
     ) -> Recovered:
         """Recover the presses of (B, N, N) coverage images, ink = 1.
 
-        `place_mm` (2,) or (B, 2) is the zero-touch point and `heading_deg` the known heading; without a place, both are
-        recovered from the mark as well. Raises ValueError for images of another size.
+        `place_mm` (2,) or (B, 2) is the zero-touch point and `heading_deg` the known heading. Raises ValueError for
+        images of another size.
         """
         target = np.ascontiguousarray(images, np.float32)
         wanted = (self.size_px, self.size_px)
         if target.ndim != 3 or target.shape[1:] != wanted:
             raise ValueError(f"images are {target.shape}, expected (B, {self.size_px}, {self.size_px})")
         seen = Moments.of(target, self.px_mm)
-        if place_mm is None:
-            heading = seen.heading_deg()
-        else:
-            place_mm = np.broadcast_to(np.asarray(place_mm, np.float64), (len(target), 2))
-            heading = np.broadcast_to(np.asarray(heading_deg, np.float64), (len(target),))
-        start = np.column_stack((self._nearest(seen, place_mm, heading), heading))
+        place = np.broadcast_to(np.asarray(place_mm, np.float64), (len(target), 2))
+        heading = np.broadcast_to(np.asarray(heading_deg, np.float64), (len(target),))
+        start = np.column_stack((self._nearest(seen, place, heading), place))
         values, sigma, rms = np.full(start.shape, np.nan), np.full(start.shape, np.nan), np.full(len(start), np.nan)
         flags: list[frozenset[Flag]] = []
         for k, image in enumerate(target):
-            alone = {Flag.ALPHA_UNKNOWN} if place_mm is None else set[Flag]()
+            alone = set[Flag]()
             if np.concatenate((image[[0, -1]], image[:, [0, -1]].T)).max() > EDGE_INK:
                 alone.add(Flag.CUT)
             if seen.area[k] < MIN_INK_MM2:
-                flags.append(frozenset(alone | {Flag.BLANK}))
-                continue
-            fit = _Fit(self, image, start[k], self._free(place_mm is not None))
-            values[k], sigma[k], rms[k], raised = fit.run()
-            flags.append(frozenset(alone | raised))
+                alone.add(Flag.BLANK)
+            else:
+                values[k], sigma[k], rms[k], raised = _Fit(self, image, start[k], heading[k]).run()
+                alone |= raised
+            flags.append(frozenset(alone))
         return Recovered(values, sigma, rms, tuple(flags))
 
-    def predict(self, values: Floats, px_mm: float) -> Images:
-        """Images (B, N, N) of (B, 5) parameters."""
+    def predict(self, values: Floats, heading_deg: Floats | float, px_mm: float) -> Images:
+        """Images (B, N, N) of (B, 4) parameters."""
         outlines = self.model.profile(values[:, 0], values[:, 1])
-        return coverage(outlines, origins(values), values[:, 4], size_px=self.size_px, px_mm=px_mm)
+        ahead = values[:, 0] * np.tan(np.radians(values[:, 1]))
+        origin = values[:, 2:] + ahead[:, None] * directions(heading_deg)
+        return coverage(outlines, origin, heading_deg, size_px=self.size_px, px_mm=px_mm)
 
-    def _free(self, anchored: bool) -> list[int]:
-        """Numbers of the parameters that are fitted."""
-        if not anchored:
-            return [0, 1, 2, 3, 4]
-        return [0, 1, 2, 3] if self.anchor_sigma_mm > 0 else [0, 1]
-
-    def _nearest(self, seen: Moments, place_mm: Floats | None, heading_deg: Floats) -> Floats:
-        """Starting points (H, alpha, x, y) of B fits, (B, 4): the press of the table that looks most alike."""
-        features = [np.sqrt(seen.area), *seen.spread(heading_deg)]
-        known = [np.sqrt(self.drawn.area), *self.drawn.spread(np.zeros(len(self.table)))]
-        ahead, way = self.drawn.centroid[:, 0] - self.side_mm, directions(heading_deg)
-        if place_mm is not None:
-            features.append(np.sum(way * (seen.centroid - place_mm), axis=1))
-            known.append(ahead)
-        distance = np.square(np.stack(features, -1)[:, None] - np.stack(known, -1)[None]).sum(-1)
+    def _nearest(self, seen: Moments, place_mm: Floats, heading_deg: Floats) -> Floats:
+        """H and alpha from which B fits start, (B, 2): the press of the table that looks most alike."""
+        ahead = np.sum(directions(heading_deg) * (seen.centroid - place_mm), axis=1)
+        features = np.sqrt(seen.area), *seen.spread(heading_deg), ahead
+        of_table = np.sqrt(self.drawn.area), *self.drawn.spread(0.0), self.drawn.centroid[:, 0] - self.side_mm
+        distance = np.square(np.stack(features, -1)[:, None] - np.stack(of_table, -1)[None]).sum(-1)
         best = np.argmin(distance, axis=1)
         # Between two depths of the table, interpolate by area, which grows as H^2.
         depth = self.table[best, 0] * np.sqrt(seen.area / np.maximum(self.drawn.area[best], 1e-12))
-        place = place_mm
-        if place is None:
-            place = seen.centroid - (ahead[best] * depth / self.table[best, 0])[:, None] * way
-        return np.column_stack((depth, self.table[best, 1], place))
-
-
-def origins(values: Floats) -> Floats:
-    """Where the brush axis meets the paper, (B, 2) mm from the left and top edge, for (B, 5) parameters."""
-    ahead = values[:, 0] * np.tan(np.radians(values[:, 1]))
-    return values[:, 2:4] + ahead[:, None] * directions(values[:, 4])
+        return np.column_stack((depth, self.table[best, 1]))
 
 
 class _Fit:
-    """The fit to one image, in the `free` parameters."""
+    """The fit to one image: of H and alpha, and of the place as well if it is uncertain."""
 
-    def __init__(self, inverter: Inverter, image: Images, start: Floats, free: list[int]) -> None:
-        self._inverter, self._image, self._start, self._free = inverter, image, start, free
-        side = inverter.side_mm
+    def __init__(self, inverter: Inverter, image: Images, start: Floats, heading_deg: float) -> None:
+        self._inverter, self._image, self._start, self._heading_deg = inverter, image, start, heading_deg
+        side, sigma = inverter.side_mm, inverter.anchor_sigma_mm
+        free = 4 if sigma > 0 else 2
         # The place may lie beyond the image on every side.
-        limits = (*(inverter.within.depth_mm, inverter.within.tilt_deg), (-side, 2 * side), (-side, 2 * side))
-        self._low, self._high = np.array([*limits, (-720.0, 720.0)])[free].T
-        sigma = np.array([0.0, 0.0, inverter.anchor_sigma_mm, inverter.anchor_sigma_mm, 0.0])[free]
-        self._precision = np.where((sigma > 0) & (len(free) < 5), 1 / np.maximum(sigma, 1e-9) ** 2, 0.0)
-        self._degrees = max(image.size - len(free), 1)
+        limits = (inverter.within.depth_mm, inverter.within.tilt_deg, (-side, 2 * side), (-side, 2 * side))
+        self._low, self._high = np.array(limits[:free]).T
+        self._precision = np.array([0.0, 0.0, *[1 / max(sigma, 1e-9) ** 2] * 2])[:free]
+        self._step, self._nudge = _STEP[:free], _NUDGE[:free]
+        self._degrees = max(image.size - free, 1)
 
     def run(self) -> tuple[Floats, Floats, float, set[Flag]]:
-        """Values (5,), standard deviations (5,), root mean square residual, and flags."""
-        step = _STEP[self._free]
+        """Values (4,), standard deviations (4,), root mean square residual, and flags."""
+        free = len(self._step)
         lowest = descend(
             self._equations,
-            self._clipped(self._start[self._free]),
+            self._clipped(self._start[:free]),
             rounds=_ROUNDS,
             most=1.0,
-            scale=step,
+            scale=self._step,
             gain=1e-9,
             feasible=self._clipped,
         )
-        values, sigma = self._start.copy(), np.zeros(5)
-        values[self._free] = lowest.vector
         residual, jacobian = self._linear(lowest.vector)
-        sigma[self._free] = np.sqrt(self._variances(residual, jacobian))
+        sd = np.sqrt(self._variances(residual, jacobian))
+        values, sigma = np.append(lowest.vector, self._start[free:]), np.append(sd, np.zeros(4 - free))
         at_limit = (lowest.vector <= self._low) | (lowest.vector >= self._high)
-        upright = at_limit[1] and values[1] == 0.0
-        flags = {Flag.UPRIGHT} if upright else set[Flag]()
-        if (at_limit & ~((np.array(self._free) == 1) & upright)).any():
+        flags = set[Flag]()
+        if at_limit[1] and values[1] == 0.0:
+            flags.add(Flag.UPRIGHT)
+            at_limit[1] = False
+        if at_limit.any():
             flags.add(Flag.AT_BOUND)
         left = np.linalg.lstsq(lowest.at.square, -lowest.at.gradient)[0]
-        if (np.abs(step * left) > np.maximum(_STILL, _NEAR * sigma)[self._free]).any():
+        if (np.abs(self._step * left) > np.maximum(_STILL[:free], _NEAR * sd)).any():
             flags.add(Flag.DID_NOT_CONVERGE)
         return values, sigma, math.sqrt(float(np.mean(np.square(residual)))), flags
 
@@ -311,7 +273,7 @@ class _Fit:
         """-log likelihood at some values, and its derivatives in steps of `_STEP`."""
         residual, jacobian = self._linear(vector)
         noise = self._noise(residual)
-        off, scale = vector - self._start[self._free], _STEP[self._free]
+        off, scale = vector - self._start[: len(vector)], self._step
         flat = jacobian.reshape(len(vector), -1)
         square = (flat @ flat.T).astype(np.float64) / noise + np.diag(self._precision)
         gradient = -(flat @ residual.ravel()).astype(np.float64) / noise + self._precision * off
@@ -323,12 +285,12 @@ class _Fit:
 
     def _linear(self, vector: Floats) -> tuple[Images, Images]:
         """The residual, image - predicted (N, N), and the derivatives of the prediction (P, N, N)."""
-        count, nudges = len(vector), np.diag(_NUDGE[self._free])
+        count, nudges = len(vector), np.diag(self._nudge)
         values = np.repeat(self._start[None], 2 * count + 1, axis=0)
-        values[:, self._free] = self._clipped(vector + np.vstack((np.zeros(count), nudges, -nudges)))
-        drawn = self._inverter.predict(values, self._inverter.px_mm)
+        values[:, :count] = self._clipped(vector + np.vstack((np.zeros(count), nudges, -nudges)))
+        drawn = self._inverter.predict(values, self._heading_deg, self._inverter.px_mm)
         ahead, behind = slice(1, count + 1), slice(count + 1, None)
-        widths = np.diag(values[ahead, self._free] - values[behind, self._free]).astype(np.float32)
+        widths = np.diag(values[ahead, :count] - values[behind, :count]).astype(np.float32)
         return self._image - drawn[0], (drawn[ahead] - drawn[behind]) / widths[:, None, None]
 
     def _noise(self, residual: Images) -> float:

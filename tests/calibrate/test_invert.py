@@ -1,9 +1,10 @@
-"""Presses of a session come back as a CSV and a protocol that the rig can press again."""
+"""Presses of a session come back as a CSV and a protocol that the rig can press again, with honest intervals."""
 
 from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,19 @@ import pytest
 
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.invert import PROTOCOL, Recovered, RecoverRequest, Row, off_command, recover
+from brushloop.calibrate.invert import (
+    NO_MODEL_ERROR,
+    NOT_INFORMATIVE,
+    PROTOCOL,
+    Recovered,
+    RecoverRequest,
+    Row,
+    common_variance,
+    covers_most,
+    model_sd,
+    recover,
+    with_model_error,
+)
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.presses import ReplayConfig
@@ -22,7 +35,7 @@ from brushloop.model.raster.exact import coverage_at
 from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Stroke
+from brushloop.sessions.records import Condition, Stroke
 from tests.command import brushloop
 
 PRESSES = [(12.0, 3.0), (15.0, 6.0), (18.5, 9.0)]
@@ -30,20 +43,20 @@ PX = 12.0  # of the pretended scan, per mm
 START = (34.0, 20.0)  # mm from the left and top edge
 
 
-def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
+def photograph(depth_mm: float, tilt_deg: float, start_x_mm: float = START[0]) -> np.ndarray:
     """A 50 x 40 mm photograph at 12 px/mm of CCD-BSM's own mark, touched at START, ferrule to the right."""
-    origin = (START[0] + depth_mm * math.tan(math.radians(tilt_deg)), START[1])
+    origin = (start_x_mm + depth_mm * math.tan(math.radians(tilt_deg)), START[1])
     ink = coverage_at(ccdbsm(Brush(), depth_mm, tilt_deg).outline(), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 
-def session(folder: Path, *, kind: str = "press") -> Path:
+def session(folder: Path, *, kind: str = "press", start_x_mm: float = START[0]) -> Path:
     photos = folder / "photos"
     photos.mkdir()
     rows = ["file,depth_mm,tilt_deg,px_per_mm,start_x_px,start_y_px"]
     for k, (height, tilt) in enumerate(PRESSES):
-        cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt))
-        rows.append(f"p{k}.png,{height},{tilt},{PX},{START[0] * PX},{START[1] * PX}")
+        cv2.imwrite(str(photos / f"p{k}.png"), photograph(height, tilt, start_x_mm))
+        rows.append(f"p{k}.png,{height},{tilt},{PX},{start_x_mm * PX},{START[1] * PX}")
     (photos / "strokes.csv").write_text("\n".join(rows) + "\n")
     out = folder / "sessions" / "shots"
     import_photographs(photos, photos / "strokes.csv", out, ImportOptions(kind=kind), "test", lambda: 1)
@@ -51,7 +64,7 @@ def session(folder: Path, *, kind: str = "press") -> Path:
 
 
 def recovered(session: Path, out: Path, **options: Any) -> Recovered:
-    return recover(RecoverRequest(session, out / "recovered.csv", **{"anchor_sd_mm": 0.05} | options))
+    return recover(RecoverRequest(session, out / "recovered.csv", **options))
 
 
 def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
@@ -72,33 +85,20 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
         first = next(csv.DictReader(file))
     assert first["commanded_depth_mm"] == "12"
     assert first["source"] == "imported photographs"
+    few = recovered(tmp_path / "sessions" / "shots", tmp_path, presses=2)  # spread evenly over the session
+    assert ([row.stroke_id for row in few.rows], few.refused) == (["p0", "p1"], [])
 
 
-def test_some_presses_are_chosen_evenly_and_the_others_left_alone(tmp_path: Path) -> None:
-    made = recovered(session(tmp_path), tmp_path, presses=2)
-    assert [row.stroke_id for row in made.rows] == ["p0", "p1"]
-    assert made.refused == []
-
-
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-def test_another_model_inverts_the_same_session(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="unknown stroke model 'x'"):
-        recovered(session(tmp_path), tmp_path, model="x")
-    made = recovered(tmp_path / "sessions" / "shots", tmp_path, model="ellipse")
-    # The ellipse is regressed on CCD-BSM's marks: it has their length, so their depth, nearly.
-    for row, (height, _) in zip(made.rows, PRESSES, strict=True):
-        assert row.depth_mm == pytest.approx(height, abs=3.0)
-        assert row.rms > 0.05
-
-
-def test_drags_are_refused(tmp_path: Path) -> None:
+def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "drags").mkdir()
     with pytest.raises(CalibrationError, match="holds drags"):
-        recovered(session(tmp_path, kind="drag"), tmp_path)
-
-
-def test_a_session_of_which_nothing_can_be_recovered_writes_nothing(tmp_path: Path) -> None:
+        recovered(session(tmp_path / "drags", kind="drag"), tmp_path)
     with pytest.raises(CalibrationError, match="no stroke could be recovered: p0: is cut by the edge of its photo"):
-        recovered(session(tmp_path), tmp_path, mm_per_px=0.12)
+        recovered(session(tmp_path, start_x_mm=8.0), tmp_path)
+    with pytest.raises(CalibrationError, match=r"no press of this brush in the range: depth_mm = \(2, 2\)"):
+        recovered(tmp_path / "sessions" / "shots", tmp_path, depth_range_mm=(2.0, 2.0))
+    with pytest.raises(CalibrationError, match="give a plain name"):
+        recover(RecoverRequest(tmp_path, tmp_path / PROTOCOL))
     assert not (tmp_path / "recovered.csv").exists()
 
 
@@ -109,31 +109,76 @@ def test_a_capture_without_any_scale_is_refused() -> None:
     assert (name, str(why)) == ("refused", "has neither a calibration nor a scale of its own")
 
 
-def test_a_name_that_no_protocol_can_hold_is_not_written(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="give a plain name"):
-        recover(RecoverRequest(tmp_path, tmp_path / PROTOCOL))
-
-
-def test_the_summary_compares_with_what_was_commanded() -> None:
-    rows = [Row("a", 10.1, 4.0, 0.1, 0.5, 0.1, (), 10.0, 5.0), Row("b", 12.5, 4.0, 0.1, None, 0.1, (), 12.0, None)]
-    summary = {name: values for name, *values in off_command(rows)}
-    assert summary["H"][0] == pytest.approx(0.3)
-    assert summary["H"][1] == pytest.approx(0.4 / 2**0.5)
-    assert summary["H"][2:] == [0.5, 2]
-    assert summary["alpha"][0] == pytest.approx(-1.0)
-    assert summary["alpha"][1] is None
-    assert summary["alpha"][3] == 1
-
-
-def test_the_command_says_what_came_out(tmp_path: Path) -> None:
+def test_the_command_compares_with_what_was_commanded(tmp_path: Path) -> None:
     session(tmp_path)
-    command = ["invert", "sessions/shots", "--out", "again/recovered.csv"]
-    ran = brushloop(*command, cwd=tmp_path)
+    ran = brushloop("invert", "sessions/shots", "--out", "again/recovered.csv", cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     words = " ".join(ran.stdout.split())
     assert "3 presses recovered by ccd-bsm (imported photographs)" in words
-    assert "H: recovered - commanded" in words
+    assert "H: recovered - commanded -0.0" in words
+    assert "100% of 3 in the interval" in words
+    assert "warning: 3 without model error in their intervals" in words
     assert load_protocol(tmp_path / "again" / PROTOCOL).kind == "replay"
-    bad = brushloop(*command, "--tilt-range", "0", "50", cwd=tmp_path)
-    assert bad.returncode == 2
-    assert bad.stderr.count("\n") == 1
+
+
+CELLS = [Condition(h, a) for h in (11.0, 13.0, 15.0, 17.0, 20.0) for a in (0.0, 5.0, 10.0)]
+
+
+def rows(cells: list[Condition], error_mm: float, error_deg: float) -> list[Row]:
+    rng = np.random.default_rng(0)
+    return [
+        Row(f"s{k}", one, one.depth_mm + error_mm * rng.normal(), one.tilt_deg + error_deg * rng.normal(), 0.05, 0.2, 0)
+        for k, one in enumerate(cells * 20)
+    ]
+
+
+def inside(made: list[Row]) -> float:
+    return float(np.mean([abs(off) <= 1.96 * sd for off, sd in (row.off["alpha"] for row in made)]))
+
+
+def test_a_model_error_is_in_the_interval_and_weighs_more_where_the_brush_is_pressed_less() -> None:
+    raw = rows(CELLS, 0.3, 2.0)
+    made = with_model_error(raw)
+    assert inside(raw) < 0.3
+    assert 0.93 <= inside(made) <= 0.99
+    shallow, deep = ([r.tilt_sd_deg for r in made if r.commanded.depth_mm == h] for h in (11.0, 20.0))
+    assert np.mean(shallow) == pytest.approx(np.mean(deep) * 20.0 / 11.0, rel=0.1)
+
+
+def test_the_own_command_does_not_enter_the_interval() -> None:
+    off = np.array([5.0, 0.1, 0.1, 0.1])
+    found = model_sd(off, np.full(4, 0.01), [Condition(h, 0.0) for h in (11.0, 13.0, 15.0, 17.0)])
+    assert found[0] == pytest.approx(0.1 * 3.182 / 1.96, rel=0.02)
+    assert found[1] > 3.0
+
+
+def test_a_cell_the_brush_was_not_fitted_to_takes_the_error_of_such_cells() -> None:
+    cells = CELLS[:9]
+    off = np.array([0.1] * 5 + [1.0] * 4)
+    sd = np.full(9, 0.01)
+    found = model_sd(off, sd, cells, fitted=cells[:5])
+    assert found[5:] == pytest.approx(1.0 * 3.182 / 1.96, rel=0.01), "three other cells left out"
+    assert (model_sd(off, sd, cells)[5:] < 1.0).all(), "diluted by the fitted cells"
+    assert (model_sd(off[:6], sd[:6], cells[:6], fitted=cells[:5])[5:] < 0.2).all(), "none else left out: all cells"
+
+
+def test_a_press_that_its_image_hardly_determines_counts_little() -> None:
+    off, sd = np.array([0.5, -0.5, 0.5, 3.0]), np.array([0.01, 0.01, 0.01, 30.0])
+    assert common_variance(off, sd) == pytest.approx(0.25 * 3 / 4, rel=0.1)
+    assert common_variance(np.array([0.1, 0.1]), np.array([0.5, 0.5])) == 0.0
+
+
+def test_too_few_cells_and_intervals_over_most_of_the_commanded_range_are_flagged() -> None:
+    assert all(NO_MODEL_ERROR in row.flags for row in with_model_error(rows(CELLS[:3], 0.3, 2.0)))
+    vague, sharp = (with_model_error(rows(CELLS, 0.3, error_deg)) for error_deg in (4.0, 0.5))
+    assert any(NOT_INFORMATIVE["alpha"] in row.flags and row.tilt_sd_deg > 3.0 for row in vague)
+    assert not any(row.flags & set(NOT_INFORMATIVE.values()) for row in sharp)
+    for value, sd, most in ((5.0, 2.5, True), (5.0, 1.5, False), (0.0, 2.5, False)):
+        assert covers_most(value, sd, [0.0, 5.0, 10.0]) is most
+        assert not covers_most(value, sd, [5.0, 5.0]), "one tilt only: there is no range to compare with"
+
+
+def test_upright_presses_recovered_at_0_do_not_count_as_exact() -> None:
+    half = [replace(r, tilt_deg=max(r.tilt_deg, 0.0)) for r in rows(CELLS[::3], 0.3, 2.0)]
+    assert np.mean([r.tilt_deg == 0.0 for r in half]) > 0.4
+    assert np.mean([r.tilt_sd_deg for r in with_model_error(half)]) > 1.9
