@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bench.harness import Result, at_most, interleave, machine, rounds_of
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.inversion import Inverter
-from brushloop.model.raster import PX_MM, SIZE_PX
+from brushloop.model.raster import PX_MM, SIZE_PX, coverage
 from brushloop.model.raster.press import press_images
 from brushloop.model.strokes import stroke_model
 
@@ -91,7 +91,7 @@ def inversion(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
     truth = {"depth_mm": rng.uniform(11, 20, count), "tilt_deg": rng.uniform(0, 10, count)}
     anchor = np.array([0.8, 0.5]) * SIZE_PX * INVERTED_PX_MM + rng.uniform(-0.5, 0.5, (count, 2)) * INVERTED_PX_MM
     origin = anchor + np.column_stack((truth["depth_mm"] * np.tan(np.radians(truth["tilt_deg"])), np.zeros(count)))
-    clean = press_images(ccdbsm(Brush(), truth["depth_mm"], truth["tilt_deg"]), origin, px_mm=INVERTED_PX_MM)
+    clean = coverage(ccdbsm(Brush(), truth["depth_mm"], truth["tilt_deg"]).outline(), origin, px_mm=INVERTED_PX_MM)
     noisy = (clean + rng.normal(0, SENSOR, clean.shape)).astype(np.float32)
     inverter = Inverter(stroke_model("ccd-bsm", Brush()), px_mm=INVERTED_PX_MM)
     with _one_thread():

@@ -28,8 +28,11 @@ Vector = NDArray[np.float64]
 Images = NDArray[np.float32]
 FARTHEST = 6.0
 """Scales by which a constant may differ from its default."""
-OFFSETS_MM = (0.3, 1.0, 1.0)
-"""Scales of the differences in depth, x and y between where the brush touched and where the rig believes it did."""
+Place = tuple[float, float, float]
+"""How much deeper each press was, and how far along x and y it touched from where the rig believes it did, mm."""
+HERE: Place = (0.0, 0.0, 0.0)
+PLACE_MM: Place = (0.3, 1.0, 1.0)
+"""Scales of a place."""
 PX_PER_MM = 5.0
 """Scale at which footprints are printed."""
 INKED = 0.3
@@ -105,16 +108,6 @@ SPREAD = (
 """Constants by which presses of one cell differ."""
 
 
-@dataclass(frozen=True, slots=True)
-class Offset:
-    """Difference between where the brush really touched and where the rig believes that it did, mm."""
-
-    depth_mm: float
-    """How much deeper each press was."""
-    x_mm: float
-    y_mm: float
-
-
 def brush_at(point: Vector, base: BrushSpec) -> BrushSpec:
     """The brush at a point (len(SHAPE) + 3,) of the search, with the size and the individual of `base`."""
     return with_values(base, SHAPE, point)
@@ -126,10 +119,10 @@ def with_values(base: BrushSpec, constants: Sequence[Constant], point: Sequence[
     return replace(base, **values)
 
 
-def offset_at(point: Vector) -> Offset:
+def place_at(point: Vector) -> Place:
     """The last three coordinates of a point."""
-    depth, x, y = (mm * float(v) for mm, v in zip(OFFSETS_MM, point[len(SHAPE) :], strict=True))
-    return Offset(depth, x, y)
+    deeper, x, y = (float(mm * v) for mm, v in zip(PLACE_MM, point[len(SHAPE) :], strict=True))
+    return deeper, x, y
 
 
 def search_bounds() -> tuple[Vector, Vector]:
@@ -140,20 +133,20 @@ def search_bounds() -> tuple[Vector, Vector]:
 
 
 def draw(
-    spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, repeats: int = 1, first_seed: int = 0
+    spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, repeats: int = 1, first_seed: int = 0
 ) -> Images:
     """(cells, repeats, len(y_mm), len(x_mm)) ink from 0 to 1 of a freshly dipped brush.
 
     Raises ValueError, naming value and range, for a press deeper than the brush allows.
     """
     brush = Brush(spec)
-    descents = _descents(mechanics(spec), offset.depth_mm, tuple(cells))
+    descents = _descents(mechanics(spec), place[0], tuple(cells))
     ink = np.empty((len(cells), repeats, len(grid.y_mm), len(grid.x_mm)), np.float32)
     for c, descent in enumerate(descents):
         for r in range(repeats):
             seed = first_seed + 1000 * c + r
             mark = brush.print_descent(descent, ink_load=1.0, press_seed=seed, px_per_mm=PX_PER_MM)
-            ink[c, r] = _on_grid(mark, offset, grid)
+            ink[c, r] = _on_grid(mark, place, grid)
     return ink
 
 
@@ -178,7 +171,7 @@ def _descents(spec: BrushSpec, deeper_mm: float, cells: tuple[Cell, ...]) -> tup
     return tuple(descents[cell] for cell in cells)
 
 
-def _on_grid(mark: Footprint, offset: Offset, grid: Grid) -> Images:
+def _on_grid(mark: Footprint, place: Place, grid: Grid) -> Images:
     """(len(y_mm), len(x_mm)) share of each pixel that the mark inks."""
     ink = (mark.density > INKED).astype(np.float32)
     fine_mm = grid.px_mm / FINE
@@ -189,8 +182,8 @@ def _on_grid(mark: Footprint, offset: Offset, grid: Grid) -> Images:
     # from a fine pixel of the grid to a pixel of the footprint, whose centres lie half a pixel from its corner
     there = np.array(
         [
-            [scale, 0.0, column - 0.5 + (first_x - offset.x_mm) * mark.px_per_mm],
-            [0.0, scale, row - 0.5 + (offset.y_mm - first_y) * mark.px_per_mm],
+            [scale, 0.0, column - 0.5 + (first_x - place[1]) * mark.px_per_mm],
+            [0.0, scale, row - 0.5 + (place[2] - first_y) * mark.px_per_mm],
         ]
     )
     size = (len(grid.x_mm), len(grid.y_mm))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import count
 from typing import ClassVar
 
 import numpy as np
@@ -20,25 +20,12 @@ from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out
 from brushloop.calibrate.store import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.sessions.terminal import Progress, unseen
-from brushloop.twin.brush import (
-    SHAPE,
-    SPREAD,
-    Constant,
-    Images,
-    Offset,
-    Vector,
-    brush_at,
-    draw,
-    offset_at,
-    with_values,
-)
+from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Images, Vector, draw, place_at, with_values
 from brushloop.twin.search import (
-    COARSE,
+    COARSE_MM,
     FEWEST_REPEATS,
-    FINE,
+    FINE_MM,
     Found,
-    Repeats,
-    Round,
     Spread,
     Target,
     choose_individual,
@@ -115,25 +102,16 @@ class TwinStopped(Exception):
 def workers(most: int = MOST_WORKERS) -> Generator[Executor]:
     """Processes that draw presses, one for each core; they end with this one, even if it is killed.
 
-    Raises `TwinStopped` on SIGTERM, once what is being drawn is drawn, and if one of them ends before the block does,
-    as when the system runs out of memory.
+    Raises `TwinStopped` if one of them ends before the block does, as when the system runs out of memory.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads of matrix products would compete with the processes
-    count = min(os.cpu_count() or 1, most)
     spawn = multiprocessing.get_context("spawn")
-
-    def terminated(_number: int, _frame: object) -> None:
-        raise TwinStopped("SIGTERM: the same command continues")
-
-    before = signal.signal(signal.SIGTERM, terminated)  # a process that just ends leaks the pool's semaphores
-    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent)
+    processes = min(os.cpu_count() or 1, most)
     try:
-        yield pool
+        with ProcessPoolExecutor(processes, mp_context=spawn, initializer=_end_with_parent) as pool:
+            yield pool
     except BrokenExecutor:
         raise TwinStopped("a process that drew presses was ended (memory?): the same command continues") from None
-    finally:
-        pool.shutdown(cancel_futures=True)
-        signal.signal(signal.SIGTERM, before)
 
 
 def _end_with_parent() -> None:
@@ -165,20 +143,20 @@ def fit_twin(
     means = np.asarray([np.mean([press.ink for press in group], axis=0) for group in cells.values()], np.float32)
     target = Target(BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0), tuple(cells), grid, means)
     parts = parts_of(target.cells)
-    searches = _Searches(pool, store, progress, 1 + len(parts))
+    searches = _Searches(pool, store, progress, (1 + len(parts)) * (2 + len(COARSE_MM) + 1))
     found = searches.coarse(target)
-    several = {cell: group for cell, group in cells.items() if len(group) >= FEWEST_REPEATS}
-    repeats = Repeats(tuple(several), tuple(np.array([press.ink for press in group]) for group in several.values()))
+    groups = {cell: np.array([press.ink for press in group]) for cell, group in cells.items()}
+    repeats = {cell: ink for cell, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
     spread: Spread | None = None
-    if several:
-        spread = fit_spread(_brush(found, target), offset_at(found.point), repeats, grid, pool.map)
+    if repeats:
+        spread = fit_spread(target.brush(found), place_at(found.point), repeats, grid, pool)
         # hairs that stray make every mark wider and its ends fainter: the shape is fitted to the captures with them
         target = replace(target, base=with_values(target.base, SPREAD, spread.point))
     found = searches.fine(target, found)
     variance = np.diagonal(covariance(target, found, pool))
-    spec, offset = _brush(found, target), offset_at(found.point)
+    spec = target.brush(found)
     if spread is not None:
-        spread = fit_spread(spec, offset, repeats, grid, pool.map, spread.point)
+        spread = fit_spread(spec, place_at(found.point), repeats, grid, pool, spread.point)
     predicted, points = list[Predicted](), list[Vector]()
     for part in parts:
         others = target.only([k for k in range(len(cells)) if k not in part])
@@ -194,45 +172,42 @@ def fit_twin(
     return Twin(spec, tuple(estimates), spread, held_out, sound_head(spec, target.cells, grid))
 
 
+@dataclass(frozen=True, slots=True)
 class _Searches:
     """The searches of one twin; passes that the store holds, as those of an interrupted run, are not repeated."""
 
-    def __init__(self, pool: Executor, store: Store | None, progress: Progress, twins: int) -> None:
-        self._pool, self._store, self._progress = pool, store, progress
-        self._done, self._count = 0, twins * (2 + len(COARSE) + 1)
-        progress("twin: passes of the search", 0, self._count)
+    pool: Executor
+    store: Store | None
+    progress: Progress
+    total: int
+    """Passes of all searches."""
+    _done: Iterator[int] = field(default_factory=lambda: count(1))
 
     def coarse(self, target: Target) -> Found:
-        found = self._step(choose_individual, target, start())
-        for one in COARSE:
-            found = self._step(search, target, found, one)
+        found = self._pass(choose_individual, target, start())
+        for blur_mm in COARSE_MM:
+            found = self._pass(search, target, found, blur_mm)
         return found
 
     def fine(self, target: Target, found: Found) -> Found:
-        return self._step(search, target, self._step(choose_individual, target, found), FINE)
+        return self._pass(search, target, self._pass(choose_individual, target, found), FINE_MM)
 
-    def _step(self, work: Callable[..., Found], target: Target, found: Found, *passes: Round) -> Found:
+    def _pass(self, work: Callable[..., Found], target: Target, found: Found, *blur_mm: float) -> Found:
         place = target.grid.x_mm, target.grid.y_mm, target.mean
-        key = key_of("twin", made_by(), passes, target.base, target.cells, *place, found.seed, found.point)
-        kept = None if self._store is None else self._store.get(key)
-        if kept is None:
-            result = work(target, found, *passes, self._pool)
-            if self._store is not None:
-                self._store.put(key, {"point": result.point, "seed": np.array(result.seed)})
-        else:
+        key = key_of("twin", made_by(), blur_mm, target.base, target.cells, *place, found.seed, found.point)
+        if self.store is not None and (kept := self.store.get(key)) is not None:
             result = Found(kept["point"], int(kept["seed"]))
-        self._done += 1
-        self._progress("twin: passes of the search", self._done, self._count)
+        else:
+            result = work(target, found, self.pool, *blur_mm)
+            if self.store is not None:
+                self.store.put(key, {"point": result.point, "seed": np.array(result.seed)})
+        self.progress("twin: passes of the search", next(self._done), self.total)
         return result
-
-
-def _brush(found: Found, target: Target) -> BrushSpec:
-    return brush_at(found.point, replace(target.base, seed=found.seed))
 
 
 def _predicted(cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target) -> Iterator[Predicted]:
     """Yield the cells `held` as predicted by the twin found without them, and by a Bezier refitted to the others."""
-    drawn = draw(_brush(there, target), offset_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
+    drawn = draw(target.brush(there), place_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
     others = [press for cell, group in cells.items() if cell not in held for press in group]
     bezier = None
     with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
@@ -254,7 +229,7 @@ def parts_of(cells: Sequence[Cell]) -> list[list[int]]:
 
 def sound_head(spec: BrushSpec, cells: Sequence[Cell], grid: Grid) -> SoundHead | None:
     """The settings of the quality checks with which presses of the twin in these cells pass; None without ink."""
-    drawn = draw(spec, Offset(0.0, 0.0, 0.0), cells, grid, PRESSES, HEAD_SEED)
+    drawn = draw(spec, HERE, cells, grid, PRESSES, HEAD_SEED)
     heads_mm = [at for cell in drawn for image in cell if (at := _head_mm(image, grid)) is not None]
     if not heads_mm:
         return None

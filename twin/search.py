@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,15 +26,16 @@ from brushloop.calibrate.fit.captures import Grid
 from brushloop.drivers.sim.brush.spec import BrushSpec
 from brushloop.model.similarity import csim
 from brushloop.twin.brush import (
+    HERE,
     SHAPE,
     SPREAD,
     Cell,
     Images,
-    Offset,
+    Place,
     Vector,
     brush_at,
     draw,
-    offset_at,
+    place_at,
     search_bounds,
     still,
     with_values,
@@ -55,7 +56,6 @@ STARTS = {"trail_share": 0.25}
 INDIVIDUALS = range(1000, 1032)
 """Seeds of the individual (its hairs and how they clump) that are tried. A captured brush has none of them: the brushes
 on which twins are measured have seeds below 1000."""
-FINEST_MM = 0.3
 MOST_TRIALS = 4
 """Brushes tried for each step: one that is not nearer to the captures costs little beside the derivatives."""
 FTOL = 3e-4
@@ -76,17 +76,12 @@ AGREEMENT_SD = 0.05
 is better known than the four deviations, each of one number a mark: without one repeat of four it changes by 3 %."""
 
 
-@dataclass(frozen=True, slots=True)
-class Round:
-    """One pass of the search: its blur, and its largest number of steps, each with derivatives of its own."""
-
-    blur_mm: float
-    steps: int
-
-
-COARSE = (Round(1.2, 6), Round(0.5, 6))
-FINE = Round(FINEST_MM, 6)
-"""The pass after the individual has been chosen."""
+COARSE_MM = (1.2, 0.5)
+"""Blurs of the first passes of the search."""
+FINE_MM = 0.3
+"""Blur of the pass after the individual has been chosen."""
+STEPS = 6
+"""Largest number of steps of a pass, each with derivatives of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +94,10 @@ class Target:
     grid: Grid
     mean: Images
     """(cells, len(y_mm), len(x_mm)) mean ink of each cell's captures."""
+
+    def brush(self, found: Found) -> BrushSpec:
+        """The brush of a search."""
+        return brush_at(found.point, replace(self.base, seed=found.seed))
 
     def only(self, kept: Sequence[int]) -> Target:
         """The same with some of the cells."""
@@ -113,23 +112,15 @@ class Found:
     seed: int
 
 
-Map = Callable[[Callable[[Vector], Vector], Iterable[Vector]], Iterable[Vector]]
-"""The built-in `map`, or an executor's."""
-
-
 def start() -> Found:
     """The default brush, but with a trail faint enough for the search to see whether there is more of it or less."""
-    point = np.zeros(len(SHAPE) + 3)
-    for at, one in enumerate(SHAPE):
-        if one.name in STARTS:
-            point[at] = one.scales(STARTS[one.name])
-    return Found(point, INDIVIDUALS[0])
+    scales = [one.scales(STARTS.get(one.name, one.default)) for one in SHAPE]
+    return Found(np.array([*scales, *HERE]), INDIVIDUALS[0])
 
 
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
     """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
-    base = replace(target.base, seed=seed)
-    drawn = draw(still(brush_at(point, base)), offset_at(point), target.cells, target.grid)[:, 0]
+    drawn = draw(still(target.brush(Found(point, seed))), place_at(point), target.cells, target.grid)[:, 0]
     apart = blurred(drawn - target.mean, blur_mm, target.grid)
     return np.concatenate([apart.ravel() / IMAGE_SD, point / PRIOR_SD])
 
@@ -141,7 +132,7 @@ def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
     return np.asarray(soft, np.float64)
 
 
-def search(target: Target, found: Found, one: Round, workers: Executor) -> Found:
+def search(target: Target, found: Found, workers: Executor, blur_mm: float) -> Found:
     """One pass, starting from `found`."""
     from scipy.optimize import least_squares  # slow to import
 
@@ -150,14 +141,14 @@ def search(target: Target, found: Found, one: Round, workers: Executor) -> Found
     reached = [began]
 
     def evaluate(moved: Vector) -> Vector:
-        return off(target, found.seed, one.blur_mm, began + moved)
+        return off(target, found.seed, blur_mm, began + moved)
 
     def slopes(moved: Vector) -> NDArray[np.float64]:
         reached.append(began + moved)
-        if len(reached) > one.steps + 1:
+        if len(reached) > STEPS + 1:
             raise _EnoughSteps
-        at_point = partial(off, target, found.seed, one.blur_mm)
-        return derivatives(at_point, reached[-1], high, STEP, workers.map)
+        at_point = partial(off, target, found.seed, blur_mm)
+        return derivatives(at_point, reached[-1], high, workers)
 
     # the search is for the way from where it began, because the minimiser's first step is as long as its start is far
     # from 0, and 1 if that is 0
@@ -167,7 +158,7 @@ def search(target: Target, found: Found, one: Round, workers: Executor) -> Found
             np.zeros_like(began),
             jac=slopes,
             bounds=(low - began, high - began),
-            max_nfev=MOST_TRIALS * one.steps,
+            max_nfev=MOST_TRIALS * STEPS,
             xtol=1e-3,
             ftol=FTOL,
             gtol=None,
@@ -181,17 +172,17 @@ class _EnoughSteps(Exception):
 
 
 def derivatives(
-    evaluate: Callable[[Vector], Vector], point: Vector, high: Vector, step: float, each: Map = map
+    evaluate: Callable[[Vector], Vector], point: Vector, high: Vector, workers: Executor
 ) -> NDArray[np.float64]:
     """(residuals, constants) by differences of one step, downward where the upper bound is nearer than that."""
-    steps = np.where(point + step < high, step, -step)
-    here, *there = each(evaluate, [point, *(point + np.diag(steps))])
+    steps = np.where(point + STEP < high, STEP, -STEP)
+    here, *there = workers.map(evaluate, [point, *(point + np.diag(steps))])
     return np.column_stack([(one - here) / by for one, by in zip(there, steps, strict=True)])
 
 
 def choose_individual(target: Target, found: Found, workers: Executor) -> Found:
     """The seed whose hairs, with the constants found, come nearest to the captures."""
-    residuals = partial(off, target, blur_mm=FINEST_MM, point=found.point)
+    residuals = partial(off, target, blur_mm=FINE_MM, point=found.point)
     squares = [float(one @ one) for one in workers.map(residuals, INDIVIDUALS, chunksize=4)]
     return Found(found.point, INDIVIDUALS[int(np.argmin(squares))])
 
@@ -203,8 +194,8 @@ def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.fl
     over the cells. The prior counts as one more observation of each constant.
     """
     _, high = search_bounds()
-    evaluate = partial(off, target, found.seed, FINEST_MM)
-    jacobian = derivatives(evaluate, found.point, high, STEP, workers.map)
+    evaluate = partial(off, target, found.seed, FINE_MM)
+    jacobian = derivatives(evaluate, found.point, high, workers)
     residual = evaluate(found.point)
     count, constants = len(target.cells), len(found.point)
     of_cells = jacobian[:-constants].reshape(count, -1, constants)
@@ -228,19 +219,6 @@ def of_parts(points: Sequence[Vector]) -> Vector | float:
 
 
 @dataclass(frozen=True, slots=True)
-class Repeats:
-    """The cells with several captures, and their ink, (n, len(y_mm), len(x_mm)) each."""
-
-    cells: tuple[Cell, ...]
-    ink: tuple[Images, ...]
-
-    @property
-    def freedom(self) -> int:
-        """Degrees of freedom of a deviation pooled over the cells."""
-        return sum(len(one) - 1 for one in self.ink)
-
-
-@dataclass(frozen=True, slots=True)
 class Spread:
     """The constants in scales from their defaults, their standard errors, and the agreement of repeats."""
 
@@ -254,45 +232,43 @@ class Spread:
 
 def fit_spread(
     spec: BrushSpec,
-    offset: Offset,
-    repeats: Repeats,
+    place: Place,
+    repeats: Mapping[Cell, Images],
     grid: Grid,
-    each: Map = map,
+    workers: Executor,
     start: Sequence[float] = SPREAD_START,
 ) -> Spread:
-    """Match the statistics of the captures. Raises ValueError without a cell that has `FEWEST_REPEATS` captures."""
+    """Match the statistics of the captures, (n, len(y_mm), len(x_mm)) ink of each cell."""
     from scipy.optimize import least_squares  # slow to import
 
-    if not repeats.cells:
-        raise ValueError(f"no cell has {FEWEST_REPEATS} captures")
+    captured = list(repeats.values())
     # twice the relative standard error of a deviation with this many degrees of freedom: the simulated one has its own
-    deviation = 2.0 / math.sqrt(2.0 * repeats.freedom)
+    deviation = 2.0 / math.sqrt(2.0 * sum(len(one) - 1 for one in captured))
     sd = np.array([deviation] * 4 + [AGREEMENT_SD])
-    seen = statistics(repeats.ink, grid)
-    off = partial(_off_statistics, spec, offset, repeats.cells, grid, seen, sd)
+    off = partial(_off_statistics, spec, place, tuple(repeats), grid, statistics(captured, grid), sd)
     low, high = np.array([one.bounds for one in SPREAD]).T
     best = least_squares(
         off,
         start,
-        jac=lambda point: derivatives(off, point, high, STEP, each),
+        jac=lambda point: derivatives(off, point, high, workers),
         bounds=(low, high),
         max_nfev=SPREAD_STEPS,
     )
-    twin = _drawn(spec, offset, repeats.cells, grid, best.x)
+    twin = _drawn(spec, place, tuple(repeats), grid, best.x)
     jacobian = np.asarray(best.jac, np.float64)
     error = np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)))
-    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(repeats.ink), agreement(twin))
+    return Spread(tuple(map(float, best.x)), tuple(map(float, error)), agreement(captured), agreement(twin))
 
 
 def _off_statistics(
-    spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, seen: Vector, sd: Vector, point: Vector
+    spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, seen: Vector, sd: Vector, point: Vector
 ) -> Vector:
-    drawn = statistics(_drawn(spec, offset, cells, grid, point), grid)
+    drawn = statistics(_drawn(spec, place, cells, grid, point), grid)
     return np.concatenate([(drawn - seen) / sd, point / SPREAD_PRIOR_SD])
 
 
-def _drawn(spec: BrushSpec, offset: Offset, cells: Sequence[Cell], grid: Grid, point: Vector) -> list[Images]:
-    return list(draw(with_values(spec, SPREAD, point), offset, cells, grid, REPEATS, FIRST_SEED))
+def _drawn(spec: BrushSpec, place: Place, cells: Sequence[Cell], grid: Grid, point: Vector) -> list[Images]:
+    return list(draw(with_values(spec, SPREAD, point), place, cells, grid, REPEATS, FIRST_SEED))
 
 
 def statistics(ink: Sequence[Images], grid: Grid) -> Vector:

@@ -70,14 +70,6 @@ def test_numpy_draws_what_torch_draws() -> None:
         Layers().shapes(40)
 
 
-def test_the_network_is_differentiable_in_its_inputs() -> None:
-    torch.manual_seed(0)
-    network = Generator(Target(size_px=32), Layers(width=16, channels=4, side=8)).double()
-    inputs = torch.tensor([[13.3, 4.0], [17.0, 9.0]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda values: network(values).mean((1, 2)), (inputs,), eps=1e-6, atol=1e-6)
-    assert network(inputs).shape == (2, 32, 32)
-
-
 def test_the_loss_is_eq_6_and_its_gradient_passes_the_clamp() -> None:
     field = torch.tensor([[[-3.0, 0.1], [0.2, 4.0]]], requires_grad=True)
     wanted = torch.tensor([[[1.0, 0.5], [0.7, 1.0]]])
@@ -143,17 +135,13 @@ def configured(**layers: int) -> str:
 
 BIAS = "convolution.0.bias"
 HOSTILE: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "absent": (Path.unlink, "no such file"),
     "text": (lambda p: p.write_text("hello"), "is not a safetensors file"),
-    "cut": (lambda p: p.write_bytes(p.read_bytes()[:-100]), "is not a safetensors file"),
     "endless header": (lambda p: p.write_bytes(struct.pack("<Q", 2**60) + b"{}"), "is not a safetensors file"),
     "huge": (lambda p: os.truncate(p, 4 * MAX_WEIGHTS + 2**26 + 1), "bytes; at most"),
     "another kind": (lambda p: changed(p, format="other"), "format is 'other'"),
     "no config": (lambda p: changed(p, config=""), "config is not JSON"),
-    "deep config": (lambda p: changed(p, config="[" * 60_000), "config is not JSON"),
     "unknown field": (lambda p: changed(p, config=json.dumps({"target": {"evil": 1}})), "evil: Extra inputs"),
     "many weights": (lambda p: changed(p, config=configured(width=2048, channels=128, side=64)), "weights; at most"),
-    "report": (lambda p: changed(p, report="[1]"), "report is not a table"),
     "shape": (lambda p: changed(p, {BIAS: np.zeros(17, np.float32)}), "expected float32 (64,)"),
     "not finite": (lambda p: changed(p, {BIAS: np.full(64, np.nan, np.float32)}), "not finite"),
     "one too many": (lambda p: changed(p, {"more": np.zeros(1, np.float32)}), "'more' is not known"),

@@ -1,27 +1,30 @@
-"""The search for a brush's mechanics, ink and spread, on shallow presses, which are quick to draw."""
+"""The brush of a twin and the search for its mechanics, ink and spread, on shallow presses, which are quick to draw."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from brushloop.calibrate.fit.captures import Grid, Pressed
-from brushloop.drivers.sim.brush.spec import BrushSpec
-from brushloop.twin.brush import SHAPE, SPREAD, Offset, draw, with_values
-from brushloop.twin.run import Estimate, fit_twin
+from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
+from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
+from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
+from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, mechanics, with_values
+from brushloop.twin.run import LEAST_MISPLACED_MM, Estimate, fit_twin, sound_head
 from brushloop.twin.search import (
     Found,
-    Repeats,
-    Round,
     Target,
     agreement,
     choose_individual,
-    derivatives,
     fit_spread,
     of_parts,
     off,
@@ -32,7 +35,6 @@ from brushloop.twin.search import (
 
 GRID = Grid(np.arange(-20.0, 6.0, 0.4), np.arange(8.0, -8.0, -0.4))
 CELLS = ((3.0, 0.0), (4.0, 5.0))
-HERE = Offset(0.0, 0.0, 0.0)
 BASE = BrushSpec(seed=0)
 
 
@@ -45,31 +47,74 @@ class Serial(Executor):
         return map(fn, *iterables)
 
 
-@pytest.fixture(scope="module")
-def target() -> Target:
-    """The mean press of a brush that gives ink from higher over the paper than the default."""
-    ink = draw(replace(BASE, film_mm=1.0), Offset(0.0, 0.4, 0.0), CELLS, GRID, repeats=2, first_seed=50)
-    return Target(BASE, CELLS, GRID, ink.mean(axis=1))
+@given(st.sampled_from([*SHAPE, *SPREAD]), st.floats(-8.0, 8.0))
+def test_a_value_is_one_that_the_brush_allows_and_lies_where_it_says(one: Constant, scales: float) -> None:
+    low, high = ALLOWED[one.name]
+    value = one.value(scales)
+    assert low <= value <= high
+    assert one.value(0.0) == getattr(BrushSpec(), one.name)
+    if low < value < high:
+        assert one.scales(value) == pytest.approx(scales, abs=1e-6)
 
 
-def test_derivatives_of_a_line_are_its_slopes_also_at_the_upper_bound() -> None:
-    slopes = np.array([[1.0, 2.0], [3.0, -4.0]])
-    found = derivatives(lambda at: slopes @ at, np.array([0.0, 1.0]), np.array([5.0, 1.0]), 0.1)
-    assert found == pytest.approx(slopes)
+def middle_mm(ink: np.ndarray) -> tuple[float, float]:
+    x, y = (ink.sum(axis=0) * GRID.x_mm).sum(), (ink.sum(axis=1) * GRID.y_mm).sum()
+    return float(x / ink.sum()), float(y / ink.sum())
 
 
-def test_a_search_comes_nearer_to_the_captures(target: Target) -> None:
+def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> None:
+    ink, moved, deeper = (
+        draw(BrushSpec(), place, [(4.0, 5.0)], GRID)[0, 0] for place in (HERE, (0.0, 1.0, 2.0), (0.5, 0.0, 0.0))
+    )
+    mark = Brush(BrushSpec()).press(4.0, 5.0, ink_load=1.0, press_seed=0, px_per_mm=5.0)
+    inked = mark.density > 0.3
+    assert ink.sum() * GRID.px_mm**2 == pytest.approx(inked.sum() / 25.0, rel=0.01)
+    rows, columns = np.nonzero(inked)
+    x, y = (columns + 0.5 - mark.origin_px[0]) / 5.0, (mark.origin_px[1] - rows - 0.5) / 5.0
+    assert middle_mm(ink) == pytest.approx((x.mean(), y.mean()), abs=0.03)
+    assert np.subtract(middle_mm(moved), middle_mm(ink)) == pytest.approx((1.0, 2.0), abs=0.03)
+    assert deeper.sum() > ink.sum()
+
+
+def test_ink_constants_and_the_spread_leave_the_mechanics_alone() -> None:
+    assert mechanics(BrushSpec(film_mm=0.8, spread_wander=0.1, seed=4)) == mechanics(BrushSpec())
+    assert mechanics(BrushSpec(friction=0.3)) != mechanics(BrushSpec())
+
+
+def test_the_quality_limits_hold_for_other_presses_of_the_brush() -> None:
+    grid, cells = grid_of(Field()), [(11.0, 0.0), (20.0, 0.0), (11.0, 10.0), (20.0, 10.0)]
+    brush = Brush(load_brush(Path(PAPER)).spec)
+    head = sound_head(brush.spec, cells, grid)
+    assert head is not None
+    for depth_mm, tilt_deg in cells:
+        mark = brush.press(depth_mm, tilt_deg, ink_load=1.0, press_seed=7)
+        columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
+        begins_mm = (columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm
+        assert abs(begins_mm - head.head_mm) < head.misplaced_mm - 0.5
+    default = sound_head(BrushSpec(), cells, grid)
+    assert default is not None
+    assert default.misplaced_mm == LEAST_MISPLACED_MM == QualityConfig().misplaced_mm
+    assert default.head_mm == pytest.approx(QualityConfig().head_mm, abs=0.3)
+    assert sound_head(BrushSpec(), cells[:1], replace(grid, y_mm=grid.y_mm + 50.0)) is None
+
+
+def test_a_search_comes_nearer_to_a_brush_that_gives_ink_from_higher_over_the_paper(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("brushloop.twin.search.STEPS", 2)
+    ink = draw(replace(BASE, film_mm=1.0), (0.0, 0.4, 0.0), CELLS, GRID, repeats=2, first_seed=50)
+    target = Target(BASE, CELLS, GRID, ink.mean(axis=1))
     before = start()
-    after = search(target, before, Round(0.5, 2), Serial())
+    after = search(target, before, Serial(), 0.5)
     squares = [float((off(target, 0, 0.5, one.point) ** 2).sum()) for one in (before, after)]
     assert squares[1] < 0.5 * squares[0]
     assert after.point[[one.name for one in SHAPE].index("film_mm")] > 0.2
 
 
-def test_the_individual_nearest_to_the_captures_is_chosen(target: Target, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_individual_nearest_to_the_captures_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(4))
     ink = draw(replace(BASE, seed=2), HERE, CELLS, GRID)
-    assert choose_individual(replace(target, mean=ink[:, 0]), start(), Serial()).seed == 2
+    assert choose_individual(Target(BASE, CELLS, GRID, ink[:, 0]), start(), Serial()).seed == 2
 
 
 def test_what_the_parts_disagree_on_is_not_determined() -> None:
@@ -81,7 +126,7 @@ def test_what_the_parts_disagree_on_is_not_determined() -> None:
 
 
 def test_equal_repeats_agree_wholly_and_moved_ones_deviate_by_as_much_as_they_were_moved() -> None:
-    one, moved = (draw(BrushSpec(), offset, CELLS, GRID)[:, 0] for offset in (HERE, Offset(0.0, 0.8, 0.0)))
+    one, moved = (draw(BrushSpec(), place, CELLS, GRID)[:, 0] for place in (HERE, (0.0, 0.8, 0.0)))
     assert agreement([np.stack([a, a]) for a in one]) == pytest.approx(100.0)
     pairs = [np.stack([a, b]) for a, b in zip(one, moved, strict=True)]
     assert agreement(pairs) < 97.0
@@ -91,7 +136,7 @@ def test_equal_repeats_agree_wholly_and_moved_ones_deviate_by_as_much_as_they_we
 @pytest.mark.parametrize(("name", "value", "least"), [("place_wander_mm", 0.4, 0.25), ("reach_wander_mm", 1.0, 0.2)])
 def test_presses_that_differ_more_give_a_wider_spread_of_that_kind(name: str, value: float, least: float) -> None:
     captured = draw(replace(BrushSpec(), **{name: value}), HERE, CELLS, GRID, repeats=6, first_seed=70)
-    found = fit_spread(BrushSpec(), HERE, Repeats(CELLS, tuple(captured)), GRID)
+    found = fit_spread(BrushSpec(), HERE, dict(zip(CELLS, captured, strict=True)), GRID, Serial())
     brush = with_values(BrushSpec(), SPREAD, found.point)
     assert least < getattr(brush, name) < 1.5 * value
     assert brush.strand_mm < 0.2
@@ -101,11 +146,11 @@ def test_presses_that_differ_more_give_a_wider_spread_of_that_kind(name: str, va
 def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monkeypatch: pytest.MonkeyPatch) -> None:
     strays: list[tuple[float, float]] = []
 
-    def counted(target: Target, found: Found, one: Round, *_: object) -> Found:
-        strays.append((one.blur_mm, target.base.strand_mm))
+    def counted(target: Target, found: Found, _workers: Executor, blur_mm: float) -> Found:
+        strays.append((blur_mm, target.base.strand_mm))
         return found  # how a search finds its way is tested above
 
-    for name, value in {"COARSE": (Round(1.0, 1),), "FINE": Round(0.5, 1), "search": counted}.items():
+    for name, value in {"COARSE_MM": (1.0,), "FINE_MM": 0.5, "search": counted}.items():
         monkeypatch.setattr(f"brushloop.twin.run.{name}", value)
     monkeypatch.setattr("brushloop.twin.search.INDIVIDUALS", range(1))
     cell = (3.0, 0.0)
