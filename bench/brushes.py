@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import ROOT, BenchError, brushloop, started
-from brushloop.calibrate.spread import spread_out
+from brushloop.calibrate.stats import spread_out
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.imports import ImportOptions, import_photographs
 

@@ -1,13 +1,16 @@
-"""The one table of scores: every comparison of a captured press with images, in memory; and its statistics.
+"""The one table of scores: every comparison of a captured press with images, in memory; its files and its statistics.
 
-Tables 1 and 2, CSV, Parquet, gates and figures are queries on it.
+Tables 1 and 2, gates and figures are queries on it.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,15 +19,16 @@ from numpy.typing import NDArray
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, to_pixels
 from brushloop.calibrate.compare.score import similarity
+from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import source_label
-from brushloop.calibrate.stats import CEILING, Floats, Integers, Summary, average, summarise
+from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, average, summarise
 from brushloop.calibrate.stroke.preprocess import Measured
+from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition, Header, Stroke
 
-Cell = tuple[float, float]
-"""Depth in mm and tilt in deg."""
 MEASURES = ("csim", "ssim")
+NUMBERS = ("depth_mm", "reached_mm", "tilt_deg", *MEASURES)
 
 
 class Score(NamedTuple):
@@ -114,6 +118,25 @@ class Scores:
         for cell in self.cells:
             rows.setdefault(self.rows[cell[0]].condition, []).extend(cell)
         return dict(sorted(rows.items()))
+
+
+def scores_csv(scores: Scores) -> str:
+    """Every score, as the text of a CSV file."""
+    rows = ((*score[:-3], f"{score.csim:.8f}", f"{score.ssim:.8f}", score.source) for score in scores)
+    return csv_text(Score._fields, rows)
+
+
+def write_parquet(scores: Scores, label: str, path: Path) -> list[str]:
+    """Write the same rows as Parquet; returns the file's name, or nothing where pyarrow is not installed."""
+    if find_spec("pyarrow") is None:
+        return []
+    pa: Any = importlib.import_module("pyarrow")  # without type stubs
+    pq: Any = importlib.import_module("pyarrow.parquet")
+    kinds = [(name, pa.float64() if name in NUMBERS else pa.string()) for name in Score._fields]
+    rows = [score._asdict() for score in scores]
+    with replacing(path) as part:
+        pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(kinds, metadata={"source": label})), part)
+    return [path.name]
 
 
 class Stat(Frozen):

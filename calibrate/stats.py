@@ -1,4 +1,6 @@
-"""Statistics: lines, summaries with intervals, paired tests, and the ceiling. Equal scores give equal numbers.
+"""Statistics: lines, summaries with intervals, paired tests, the ceiling, and the order of a design.
+
+Equal scores give equal numbers.
 
 The ceiling is the score of a perfect model, that is of the best image of each cell on a fresh press of it. Presses of a
 cell stray from each other. Two of them differ by the strays of both, a press and the best image only by those of one.
@@ -97,10 +99,8 @@ class Summary:
     below_interval: Interval | None = None
 
     @property
-    def range_and_avg(self) -> tuple[float, float, float]:
+    def range_and_avg(self) -> tuple[float | None, float | None, float]:
         """Max, min and average, in the order of the paper's tables."""
-        assert self.max is not None, "the ceiling has no extremes"
-        assert self.min is not None, "the ceiling has no extremes"
         return self.max, self.min, self.avg
 
 
@@ -169,11 +169,7 @@ def _draw_count(values: Floats) -> int:
 
 
 def _interval(draws: Floats) -> Interval:
-    return _ends(np.quantile(draws, [0.025, 0.975]))
-
-
-def _ends(interval: Sequence[float] | Floats) -> Interval:
-    low, high = interval
+    low, high = np.quantile(draws, [0.025, 0.975])
     return _round(low), _round(high)
 
 
@@ -226,8 +222,9 @@ def average(values: Floats, cells: Integers) -> Summary | None:
     summary = summarise(values, cells)
     if summary is None:
         return None
-    interval = interval_over_groups(values, cells)
-    return Summary(summary.n, summary.avg, summary.avg_interval if interval is None else _ends(interval))
+    over_cells = interval_over_groups(values, cells)
+    interval = summary.avg_interval if over_cells is None else (_round(over_cells[0]), _round(over_cells[1]))
+    return Summary(summary.n, summary.avg, interval)
 
 
 def is_near(below: float, interval: Interval | None, points: float = NEAR_POINTS) -> bool | None:
@@ -262,32 +259,49 @@ def paired(before: Floats, after: Floats, groups: Integers) -> Paired | None:
     if not n:
         return None
     _, group = np.unique(groups[known], return_inverse=True)
+    sums, p = np.bincount(group, difference), 1.0
     # Differences below one millionth are ignored: reports keep six digits.
-    equal = bool(np.all(np.abs(difference) < 1e-6))
-    sums = np.asarray(np.bincount(group, difference), np.float64)
-    p = 1.0 if equal or len(sums) == 1 else _sign_flip_p(sums)
+    if len(sums) > 1 and np.abs(difference).max() >= 1e-6:
+        from scipy.stats import permutation_test  # slow to import
+
+        flips = permutation_test((sums,), np.sum, permutation_type="samples", n_resamples=FLIPS, rng=SEED)
+        p = float(flips.pvalue)
     return Paired(n, len(sums), float(difference.mean()), interval_over_groups(difference, group), p)
 
 
-def _sign_flip_p(difference: Floats) -> float:
-    """Two-sided p-value: share of sign flips whose mean is at least as far from 0; needs two or more differences."""
-    n = len(difference)
-    every = 2**n <= FLIPS
-    if every:
-        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=n)))
-    else:
-        signs = np.random.default_rng(SEED).choice(np.array([-1.0, 1.0]), (FLIPS, n))
-    far = np.count_nonzero(np.abs(signs @ difference) >= abs(difference.sum()) * (1.0 - 1e-12))
-    # Among random flips the one that was observed counts as well.
-    return far / len(signs) if every else (far + 1) / (len(signs) + 1)
-
-
-def holm(p_values: list[float]) -> list[float]:
+def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's correction: p-values that hold for all the tests together."""
-    order = sorted(range(len(p_values)), key=p_values.__getitem__)
-    out = [0.0] * len(p_values)
-    highest = 0.0
-    for rank, k in enumerate(order):
-        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[k]))
-        out[k] = highest
-    return out
+    p = np.array(p_values)
+    order, left = np.argsort(p), len(p) - np.arange(len(p))
+    p[order] = np.maximum.accumulate(np.minimum(1.0, left * p[order]))
+    return p.tolist()
+
+
+Cell = tuple[float, float]
+"""Depth in mm and tilt in deg."""
+
+
+def farthest_first(places: Floats, first: int, count: int) -> list[int]:
+    """Rows of (n, d) `places`, from the row `first`, each as far as possible from those before; `count` is at most n.
+
+    A maximin design that can stop anywhere, after R. Kennard and L. Stone, "Computer aided design of experiments"
+    (1969). Of equally distant rows the upper one comes first.
+    """
+    order, nearest = [first], np.full(len(places), np.inf)
+    while len(order) < count:
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[order[-1]], axis=1))
+        nearest[order] = -1.0
+        order.append(int(np.round(nearest, 9).argmax()))
+    return order
+
+
+def spread_out(depths_mm: Sequence[float], tilts_deg: Sequence[float]) -> list[Cell]:
+    """Every cell once, each as far as possible from those before it: the first few already describe any brush well.
+
+    Both axes are scaled to the range of the grid. The first cell is the shallowest at the least tilt.
+    """
+    cells = list(itertools.product(depths_mm, tilts_deg))
+    places = np.array(cells)
+    range_of = np.ptp(places, axis=0)
+    places = (places - places.min(axis=0)) / np.where(range_of > 0.0, range_of, 1.0)
+    return [cells[k] for k in farthest_first(places, cells.index(min(cells)), len(cells))]

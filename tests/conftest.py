@@ -70,7 +70,7 @@ TOGETHER = {
     "tests/calibrate/compare/": "comparing",
     "tests/calibrate/test_invert.py": "comparing",
     "tests/calibrate/fit/": "comparing",
-    "tests/calibrate/loop/": "comparing",
+    "tests/calibrate/test_loop.py": "comparing",
     "tests/calibrate/writing/": "comparing",
     "tests/calibrate/drags/": "drags",
     "tests/calibrate/test_pages.py": "pages",

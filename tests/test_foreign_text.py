@@ -87,7 +87,6 @@ COMMANDS = [
     "sessions export profile out --format npz",
     "validate profile --no-held-out",
     "validate closed",
-    "validate closed --json --no-held-out",
     "validate diff fit.json fit.json",
     "calibrate closed",
     "fit closed",

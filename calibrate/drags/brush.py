@@ -30,7 +30,7 @@ from brushloop.calibrate.drags.fit import (
     threshold,
 )
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.spread import farthest_first
+from brushloop.calibrate.stats import farthest_first
 from brushloop.model.drag import DragModel, Floats, Indices, ink
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.terminal import Progress, counted, unseen

@@ -35,17 +35,6 @@ def validate(
     curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
     held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
     tune: Annotated[int, typer.Option(min=0, help="Steps to tune each generator on other cells; 0: none.")] = 0,
-    loop: Annotated[
-        list[Path] | None, typer.Option(help="loop.json of re-pressed strokes; <session>/loop by default.")
-    ] = None,
-    written: Annotated[
-        list[Path] | None, typer.Option(help="written.json of characters; default: the one beside the sessions.")
-    ] = None,
-    beside: Annotated[bool, typer.Option(help="Include loop and characters found beside the session.")] = True,
-    parquet: Annotated[
-        bool | None, typer.Option(help="Write scores.parquet; default: if pyarrow is installed.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
     workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Threads; all cores by default.")] = None,
 ) -> None:
@@ -70,22 +59,13 @@ def validate(
         ablations=ablations,
         held_out=held_out,
         tune_steps=tune,
-        parquet=parquet,
-        loops=tuple(loop or ()),
-        written=tuple(written or ()),
-        beside=beside,
         out=out,
         scheduler=scheduler,
         workers=workers,
     )
     with shown() as progress:
         output = run(request, progress)
-    predicted = [drags.predictions for drags in output.drags if drags.predictions is not None]
-    if json and (output.report is not None or predicted):
-        for text in [output.report.to_json()] if output.report is not None else [one.to_json() for one in predicted]:
-            say(*text.rstrip("\n").split("\n"))
-    else:
-        say(*output.lines())
+    say(*output.lines())
     check(output, request)
 
 
@@ -93,16 +73,11 @@ def validate(
 def diff(
     before: Annotated[Path, typer.Argument(help="A report.json, or a session that was validated.")],
     after: Annotated[Path, typer.Argument(help="A report.json or session to compare it with.")],
-    json: Annotated[bool, typer.Option("--json", help="Print every series as JSON.")] = False,
 ) -> None:
     """Show what got better or worse between two reports, sessions or software versions, by a paired test."""
     from brushloop.calibrate.validate.diff import compare
 
-    difference = compare(before, after)
-    if json:
-        say(*difference.to_json().split("\n"))
-    else:
-        say(*difference.sentences(), difference.table())
+    say(*compare(before, after).lines())
 
 
 @app.command()
@@ -113,7 +88,6 @@ def captures(
     leave_out: Annotated[
         list[str] | None, typer.Option(help="A cell to keep for evaluation, as H/alpha: 13/5.")
     ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Write captured presses in the format that `brushloop train tune` reads."""
     from brushloop.calibrate.errors import CalibrationError
@@ -131,7 +105,7 @@ def captures(
             raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
         cells.append(Condition(depth_mm, tilt_deg))
     check_target(out, ".safetensors", generator)
-    opened = [open_session(place, calibration, None) for place in session]
+    opened = [open_session(place) for place in session]
     one_source(opened)
     aligned = align_captures(opened, generator)
     count = write_captures(aligned, out, cells)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,18 +17,19 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit
-from brushloop.calibrate.loop.compare import FILE as LOOP_FILE
-from brushloop.calibrate.loop.compare import LoopRecord, read_loop
+from brushloop.calibrate.loop import FILE as LOOP_FILE
+from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.pool import cluster, threads
 from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import framed, png_uri, source_note, write_files
+from brushloop.calibrate.scores import scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
 from brushloop.calibrate.stroke.params import Params
 from brushloop.calibrate.validate import findings, tables
 from brushloop.calibrate.validate.models import FittedSession
 from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
 from brushloop.calibrate.validate.report import Report, report_of
-from brushloop.calibrate.validate.run import Options, Outcome, Refused, validate_presses
+from brushloop.calibrate.validate.run import Outcome, Refused, Request, validate_presses
 from brushloop.calibrate.writing.scores import FILE as WRITTEN_FILE
 from brushloop.calibrate.writing.scores import PICTURE, WrittenRecord, read_written
 from brushloop.sessions.disk import check_writable, csv_text
@@ -40,34 +40,11 @@ from brushloop.sessions.terminal import Progress, counted, unseen
 
 FOLDER = "validation"
 WORK = "work"
-SCORES, PARQUET, TABLE_3 = "scores.csv", "scores.parquet", "table3.csv"
-LOOP_FOLDER, WRITTEN_FOLDER = "loop", "written"
-"""Default output folders of those commands: in the session, and next to the folder of sessions."""
+LOOP, WRITTEN = "loop", "written"
+"""Folders of a session, where its loop and its characters are looked for; `written` also beside all sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
 MAX_REFUSED = 20
 """Refused strokes listed on the terminal."""
-
-
-@dataclass(frozen=True, slots=True)
-class Request(Options):
-    """What the command line asked for."""
-
-    places: tuple[str, ...] = ()
-    command: str = ""
-    """Named by the report as what made it."""
-    calibration: Path | None = None
-    fit: Path | None = None
-    curves: tuple[str, ...] = ()
-    gates: tuple[str, ...] = ()
-    parquet: bool | None = None
-    """None writes it if pyarrow is installed."""
-    loops: tuple[Path, ...] = ()
-    written: tuple[Path, ...] = ()
-    beside: bool = True
-    """Whether loops and characters found with the sessions are used where none are named."""
-    out: Path | None = None
-    scheduler: str = ""
-    workers: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +55,7 @@ class ValidationOutput:
     report: Report | None = None
     drags: tuple[DragValidation, ...] = ()
     notes: tuple[str, ...] = ()
-    """What was left out or not written, and why."""
+    """What was found beside the sessions and left out, and why."""
 
     @property
     def page(self) -> Path:
@@ -100,14 +77,14 @@ class ValidationOutput:
 
 
 @dataclass(slots=True)
-class Extras:
-    """The loops and characters that go into a report, each once."""
+class Beside:
+    """The loops and characters that belong to the sessions of a report, and what was left out."""
 
-    loops: dict[str, LoopRecord] = field(default_factory=dict[str, LoopRecord])
-    written: dict[str, tuple[WrittenRecord, str]] = field(default_factory=dict[str, tuple[WrittenRecord, str]])
-    """By digest, with Figure 13 as a data URI; empty if the picture is missing."""
+    loops: list[LoopRecord] = field(default_factory=list[LoopRecord])
+    written: list[WrittenRecord] = field(default_factory=list[WrittenRecord])
+    figures_13: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """Sessions of characters and their pictures as data URIs."""
     notes: list[str] = field(default_factory=list[str])
-    """What was found and left out, or is missing, and why."""
 
 
 def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
@@ -125,13 +102,22 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     check_writable(folder)
     sessions = [open_session(place, request.calibration, request.fit) for place in request.places]
     one_source(sessions)
-    if _kind(sessions, request) == "drag":
+    kinds = {session.strokes[0].kind for session in sessions}
+    if len(kinds) > 1:
+        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
+    if kinds == {"drag"}:
         return _drags(request, sessions, folder, progress)
-    extras = find_extras(sessions, request.loops, request.written, beside=request.beside)
+    beside = find_beside(sessions)
     (folder / WORK).mkdir(parents=True, exist_ok=True)
-    with _locked(folder), cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler:
-        outcome = validate_presses(sessions, request, scheduler, folder / WORK, progress)
-        return _write(outcome, folder, request, curves, extras)
+    try:
+        with (
+            FileLock(folder / WORK / "lock", timeout=0),
+            cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler,
+        ):
+            outcome = validate_presses(sessions, request, scheduler, folder / WORK, progress)
+            return ValidationOutput(folder, _write(outcome, folder, curves, beside), notes=tuple(beside.notes))
+    except Timeout:
+        raise CalibrationError(str(folder), "another validation is writing there") from None
 
 
 def check(output: ValidationOutput, request: Request) -> None:
@@ -139,10 +125,10 @@ def check(output: ValidationOutput, request: Request) -> None:
     if request.gates and output.report is None:
         raise CalibrationError("--gate", "applies to presses; these are drags")
     if output.report is not None:
-        tables.check_gates(output.report, [tables.parse_gate(text) for text in request.gates])
+        tables.check_gates(output.report, request.gates)
 
 
-def open_session(place: str, calibration: Path | None, fit: Path | None) -> FittedSession:
+def open_session(place: str, calibration: Path | None = None, fit: Path | None = None) -> FittedSession:
     """Open a session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
     session = open_recording(local_path(place), calibration)
     path = session.recording.path
@@ -166,34 +152,37 @@ def one_source(sessions: Sequence[FittedSession]) -> Source:
     return first.header.source
 
 
-def find_extras(
-    sessions: Sequence[FittedSession], loops: Sequence[Path], written: Sequence[Path], *, beside: bool
-) -> Extras:
-    """Read the loops and characters named; of a kind without any, those beside the sessions if `beside` is true.
+def find_beside(sessions: Sequence[FittedSession]) -> Beside:
+    """Read the loop and the characters in each session's folder, and the characters beside the folder of sessions.
 
-    Raises `CalibrationError` that names an unusable file.
+    Those of other strokes, another brush or another kind of ink are left out. Raises `CalibrationError` for an edited
+    file.
     """
-    extras = Extras()
-    folders = [session.recording.path.resolve().parent for session in sessions]
-    places = [session.recording.path.parent / LOOP_FOLDER for session in sessions] if beside else []
-    for path in _files(loops, places, LOOP_FILE):
-        with _naming_no_beside(requested=bool(loops)):
-            loop = read_loop(path)
-            _check_loop(path, loop, sessions)
-        extras.loops[loop.digest] = loop
-    places = [place / WRITTEN_FOLDER for folder in folders for place in (folder, folder.parent.parent) if beside]
-    for path in _files(written, places, WRITTEN_FILE):
-        with _naming_no_beside(requested=bool(written)):
-            record = read_written(path)
-            if not written and path.parent.parent not in folders and (why := _foreign(record, sessions, folders)):
-                extras.notes.append(f"{path} is left out: {why}; --written uses it")
-                continue
-            _check_source(path, record.source, sessions)
-            picture = path.parent / PICTURE
-            if not picture.exists():
-                extras.notes.append(f"{picture} does not exist: the report has no Figure 13 of {record.session}")
-            extras.written[record.digest] = record, figure_13(picture, record) if picture.exists() else ""
-    return extras
+    beside, source = Beside(), sessions[0].header.source
+    brushes = {session.header.brush for session in sessions}
+    homes = list(dict.fromkeys(session.recording.path.resolve().parent for session in sessions))
+    originals = {session.sha256 for session in sessions}
+    for folder in (home / LOOP for home in homes):
+        if (folder / LOOP_FILE).is_file():
+            loop = read_loop(folder)
+            why = "" if loop.original_sha256 in originals else f"it is of another recording of {loop.original}"
+            why = why or (f"it is of {loop.source}, not {source}" if loop.source != source else "")
+            if why:
+                beside.notes.append(f"{folder / LOOP_FILE} is left out: {why}; `{loop.MADE_BY}` compares again")
+            else:
+                beside.loops.append(loop)
+    places = dict.fromkeys(place / WRITTEN for home in homes for place in (home, home.parent.parent))
+    for folder in places:
+        if (folder / WRITTEN_FILE).is_file():
+            record = read_written(folder)
+            why = f"it is of {record.source}, not {source}" if record.source != source else ""
+            why = why or (f"it was written with another brush, {record.brush}" if {record.brush} != brushes else "")
+            if why:
+                beside.notes.append(f"{folder / WRITTEN_FILE} is left out: {why}")
+            else:
+                beside.written.append(record)
+                beside.figures_13.append((record.session, figure_13(folder / PICTURE, record)))
+    return beside
 
 
 def figure_13(path: Path, record: WrittenRecord) -> str:
@@ -204,60 +193,13 @@ def figure_13(path: Path, record: WrittenRecord) -> str:
     return png_uri(data)
 
 
-def _files(named: Sequence[Path], places: Sequence[Path], name: str) -> list[Path]:
-    """The files named, by themselves or by their folder; without any, those of that name in these places, each once."""
-    if named:
-        return [path / name if path.is_dir() else path for path in named]
-    return [path for path in dict.fromkeys(place / name for place in places) if path.is_file()]
-
-
-def _foreign(record: WrittenRecord, sessions: Sequence[FittedSession], folders: Sequence[Path]) -> str:
-    """Explain why characters found near the sessions do not belong to them; empty if they do."""
-    source = one_source(sessions)
-    if record.source != source:
-        return f"it is of {record.source}, not {source}"
-    named = record.session not in ("", ".", "..") and Path(record.session).name == record.session
-    if not named or not any((folder.parent / record.session).is_dir() for folder in folders):
-        return f"its session {record.session} is not beside it"
-    brushes = {session.header.brush for session in sessions}
-    return "" if brushes == {record.brush} else f"it was written with another brush, {record.brush or 'not named'}"
-
-
-def _check_loop(path: Path, record: LoopRecord, sessions: Sequence[FittedSession]) -> None:
-    _check_source(path, record.source, sessions)
-    if record.original_sha256 in {session.sha256 for session in sessions}:
-        return
-    names = [session.header.session_id for session in sessions]
-    if record.original in names:
-        why = f"is of another recording of {record.original}: its SHA-256 differs; `{record.MADE_BY}` compares again"
-        raise CalibrationError(str(path), why)
-    raise CalibrationError(str(path), f"repeats {record.original}, not {', '.join(names)}")
-
-
-def _check_source(path: Path, source: Source, sessions: Sequence[FittedSession]) -> None:
-    here, recording = one_source(sessions), sessions[0].recording.path.name
-    if source != here:
-        raise CalibrationError(str(path), f"is of {source}, {recording} of {here}: one report cannot hold both")
-
-
-@contextmanager
-def _naming_no_beside(*, requested: bool) -> Generator[None]:
-    """Add a hint at --no-beside to an error about a file that was found, not requested."""
-    try:
-        yield
-    except CalibrationError as error:
-        if not requested:
-            error.add_note("(found beside the session; --no-beside ignores it)")
-        raise
-
-
 def _summary(report: Report) -> Iterator[object]:
     """Yield tables and lines for the terminal."""
     names = ", ".join(session.session_id for session in report.sessions[:4])
     yield f"{names}: {source_note(report.source)}"
     yield findings.measured(report)
     yield from tables.terminal_tables(report)
-    yield from findings.findings(report)
+    yield " ".join(findings.verdict(report))
     for point in findings.trust(report):
         yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
     for press in report.refused[:MAX_REFUSED]:
@@ -266,48 +208,18 @@ def _summary(report: Report) -> Iterator[object]:
         yield f"and {len(report.refused) - MAX_REFUSED} more, in the report"
 
 
-def _kind(sessions: Sequence[FittedSession], request: Request) -> str:
-    """Kind of the strokes, `press` or `drag`."""
-    kinds = {session.strokes[0].kind for session in sessions}
-    if len(kinds) > 1:
-        raise CalibrationError(str(sessions[-1].recording.path), "mixes presses and drags: validate them separately")
-    [kind] = kinds
-    for option, paths in (("--loop", request.loops), ("--written", request.written)):
-        if paths and kind == "drag":
-            raise CalibrationError(option, "is for a report of presses; these are drags")
-    return kind
-
-
-def _write(
-    outcome: Outcome, folder: Path, request: Request, curves: Sequence[Curve], extras: Extras
-) -> ValidationOutput:
-    """Write the files of a report, with notes on what was not written."""
-    notes = extras.notes
-    digest = tables.write_csv(outcome.scores, folder / SCORES)
-    report = report_of(outcome, request.command, digest, extras.loops.values(), [w for w, _ in extras.written.values()])
-    beside = [SCORES]
-    if request.parquet is not False:
-        try:
-            tables.write_parquet(outcome.scores, report.label, folder / PARQUET)
-            beside.append(PARQUET)
-        except CalibrationError as error:
-            if request.parquet:
-                raise
-            notes.append(f"no scores.parquet: {error.what}")
-    files = {"summary.csv": tables.summary_csv(report)}
-    if report.written:
-        files[TABLE_3] = tables.table_3_csv(report)
-    else:
-        (folder / TABLE_3).unlink(missing_ok=True)  # left by an earlier run with characters
+def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Beside) -> Report:
+    """Write the files of a report."""
+    files = {"scores.csv": scores_csv(outcome.scores)}
+    report = report_of(outcome, hashlib.sha256(files["scores.csv"].encode()).hexdigest(), beside.loops, beside.written)
+    files["summary.csv"] = tables.summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
-    beside += [*files, "report.json"]
-    figures_13 = [picture for _, picture in extras.written.values()]
-    files["report.html"] = page_of(
-        outcome, report, curves, beside, figures_13, list(pages_beside(outcome.sessions, folder))
-    )
     files["report.json"] = report.to_json()
+    names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]
+    pages = list(pages_beside(outcome.sessions, folder))
+    files["report.html"] = page_of(outcome, report, curves, names, beside.figures_13, pages)
     write_files(folder, files)
-    return ValidationOutput(folder, report, notes=tuple(notes))
+    return report
 
 
 def _drags(request: Request, sessions: Sequence[FittedSession], folder: Path, progress: Progress) -> ValidationOutput:
@@ -333,12 +245,3 @@ def _folder(request: Request) -> Path:
         path = Path(request.places[0])
         return (path if path.is_dir() else path.parent) / FOLDER
     return Path(FOLDER)
-
-
-@contextmanager
-def _locked(folder: Path) -> Generator[None]:
-    try:
-        with FileLock(folder / WORK / "lock", timeout=0):
-            yield
-    except Timeout:
-        raise CalibrationError(str(folder), "another validation is writing there") from None

@@ -7,10 +7,9 @@ options); the averages of the same cell in two sessions.
 from __future__ import annotations
 
 import csv
-import json
 import shlex
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -64,8 +63,8 @@ class Difference:
     """Models that only one of the two reports has."""
     only_after: list[str]
 
-    def sentences(self) -> Iterator[str]:
-        """What is compared."""
+    def lines(self) -> Iterator[object]:
+        """What the command prints: what is compared, and the changes."""
         named = [", ".join(session.session_id for session in side.sessions[:4]) for side in (self.before, self.after)]
         versions = [side.software.get("brushloop", "?") for side in (self.before, self.after)]
         yield f"Before: {named[0]}, brushloop {versions[0]}. After: {named[1]}, {versions[1]}."
@@ -81,9 +80,6 @@ class Difference:
             yield f"Only before: {', '.join(self.only_before)}."
         if self.only_after:
             yield f"Only after: {', '.join(self.only_after)}."
-
-    def table(self) -> Table:
-        """The changes, for the terminal."""
         title = f"after minus before, points of percent ({self.before.label})"
         table = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
         for change in self.changes:
@@ -94,13 +90,7 @@ class Difference:
                 *(f"{change.test.mean:+.3f}", "" if span is None else f"{span[0]:+.2f} to {span[1]:+.2f}"),
                 *(f"{change.p_holm:.3f}", change.verdict),
             )
-        return table
-
-    def to_json(self) -> str:
-        """Every series, as text."""
-        changes = [asdict(change) | {"verdict": change.verdict} for change in self.changes]
-        contents = {"paired_by": self.paired_by, "source": self.before.label, "changes": changes}
-        return json.dumps(contents, indent=1, ensure_ascii=False)
+        yield table
 
 
 def compare(before: Path, after: Path) -> Difference:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-from brushloop.calibrate.compare.paper import ORDER
 from brushloop.calibrate.compare.place import Key
-from brushloop.calibrate.compare.score import Polarity
-from brushloop.calibrate.loop.compare import AGAIN, LoopRecord
-from brushloop.calibrate.loop.compare import ANOTHER as ANOTHER_ORIGINAL
+from brushloop.calibrate.compare.score import ORDER
 from brushloop.calibrate.report import Point, brush_and_size, source_point
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
-from brushloop.calibrate.validate.models import ANOTHER, BEZIER_REFITTED, FITTED_HELD_OUT, GENERATOR_HELD_OUT, PRESSES
+from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT, PRESSES
 from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session, missed_mm
-from brushloop.calibrate.writing.scores import REFERENCE
 
 CLOSE = 0.5
 """Points below which two models count as equal."""
@@ -44,12 +40,14 @@ def measured(report: Report) -> str:
 
 
 def verdict(report: Report) -> Iterator[str]:
-    """The report in at most three sentences: how well the model shown predicts, beside what, and on what ink."""
+    """How well the model shown predicts, beside what, and how large the marks are."""
     shown, top, bezier, published = (
         _csim(report, name) for name in (report.shown, CEILING, BEZIER_REFITTED, "ccd-bsm")
     )
     if shown is not None:
-        below = "" if top is None or shown.below_ceiling is None else f"{_below(shown)} of {top.avg:.1f} %"
+        below = ""
+        if top is not None and shown.below_ceiling is not None:
+            below = f", {_points(shown)} below the ceiling of {top.avg:.1f} %"
         unseen = " from cells that it has not seen" if report.shown == FITTED_HELD_OUT else ""
         label = _label(report, report.shown)
         yield f"{label} predicts presses{unseen} with an average CSIM of {shown.avg:.1f} %{below}."
@@ -59,68 +57,7 @@ def verdict(report: Report) -> Iterator[str]:
     if others:
         words = " and ".join(others)
         yield f"{words[0].upper()}{words[1:]}."
-    yield source_point(report.source).text
-
-
-def findings(report: Report) -> Iterator[str]:
-    """How well the models predict: the ceiling, the best model that had not seen the strokes, the published one."""
-    again, top = _csim(report, ANOTHER), _csim(report, CEILING)
-    if again is not None and top is not None:
-        yield (
-            f"Repeatability of the brush: one press predicts another of the same H and α with a CSIM of "
-            f"{again.avg:.1f} %. A perfect model of this brush, which draws the best image of each cell, would reach "
-            f"{_interval(top)}: this is the ceiling, and no model can be expected to do better."
-        )
-    held, bezier, tuned = (_csim(report, name) for name in (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT))
-    if held is not None:
-        unseen = "on cells that the fit had not seen"
-        yield f"Calibrated to this brush, CCD-BSM reaches {_interval(held)}{_below(held)}, {unseen}."
-    if tuned is not None:
-        yield f"Tuned to this brush, CCD-BSMG reaches {_interval(tuned)}{_below(tuned)}, on cells that it had not seen."
-    if bezier is not None:
-        peer = ""
-        if held is not None:
-            peer = f": {abs(held.avg - bezier.avg):.1f} points {'less' if bezier.avg < held.avg else 'more'}"
-        yield f"A Bézier stroke fitted to the same captures reaches {_interval(bezier)}{peer}."
-    yield from _pressed_again(report)
-    yield from _characters(report)
-    published = [(model, _csim(report, model.name)) for model in report.models if model.name in ("ccd-bsmg", "ccd-bsm")]
-    for model, stat in published:
-        if stat is not None:
-            yield f"{model.label} {model.basis}, given only the brush's size, H and α, reaches {_interval(stat)}."
-    if published:
-        yield from _sizes(report)
-    if held is None and not report.source.imported:
-        yield "No model was calibrated to this brush: run “brushloop fit”, then validate again."
-
-
-def _pressed_again(report: Report) -> Iterator[str]:
-    for loop in report.loops:
-        again, other = (loop.stat(what, STRICT) for what in (AGAIN, ANOTHER_ORIGINAL))
-        if again is None:
-            continue
-        others = "" if other is None else f", other presses of the same H and α {other.csim.avg:.1f} %"
-        yield (
-            f"Pressed again from their photographs alone ({loop.again}), {again.csim.n} strokes match their "
-            f"originals with a CSIM of {again.csim.avg:.1f} %{others}."
-        )
-
-
-def _characters(report: Report) -> Iterator[str]:
-    for row in (row for record in report.written for row in record.table_3):
-        if (row.pair, row.alignment, row.tone, row.polarity) == (REFERENCE, *STRICT, Polarity.INK):
-            yield (
-                f"{row.character}, written {row.csim.n} times by the arm, matches its reference ({row.reference}) with "
-                f"a CSIM of {row.csim.avg:.1f} %."
-            )
-
-
-def _sizes(report: Report) -> Iterator[str]:
-    ratios = [
-        (session.length_ratio, session.width_ratio)
-        for session in report.sessions
-        if session.length_ratio is not None and session.width_ratio is not None
-    ]
+    ratios = [session.size_ratio for session in report.sessions if session.size_ratio is not None]
     if ratios:
         length, width = (sum(side) / len(ratios) for side in zip(*ratios, strict=True))
         yield f"The marks are {length:.2f} times as long and {width:.2f} times as wide as CCD-BSM predicts."
@@ -157,46 +94,42 @@ def trust(report: Report) -> Iterator[Point]:
     else:
         yield Point(True, "Every stroke that counted was used.")
     for session in report.sessions:
-        yield from _collection(session)
-    cut = sum(len(session.cut) for session in report.sessions)
-    if cut:
-        yield Point(False, f"{cut} strokes are cut by the edge of their photograph or cell: their scores are too low.")
-    for session in report.sessions:
-        if (scale := session.calibration) is not None:
-            width = (scale.mm_per_px_high - scale.mm_per_px_low) / scale.mm_per_px
-            words = f"scale known to ±{50 * width:.3f} %, board seen to {scale.rms_px:.2f} px."
-            yield Point(width <= WIDE_SCALE, f"{session.session_id}: {words}")
+        for point in _session(session):
+            yield Point(point.good, f"{session.session_id}: {point.text}")
     yield from _models(report)
     for loop in report.loops:
-        yield _loop(loop)
+        yield loop.answer
     if any("in sample" in model.basis for model in report.models):
         words = "Rows “in sample” were fitted to the very strokes that they predict: read the held-out rows instead."
         yield Point(None, words)
 
 
-def _collection(session: Session) -> Iterator[Point]:
-    """Points that the recording alone does not show: planned strokes that were left out, and paper that moved."""
-    name, miss, collected = session.session_id, session.deepest_miss, session.collected
+def _session(session: Session) -> Iterator[Point]:
+    """What the pictures alone do not show: strokes that were left out, paper that moved, a scale that is not known."""
+    miss, collected, scale = session.deepest_miss, session.collected, session.calibration
     if miss is not None and missed_mm(miss) > MISSED_MM:
         yield Point(
             False,
-            f"{name}: commanded and reached depth differ by more than {MISSED_MM:g} mm, most at "
+            f"commanded and reached depth differ by more than {MISSED_MM:g} mm, most at "
             f"{miss.stroke_id}: {miss.depth_mm:g} mm was commanded, {miss.reached_mm:.2f} mm was reached.",
         )
-    if collected is None:
-        return
-    if collected.left_out:
+    if collected is not None and collected.left_out:
         of = "" if collected.planned is None else f" of {collected.planned} planned"
         names = ", ".join(collected.left_out[:MAX_NAMED]) + (", ..." if len(collected.left_out) > MAX_NAMED else "")
-        words = f"{len(collected.left_out)}{of} strokes were left out during collection: {names}."
-        yield Point(False, f"{name}: {words}")
-    if collected.pressed_again:
+        yield Point(False, f"{len(collected.left_out)}{of} strokes were left out during collection: {names}.")
+    if collected is not None and collected.pressed_again:
         takes = f"{len(collected.pressed_again)} of {collected.photographed} takes"
-        words = f"{takes} did not count and were pressed again: the remaining strokes are a selection."
-        yield Point(None, f"{name}: {words}")
-    if collected.moved_mm > MOVED_MM:
+        yield Point(None, f"{takes} did not count and were pressed again: the remaining strokes are a selection.")
+    if collected is not None and collected.moved_mm > MOVED_MM:
         words = f"two zero touches differ by {collected.moved_mm:.2f} mm ({', '.join(collected.touches[:MAX_NAMED])})"
-        yield Point(False, f"{name}: {words}: presses with the same H do not have the same depth.")
+        yield Point(False, f"{words}: presses with the same H do not have the same depth.")
+    if session.cut:
+        words = f"{len(session.cut)} strokes are cut by the edge of their photograph or cell"
+        yield Point(False, f"{words}: their scores are too low.")
+    if scale is not None:
+        width = (scale.mm_per_px_high - scale.mm_per_px_low) / scale.mm_per_px
+        words = f"scale known to ±{50 * width:.3f} %, board seen to {scale.rms_px:.2f} px."
+        yield Point(width <= WIDE_SCALE, words)
 
 
 def _models(report: Report) -> Iterator[Point]:
@@ -214,22 +147,10 @@ def _models(report: Report) -> Iterator[Point]:
         how = {True: "within", False: "not within", None: "not certainly within"}[near]
         words = f"{NEAR_POINTS} points of the ceiling (mm, binary, CSIM): {_points(held)}."
         yield Point(near, f"The calibrated model is {how} {words}")
+    elif held is None and not report.source.imported:
+        yield Point(None, "No model was calibrated to this brush: run “brushloop fit”, then validate again.")
     if held is not None and bezier is not None and held.avg < bezier.avg:
         yield Point(False, "The refitted Bézier predicts unseen cells better than the calibrated CCD-BSM.")
-
-
-def _loop(loop: LoopRecord) -> Point:
-    if not loop.verdicts:
-        return Point(None, f"{loop.again}: no original cell was pressed twice, so its repeatability is unknown.")
-    least = min(loop.verdicts, key=lambda verdict: verdict.difference)
-    failed = sum(not verdict.holds for verdict in loop.verdicts)
-    how = "at most" if not failed else f"in {failed} of {len(loop.verdicts)} comparisons more than"
-    sure = "" if all(verdict.certain for verdict in loop.verdicts) else ", not certain in all"
-    return Point(
-        not failed,
-        f"Strokes pressed again ({loop.again}) are {how} {loop.goal_points:g} point less similar to their originals "
-        f"than other presses of the same cell (least: {least.difference:+.2f} points{sure}).",
-    )
 
 
 def _csim(report: Report, model: str, key: Key = STRICT) -> Summary | None:
@@ -237,20 +158,12 @@ def _csim(report: Report, model: str, key: Key = STRICT) -> Summary | None:
     return None if stat is None else stat.csim
 
 
-def _span(interval: Interval | None) -> str:
-    return "" if interval is None else " (95 % {:.1f} to {:.1f})".format(*interval)
-
-
-def _interval(csim: Summary) -> str:
-    return f"{csim.avg:.1f} %{_span(csim.avg_interval)}"
-
-
 def _points(csim: Summary) -> str:
     return f"{csim.below_ceiling:.1f} points{_span(csim.below_interval)}"
 
 
-def _below(csim: Summary) -> str:
-    return "" if csim.below_ceiling is None else f", {_points(csim)} below the ceiling"
+def _span(interval: Interval | None) -> str:
+    return "" if interval is None else " (95 % {:.1f} to {:.1f})".format(*interval)
 
 
 def _label(report: Report, name: str) -> str:

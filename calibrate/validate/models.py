@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.paper import ROBOT_WRITING
 from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of, levels_of, simulated
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
@@ -30,11 +29,8 @@ HELD_OUT = "fitted, held-out cells"
 PRESSES = "captured presses"
 FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
 GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
-HELD_OUT_NAMES = (FITTED_HELD_OUT, BEZIER_REFITTED, GENERATOR_HELD_OUT)
 ANOTHER = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
-REPEATED = ROBOT_WRITING
-"""A press compared with the stroke of another session that it repeats: the third row of the paper's Table 1."""
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
 """Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 ORDER = (
@@ -57,7 +53,7 @@ class FittedSession(OpenSession):
 
 
 class ModelInfo(Frozen):
-    """What a report says of a model, or of the kind of press that a press is compared with."""
+    """What a report says of a model, or of what its rows are compared with."""
 
     name: str
     label: str
@@ -74,12 +70,6 @@ KINDS_OF_PRESS = (
         label="another press",
         definition="A capture predicted by other captures of its cell, averaged: how well the brush repeats a press. A "
         "model can do better, because only one of two presses strays from its image.",
-        basis=PRESSES,
-    ),
-    ModelInfo(
-        name=REPEATED,
-        label="robot writing",
-        definition="A stroke pressed again with the depth and tilt that were recovered from it, against the original.",
         basis=PRESSES,
     ),
     ModelInfo(
@@ -122,52 +112,34 @@ class Model:
 
 def in_order(models: Sequence[Model]) -> list[Model]:
     """Sort in the order of the paper's tables, all others last."""
-
-    def place(model: Model) -> int:
-        stem = "ccd-bsmg" if model.name.startswith("ccd-bsmg-") and model.name not in ORDER else model.name
-        return ORDER.index(stem) if stem in ORDER else len(ORDER)
-
-    return sorted(models, key=place)
+    return sorted(models, key=lambda model: ORDER.index(model.name) if model.name in ORDER else len(ORDER))
 
 
-def known_models(
-    session: FittedSession, generators: Sequence[Path], view: Field, *, ablations: bool, chosen: Sequence[str]
-) -> list[Model]:
+def known_models(session: FittedSession, generators: Sequence[Path], view: Field, *, ablations: bool) -> list[Model]:
     """The models that need no held-out fit: generators, the registered models of the brush, and its fit.
 
-    Raises `CalibrationError` if one of `chosen` is unknown, and what `load_generator` does.
+    Raises what `load_generator` does, and `CalibrationError` for two generators of one name.
     """
     from brushloop.model.fitted import fitted_model
+    from brushloop.model.generator.stroke import load_generator
     from brushloop.model.strokes import stroke_model, stroke_models
 
     brush, fit = brush_of(session.header), session.fit
     models = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
     if fit is not None:
         basis = "fitted, in sample" if fit.recording_sha256 == session.sha256 else f"fitted on {fit.session_id}"
-        models.insert(1, _of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
+        models.append(_of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
     for name, lam in LAMBDAS.items() if ablations else ():
         label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
         models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name=name, label=label))
-    known = in_order([*_generators(brush, generators, view), *models])
-    names = (*dict.fromkeys(model.name for model in known), *HELD_OUT_NAMES)
-    for name in chosen:
-        if name not in names:
-            raise CalibrationError("--model", f"{name!r} is not one of: {', '.join(names)}")
-    return known
-
-
-def _generators(brush: Brush, files: Sequence[Path], view: Field) -> Iterator[Model]:
-    """Yield trained generators, drawn as their traced outlines; a second one of a name has a number."""
-    from brushloop.model.generator.stroke import load_generator
-
-    names: set[str] = set()
-    for number, file in enumerate(files, 1):
+    for file in generators:
         model = load_generator(file, brush)
-        images = f"trained on exact images of {model.target.stroke_model.label}"
-        basis = f"{images}, then tuned on captures" if model.fitted else images
-        name = f"{model.name}-{number}" if model.name in names else model.name
-        names.add(name)
-        yield _of_model(model, basis, view, sha256=file_sha256(file), name=name)
+        if model.name in [known.name for known in models]:
+            raise CalibrationError(str(file), f"is a second {model.name}")
+        basis = f"trained on exact images of {model.target.stroke_model.label}"
+        basis += ", then tuned on captures" if model.fitted else ""
+        models.append(_of_model(model, basis, view, sha256=file_sha256(file)))
+    return in_order(models)
 
 
 def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBezier | None], view: Field) -> Model:
@@ -182,14 +154,15 @@ def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBez
     return Model(info, predict)
 
 
-def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field, number: int) -> Model:
+def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field) -> Model:
     """A generator tuned on all cells except the one it predicts."""
     from brushloop.model.generator.stroke import load_generator
 
     loaded = {file: load_generator(file, brush) for file in set(files.values())}
+    first = next(iter(loaded.values()))
     info = ModelInfo(
-        name=GENERATOR_HELD_OUT if number == 0 else f"{GENERATOR_HELD_OUT}-{number + 1}",
-        label="CCD-BSMG calibrated",
+        name=f"{first.name}-heldout",
+        label=f"{first.label} calibrated",
         definition="The generator, fine-tuned on captures of other cells (left out by fifths) and on images of the "
         "CCD-BSM that was fitted to them, if there is a fit; its outline.",
         basis=HELD_OUT,

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.artefact import FOLDER
-from brushloop.calibrate.compare.paper import TABLE_3
 from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Tone
+from brushloop.calibrate.compare.score import TABLE_3
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.brush import FOLDER as FITS
@@ -30,12 +30,11 @@ from brushloop.calibrate.report import (
     render,
     source_note,
 )
-from brushloop.calibrate.scores import Cell, Row, Stat
-from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.scores import Row, Stat
+from brushloop.calibrate.stats import CEILING, Cell
 from brushloop.calibrate.validate import findings, tables
 from brushloop.calibrate.validate.models import (
     BEZIER_REFITTED,
-    FITTED,
     FITTED_HELD_OUT,
     GENERATOR_HELD_OUT,
     LAMBDAS,
@@ -47,10 +46,6 @@ from brushloop.calibrate.validate.run import Outcome
 from brushloop.model.ccdbsm import DomainError
 
 CELL_COLUMNS = ("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
-CALIBRATED = (
-    *("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED_HELD_OUT),
-    *(FITTED, "bezier", BEZIER_REFITTED),
-)
 GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
 MAX_REFUSED = 200
 ROWS = slice(32, 96)
@@ -74,18 +69,12 @@ class Curve:
 def read_curve(text: str) -> Curve:
     """Read `NAME=FOLDER`, a folder that `brushloop train` wrote. Raises `CalibrationError` if it holds no curve."""
     name, _, folder = text.partition("=")
-    if not name or not folder:
-        raise CalibrationError(f"--curves {text}", "expected NAME=FOLDER")
     path = Path(folder) / "validation.csv"
     try:
         rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_CURVE_BYTES).decode())))
-        steps = tuple(int(row["step"]) for row in rows)
-        losses = tuple(float(row["mse"]) for row in rows)
+        return Curve(name, tuple(int(row["step"]) for row in rows), tuple(float(row["mse"]) for row in rows))
     except (KeyError, TypeError, ValueError):
         raise CalibrationError(str(path), "is not a table of validation losses (step, mse)") from None
-    if not steps:
-        raise CalibrationError(str(path), "holds no validation yet")
-    return Curve(name, steps, losses)
 
 
 def page_of(
@@ -93,16 +82,17 @@ def page_of(
     report: Report,
     curves: Sequence[Curve],
     beside: Sequence[str],
-    figures_13: Sequence[str] = (),
+    figures_13: Sequence[tuple[str, str]] = (),
     pages: Sequence[tuple[str, str]] = (),
 ) -> str:
     """The whole page. `beside` names the data files in its folder, `pages` is what `pages_beside` finds.
 
-    `figures_13` are pictures of written characters as data URIs, empty if missing.
+    `figures_13` are sessions of characters and their pictures as data URIs.
     """
     shown, names = report.model(report.shown), [session.session_id for session in report.sessions]
     best, worst = _extremes(outcome, report.shown)
     columns = [model for name in CELL_COLUMNS if (model := report.model(name)) is not None]
+    figure_3 = (*LAMBDAS, "ccd-bsm") if any(report.model(name) for name in LAMBDAS) else ()
     return render(
         "presses.html.j2",
         report=report,
@@ -112,14 +102,12 @@ def page_of(
         pages=pages,
         verdict=list(findings.verdict(report)),
         measured=findings.measured(report),
-        findings=list(findings.findings(report)),
         trust=list(findings.trust(report)),
         order=findings.order(report),
         table_one=tables.table_1(report),
-        table_two=tables.table_2(report, NORMAL),
-        strict=tables.table_2(report, STRICT),
+        table_two=tables.table_2(report),
         table_three=list(tables.table_3(report)),
-        figures_13=[(record.session, uri) for record, uri in zip(report.written, figures_13, strict=False) if uri],
+        figures_13=figures_13,
         paper_three=list(TABLE_3.values()),
         plot=_distributions(outcome, report),
         keys=KEYS,
@@ -130,7 +118,9 @@ def page_of(
         shown=shown.label if shown is not None else "",
         best=[_pictured(outcome, k, report.shown) for k in best],
         worst=[_pictured(outcome, k, report.shown) for k in worst],
-        ablations=_ablations(outcome, report, curves),
+        lambdas=list(_of_one_cell(outcome, figure_3)) if figure_3 else [],
+        steps=_by_strokes(report) if report.by_strokes else "",
+        curves=_curves(curves) if curves else "",
         refused=report.refused[:MAX_REFUSED],
         more_refused=max(0, len(report.refused) - MAX_REFUSED),
         provenance=[*map(provenance, report.sessions), *_of_others(report), _of_run(report)],
@@ -223,15 +213,11 @@ def _distributions(outcome: Outcome, report: Report) -> str:
     for axis, key in zip(axes, (STRICT, NORMAL), strict=True):
         rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
         for place, model in enumerate(reversed(models)):
-            values = 100.0 * outcome.scores.of_key(model.name, key)[:, 0]
-            values = values[np.isfinite(values)]
             stat = report.stat(model.name, key)
             if stat is None:
                 continue
-            if len(values) > 3 and np.ptp(values) > 1e-6:
-                parts: Any = axis.violinplot([values], [place], orientation="horizontal", widths=0.8, showextrema=False)
-                for body in parts["bodies"]:
-                    body.set(facecolor=BLUE, alpha=0.18)
+            values = 100.0 * outcome.scores.of_key(model.name, key)[:, 0]
+            values = values[np.isfinite(values)]
             some = values[:: max(1, -(-len(values) // MAX_POINTS))]
             axis.plot(some, place + 0.14 * rng.uniform(-1, 1, len(some)), ".", ms=3, alpha=0.5, color=BLUE)
             if stat.csim.avg_interval is not None:
@@ -252,9 +238,8 @@ def _by_strokes(report: Report) -> str:
         for step in report.by_strokes:
             if step.model == name:
                 csim.setdefault(step.strokes, []).append(step.csim)
-        if csim:
-            means = [np.mean(csim[count]) for count in sorted(csim)]
-            axis.plot(sorted(csim), means, "o-", ms=4, color=colour, label=f"{name} fitted")
+        means = [np.mean(csim[count]) for count in sorted(csim)]
+        axis.plot(sorted(csim), means, "o-", ms=4, color=colour, label=f"{name} fitted")
     ticks = sorted({step.strokes for step in report.by_strokes})
     axis.set_xscale("log")
     axis.set_xticks(ticks, [str(n) for n in ticks])
@@ -280,29 +265,6 @@ def _cell(report: Report, cell: Cell, columns: Sequence[ModelInfo]) -> tuple[Cel
     return cell, max((stat.csim.n for stat in stats if stat is not None), default=0), stats
 
 
-def _ablations(outcome: Outcome, report: Report, curves: Sequence[Curve]) -> dict[str, Any]:
-    """The parts of that section; empty if it has none."""
-
-    def rows(names: Sequence[str], needed: Sequence[str]) -> list[tuple[ModelInfo, str, str]]:
-        models = [model for name in names if (model := report.model(name)) is not None]
-        if not any(model.name in needed for model in models):
-            return []
-        return [
-            (model, tables.pair(report, model.name, STRICT), tables.pair(report, model.name, NORMAL))
-            for model in models
-        ]
-
-    lambdas = rows((*LAMBDAS, "ccd-bsm"), tuple(LAMBDAS))
-    parts = {
-        "lambdas": lambdas,
-        "lambda_images": list(_of_one_cell(outcome, (*LAMBDAS, "ccd-bsm"))) if lambdas else [],
-        "calibrated": rows(CALIBRATED, (FITTED_HELD_OUT, FITTED)),
-        "steps": _by_strokes(report) if report.by_strokes else "",
-        "curves": _curves(curves) if curves else "",
-    }
-    return parts if any(parts.values()) else {}
-
-
 def provenance(session: Session) -> list[tuple[str, str]]:
     """Name and text of what is known of a recording."""
     collected, counts = session.collected, f"{session.strokes} captured, {session.compared} compared"
@@ -321,23 +283,21 @@ def provenance(session: Session) -> list[tuple[str, str]]:
 def _of_others(report: Report) -> Iterator[list[tuple[str, str]]]:
     """The loops and the characters of the report, each with its own digest."""
     for loop in report.loops:
+        model = f"{loop.model}{' (in sample)' if loop.in_sample else ''}"
         yield [
-            ("pressed again", f"{loop.again}, recording sha256 {loop.again_sha256}"),
-            ("source", str(loop.source)),
-            ("of", f"{loop.original}, recovered by {loop.model}{' (in sample)' if loop.in_sample else ''}"),
+            ("pressed again", f"{loop.original} as {loop.again} ({loop.source}), recovered by {model}"),
+            ("recording", f"sha256 {loop.again_sha256}"),
             ("strokes", f"{loop.pairs} pairs, {len(loop.refused)} strokes not compared"),
             ("compared with", f"{loop.software}; {loop.command}"),
             ("loop.json", f"digest {loop.digest}"),
         ]
     for record in report.written:
         yield [
-            ("characters", f"{' '.join(record.characters)} in {record.session}"),
-            ("source", str(record.source)),
+            ("characters", f"{' '.join(record.characters)} in {record.session} ({record.source})"),
             ("recording", f"sha256 {record.recording_sha256}"),
             ("brush", record.brush or "not named"),
             ("planned by", record.model),
-            ("strokes", f"{len(record.refused)} not compared"),
-            ("compared with", f"{record.software}; {record.command}"),
+            ("compared with", f"{record.software}; {record.command}; {len(record.refused)} strokes not compared"),
             ("written.json", f"digest {record.digest}"),
         ]
 

@@ -17,7 +17,7 @@ import numpy as np
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import Alignment, Key, Tone, brush_of
-from brushloop.calibrate.loop.compare import LoopRecord
+from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.scores import Cell, Row, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.stats import CEILING, Floats, ceiling_values
@@ -38,7 +38,7 @@ from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Header, Source, Stroke
 from brushloop.sessions.show import details
 
-FORMAT = "brushloop-validation-3"
+FORMAT = "brushloop-validation-4"
 MAX_BYTES = 256 * 1024 * 1024
 PACKAGES = ("brushloop", "numpy", "opencv-python-headless", "scikit-image", "numba", "torch")
 STRICT: Key = (Alignment.MM, Tone.BINARY)
@@ -74,9 +74,8 @@ class Session(Frozen):
     calibration: Calibration | None
     """None for an import, which brings its own scale."""
     fit: str
-    length_ratio: float | None
-    width_ratio: float | None
-    """Measured size divided by that of CCD-BSM as published, averaged over uncut strokes."""
+    size_ratio: tuple[float, float] | None
+    """Measured length and width divided by those of CCD-BSM as published, averaged over uncut strokes."""
     deepest_miss: Stroke | None = None
     """The stroke whose reached depth differs most from the commanded one; None where none is recorded."""
     collected: Collected | None = None
@@ -143,11 +142,7 @@ def load_report(path: Path) -> Report:
 
 
 def report_of(
-    outcome: Outcome,
-    command: str,
-    scores_sha256: str,
-    loops: Iterable[LoopRecord] = (),
-    written: Iterable[WrittenRecord] = (),
+    outcome: Outcome, scores_sha256: str, loops: Iterable[LoopRecord] = (), written: Iterable[WrittenRecord] = ()
 ) -> Report:
     """Build one frozen report of a whole run, with the loops and characters that belong to it."""
     stats = tuple(_stats(outcome.scores))
@@ -157,8 +152,8 @@ def report_of(
     report = Report(
         source=outcome.sessions[0].header.source,
         software={name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        command=command,
-        mm_per_px=outcome.options.view.mm_per_px,
+        command=outcome.request.command,
+        mm_per_px=outcome.request.view.mm_per_px,
         ssim_settings=SSIM_SETTINGS,
         sessions=tuple(_session(session, outcome.scores) for session in outcome.sessions),
         models=(*_models(outcome), *(kind for kind in KINDS_OF_PRESS if kind.name in present)),
@@ -197,7 +192,6 @@ def _models(outcome: Outcome) -> Iterator[ModelInfo]:
 
 def _session(session: FittedSession, scores: Scores) -> Session:
     rows = [row for row in scores.rows if row.session == session.header.session_id]
-    length, width = _ratios(session.header, rows)
     return Session(
         header=session.header,
         recording=session.recording.path.name,
@@ -207,8 +201,7 @@ def _session(session: FittedSession, scores: Scores) -> Session:
         cut=tuple(row.stroke.stroke_id for row in rows if row.cut),
         calibration=session.calibration,
         fit="" if session.fit is None else session.fit.digest,
-        length_ratio=length,
-        width_ratio=width,
+        size_ratio=_size_ratio(session.header, rows),
         deepest_miss=max((row.stroke for row in rows), key=missed_mm, default=None),
         collected=collected_in(session.recording.path.parent),
     )
@@ -239,20 +232,19 @@ def collected_in(folder: Path) -> Collected | None:
     )
 
 
-def _ratios(header: Header, rows: Sequence[Row]) -> tuple[float | None, float | None]:
+def _size_ratio(header: Header, rows: Sequence[Row]) -> tuple[float, float] | None:
     """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
     from brushloop.model.ccdbsm import ccdbsm
 
     brush = brush_of(header)
     ratios: list[tuple[float, float]] = []
     for row in rows:
-        if row.cut:
-            continue
         with suppress(DomainError):
             mark = ccdbsm(brush, row.condition.depth_mm, row.condition.tilt_deg)
             length, width = row.measured.length_mm / mark.length_mm[0], row.measured.breadth_mm / mark.width_mm[0]
-            ratios.append((float(length), float(width)))
+            if not row.cut:
+                ratios.append((float(length), float(width)))
     if not ratios:
-        return None, None
+        return None
     length, width = np.mean(ratios, axis=0).tolist()
     return round(length, 6), round(width, 6)

@@ -30,8 +30,6 @@ from brushloop.calibrate.validate.models import (
     BRUSH_LEFT_OUT,
     FITTED_HELD_OUT,
     GENERATOR_HELD_OUT,
-    HELD_OUT_NAMES,
-    REPEATED,
     FittedSession,
     Model,
     held_out,
@@ -43,7 +41,7 @@ from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.records import Condition
-from brushloop.sessions.terminal import Progress, unseen
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 COUNTS = (1, 2, 3, 5, 9, 15, 30, 60)
 """Numbers of fitted presses for which similarity is told."""
@@ -55,17 +53,29 @@ MM_BINARY = KEYS.index((Alignment.MM, Tone.BINARY))
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
-    """What is compared, and how."""
+class Request:
+    """What the command line asked for."""
 
+    places: tuple[str, ...] = ()
+    """Paths or URLs of sessions."""
+    command: str = ""
+    """Named by the report as what made it."""
     models: tuple[str, ...] = ()
     """Names; all if empty."""
     view: Field = field(default_factory=Field)
+    calibration: Path | None = None
+    fit: Path | None = None
     generators: tuple[Path, ...] = ()
+    curves: tuple[str, ...] = ()
+    """Trainings as NAME=FOLDER."""
+    gates: tuple[str, ...] = ()
     ablations: bool = False
     held_out: bool = True
     tune_steps: int = 0
     """Tuning steps of each generator on other cells; 0 means no tuning."""
+    out: Path | None = None
+    scheduler: str = ""
+    workers: int | None = None
 
 
 class Refused(NamedTuple):
@@ -92,7 +102,7 @@ class Outcome:
     """Every score of a run."""
 
     sessions: Sequence[FittedSession]
-    options: Options
+    request: Request
     models: Mapping[str, Sequence[Model]]
     """Models of each session, by its name."""
     scores: Scores
@@ -103,7 +113,7 @@ class Outcome:
 
 
 def validate_presses(
-    sessions: Sequence[FittedSession], options: Options, scheduler: Scheduler, work: Path, progress: Progress = unseen
+    sessions: Sequence[FittedSession], request: Request, scheduler: Scheduler, work: Path, progress: Progress = unseen
 ) -> Outcome:
     """Compare every model with every press. Tuned generators are kept in the folder `work`.
 
@@ -111,31 +121,35 @@ def validate_presses(
     """
     models: dict[str, Sequence[Model]] = {}
     for session in sessions:
-        name = session.header.session_id
-        if name in models:
-            raise CalibrationError(str(session.recording.path), f"{name} is given twice")
-        models[name] = known_models(
-            session, options.generators, options.view, ablations=options.ablations, chosen=options.models
-        )
+        known = known_models(session, request.generators, request.view, ablations=request.ablations)
+        models[session.header.session_id] = known
+    if len(models) < len(sessions):
+        raise CalibrationError(sessions[-1].header.session_id, "two sessions have this name")
+    possible = [*(model.name for known in models.values() for model in known), BEZIER_REFITTED]
+    possible += [FITTED_HELD_OUT] if any(session.fit for session in sessions) else []
+    possible += [GENERATOR_HELD_OUT] if request.tune_steps else []
+    for name in request.models:
+        if name not in possible:
+            names = ", ".join(dict.fromkeys(possible))
+            raise CalibrationError(
+                "--model", f"{name!r} is not one of: {names}; some need a fit, --generator or --tune"
+            )
     refused: list[Refused] = []
     rows: list[Row] = []
     for session in sessions:
         name = session.header.session_id
-        of_session = list(_rows(session, options.view, refused, scheduler, progress))
-        every = in_order([*models[name], *_held_out(session, of_session, options, scheduler, work, progress)])
-        models[name] = [model for model in every if not options.models or model.name in options.models]
+        of_session = list(_rows(session, request.view, refused, scheduler, progress))
+        every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, work, progress)])
+        models[name] = [model for model in every if not request.models or model.name in request.models]
         rows += of_session
     names = list(dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group])))
-    for name in options.models:
-        if name not in names:
-            why = f"{name} needs a fit, or --tune: see `brushloop validate sessions --help`"
-            raise CalibrationError("--model", why)
-    scores = Scores(rows, (*names, ANOTHER, REPEATED))
-    _score(scores, sessions, models, refused, scheduler, progress)
+    scores = Scores(rows, (*names, ANOTHER))
+    for session in sessions:
+        _score(scores, session, models[session.header.session_id], refused, scheduler, progress)
     steps: list[Step] = []
-    for number, session in enumerate(sessions if options.ablations else ()):
-        steps += _similarity_by_strokes(session, number, scores, options.view, scheduler)
-    return Outcome(sessions, options, models, scores, refused, steps)
+    for number, session in enumerate(sessions if request.ablations else ()):
+        steps += _similarity_by_strokes(session, number, scores, request.view, scheduler)
+    return Outcome(sessions, request, models, scores, refused, steps)
 
 
 def _rows(
@@ -149,11 +163,11 @@ def _rows(
 
 
 def _held_out(
-    session: FittedSession, rows: Sequence[Row], options: Options, scheduler: Scheduler, work: Path, progress: Progress
+    session: FittedSession, rows: Sequence[Row], request: Request, scheduler: Scheduler, work: Path, progress: Progress
 ) -> Iterator[Model]:
     """Yield the models fitted to the session without the cells that they predict."""
-    names, view = options.models or HELD_OUT_NAMES, options.view
-    if options.held_out and (FITTED_HELD_OUT in names or BEZIER_REFITTED in names):
+    view, wanted = request.view, request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
+    if request.held_out and (FITTED_HELD_OUT in wanted or BEZIER_REFITTED in wanted):
         left_out = _left_out(rows, MAX_FOLDS)
         presses = _refitted(session, left_out, view, scheduler, progress)
         if presses:
@@ -161,14 +175,14 @@ def _held_out(
         if left_out:
             beziers = {cell: _bezier(others, view) for fold, others in left_out for cell in fold}
             yield held_out(BEZIER_LEFT_OUT, beziers, view)
-    if options.tune_steps and GENERATOR_HELD_OUT in names:
+    if request.tune_steps:
         left_out = _left_out(rows, FOLDS)
         presses = _refitted(session, left_out, view, scheduler, progress)
-        for number, generator in enumerate(options.generators):
+        for generator in request.generators:
             folds = [(fold, presses.get(fold[0])) for fold, _ in left_out]
-            files = tuned_by_cell(session, folds, generator, options.tune_steps, work, progress)
+            files = tuned_by_cell(session, folds, generator, request.tune_steps, work, progress)
             if files:
-                yield tuned(files, brush_of(session.header), view, number)
+                yield tuned(files, brush_of(session.header), view)
 
 
 LeftOut = list[tuple[list[Condition], list[Pressed]]]
@@ -210,66 +224,43 @@ def _bezier(strokes: Sequence[Pressed], view: Field) -> RefittedBezier | None:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class ScoreJob:
-    """Compare a press with images."""
-
-    press: Pixels
-    """(len(KEYS), 128, 128)."""
-    against: tuple[Pixels, ...]
-    """For each comparison (n, len(KEYS), 128, 128), whose scores are averaged; n is 0 where there is nothing."""
-
-    @property
-    def key(self) -> str:
-        """Key in the store of finished work."""
-        return key_of("score", self.press, *self.against)
+ScoreJob = tuple[Pixels, tuple[Pixels, ...]]
+"""A press (len(KEYS), 128, 128), and for each comparison (n, len(KEYS), 128, 128), whose scores are averaged."""
 
 
 def score_job(job: ScoreJob) -> Arrays:
     """`values` (comparisons, KEYS, 2): CSIM and SSIM, NaN where there is nothing to compare with."""
-    return {"values": np.array([similarities(job.press / 255.0, images / 255.0) for images in job.against])}
+    press, against = job
+    return {"values": np.array([similarities(press / 255.0, images / 255.0) for images in against])}
 
 
 def _score(
     scores: Scores,
-    sessions: Sequence[FittedSession],
-    models: Mapping[str, Sequence[Model]],
+    session: FittedSession,
+    models: Sequence[Model],
     refused: list[Refused],
     scheduler: Scheduler,
     progress: Progress,
 ) -> None:
-    """Fill the table: every press against every model, other presses of its cell, and the press that it repeats."""
-    done = 0
-    for session in sessions:
-        of_session = models[session.header.session_id]
-        columns = [scores.models.index(name) for name in (*(model.name for model in of_session), ANOTHER, REPEATED)]
-        places: dict[str, list[int]] = {}
-        jobs = _jobs(session.header.session_id, of_session, scores, refused, places)
-        for key, arrays in finished(scheduler, session.store, score_job, jobs):
-            for row in places[key]:
-                scores.values[row, columns] = arrays["values"]
-            done += 1
-            progress("compared", done, len(scores.rows))
+    """Fill the table for one session: every press against every model, and against other presses of its cell."""
+    rows, columns = scores.rows, [scores.models.index(name) for name in (*(model.name for model in models), ANOTHER)]
+    cells = [cell for cell in scores.cells if rows[cell[0]].session == session.header.session_id]
+    places: dict[str, list[int]] = {}
+    """Rows by key of their job: equal presses share one."""
 
+    def jobs() -> Iterator[tuple[str, ScoreJob]]:
+        for cell in cells:
+            predictions = list(_predictions(models, [rows[k] for k in cell], refused))
+            for number, k in enumerate(cell):
+                others = [rows[cell[other]].images for other in others_of(number, len(cell))]
+                against = (*predictions, np.array(others))
+                key = key_of("score", rows[k].images, *against)
+                places.setdefault(key, []).append(k)
+                yield key, (rows[k].images, against)
 
-def _jobs(
-    session: str, models: Sequence[Model], scores: Scores, refused: list[Refused], places: dict[str, list[int]]
-) -> Iterator[tuple[str, ScoreJob]]:
-    """Yield the key and the job of each press of a session, and note its row in `places`; equal presses share a key."""
-    rows, originals = scores.rows, _originals(scores.rows)
-    for cell in (cell for cell in scores.cells if rows[cell[0]].session == session):
-        predictions = list(_predictions(models, [rows[k] for k in cell], refused))
-        for number, k in enumerate(cell):
-            others = [rows[cell[other]] for other in others_of(number, len(cell))]
-            job = ScoreJob(rows[k].images, (*predictions, _stack(others), _stack(originals[k])))
-            key = job.key
-            places.setdefault(key, []).append(k)
-            yield key, job
-
-
-def _stack(rows: Sequence[Row]) -> Pixels:
-    """(rows, KEYS, 128, 128)."""
-    return np.array([row.images for row in rows], np.uint8)
+    what, count = f"{session.header.session_id}: compared", sum(map(len, cells))
+    for key, arrays in counted(finished(scheduler, session.store, score_job, jobs()), what, count, progress):
+        scores.values[np.ix_(places[key], columns)] = arrays["values"]
 
 
 def _predictions(models: Sequence[Model], cell: Sequence[Row], refused: list[Refused]) -> Iterator[Pixels]:
@@ -278,18 +269,9 @@ def _predictions(models: Sequence[Model], cell: Sequence[Row], refused: list[Ref
         try:
             yield model.predict(cell[0].condition)[np.newaxis]
         except DomainError as error:
-            yield _stack([])
+            yield np.zeros((0,), np.uint8)
             why = f"{model.name} does not predict it: {error}"
             refused += (Refused(row.session, row.stroke.stroke_id, why) for row in cell)
-
-
-def _originals(rows: Sequence[Row]) -> list[list[Row]]:
-    """For each row the one of another session that it repeats, if that session is given too."""
-    by_name: dict[str, list[Row]] = {}
-    for row in rows:
-        by_name.setdefault(row.stroke.stroke_id, []).append(row)
-    named = [[of for of in by_name.get(row.stroke.again_of or "", []) if of.session != row.session] for row in rows]
-    return [originals if len(originals) == 1 else [] for originals in named]
 
 
 def _similarity_by_strokes(

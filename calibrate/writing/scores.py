@@ -15,9 +15,8 @@ import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.paper import ROBOT_WRITING, TABLE_3
 from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, prepare_cell, to_tone
-from brushloop.calibrate.compare.score import Polarity, similarity
+from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_3, Polarity, similarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.report import Sealed, load_sealed

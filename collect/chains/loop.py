@@ -78,7 +78,7 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
     )
     again = collected_session(say, wanted)
 
-    from brushloop.calibrate.loop.report import CompareRequest, compare  # slow to import
+    from brushloop.calibrate.loop import CompareRequest, compare  # slow to import
 
     command = f"brushloop loop compare {folder} {again} --fit {fit} --out {request.out}"
     say(f"$ {command}")

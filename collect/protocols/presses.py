@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from brushloop.calibrate.spread import spread_out
+from brushloop.calibrate.stats import spread_out
 from brushloop.collect.protocols.base import (
     MAX_STROKES,
     DeepMm,

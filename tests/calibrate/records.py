@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.compare.place import KEYS
-from brushloop.calibrate.loop.compare import AGAIN, ANOTHER, SIMULATED, LoopRecord, table_1, verdicts
+from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, table_1, verdicts
 from brushloop.calibrate.scores import Row, Scores
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.writing.scores import KEYS as WRITTEN_KEYS

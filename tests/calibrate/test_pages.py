@@ -16,8 +16,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
-from brushloop.calibrate.loop.compare import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts
-from brushloop.calibrate.loop.report import write_loop
+from brushloop.calibrate.loop import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts, write_loop
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import printable, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured

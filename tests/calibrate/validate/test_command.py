@@ -90,4 +90,4 @@ def test_a_recording_that_is_not_the_one_its_journal_closed_is_damaged(session: 
         journal.append(event)
     journal.close()
     with pytest.raises(SessionDamaged, match="SHA-256 differs"):
-        open_session(str(folder), None, None)
+        open_session(str(folder))

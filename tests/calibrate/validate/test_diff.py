@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -47,13 +46,9 @@ def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, 
     assert coarser.test.interval[0] > 0.0
     assert coarser.test.p == pytest.approx(2 / 2**5)  # signs are flipped by cell: five alike are no proof yet
     assert coarser.verdict == "no significant difference"
-    assert found[("line", "size-normalised", "binary", "ssim")].verdict == "no significant difference"
-    said = json.loads(invoke("validate", "diff", before, tmp_path, "--json"))
-    assert said["paired_by"] == "stroke"
-    assert said["source"] == "imported photographs"
     table = invoke("validate", "diff", before, tmp_path)
-    assert "n = 10 in 5 cells" in table
     assert "the same stroke" in table
+    assert "n = 10 in 5 cells" in table
 
 
 def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Path, tmp_path: Path) -> None:
@@ -65,27 +60,16 @@ def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Pa
     assert {change.verdict for change in found.changes} == {"no significant difference"}
 
 
-def test_a_session_that_was_never_validated_is_refused_with_the_command_that_does_it(
-    make_session: object, before: Path, tmp_path: Path
-) -> None:
-    never = make_session(tmp_path, "never", repeats=1, blank=False)  # pyright: ignore[reportCallIssue]
-    # A report of many sessions beside it is not this session's.
+def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before: Path, tmp_path: Path) -> None:
+    # A report of many sessions beside a session's folder is not that session's.
+    shutil.copytree(session, tmp_path / "never", ignore=shutil.ignore_patterns("validation"))
     shutil.copytree(before, tmp_path / "validation")
-    for given in (never, never / "never.mcap"):
-        ran = CliRunner().invoke(app, ["validate", "diff", str(before), str(given)])
-        assert isinstance(ran.exception, CalibrationError)
-        assert ran.exception.exit_code == 2
-        message = f"{given}: was not validated: run `brushloop validate {given}` first, or give a report.json"
-        assert str(ran.exception) == message
+    for never in (tmp_path / "never", tmp_path / "never" / "presses.mcap"):
+        with pytest.raises(CalibrationError, match=f"{never}: was not validated: run `brushloop validate {never}`"):
+            compare(before, never)
     with pytest.raises(CalibrationError, match=r"nowhere: does not exist: give a report\.json"):
         compare(tmp_path / "nowhere", before)
-
-
-def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before: Path, tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="was not validated: run `brushloop validate"):
-        compare(before, tmp_path)
-    for name in ("report.json", "scores.csv"):
-        (tmp_path / name).write_bytes((before / name).read_bytes())
-    (tmp_path / "scores.csv").write_text((tmp_path / "scores.csv").read_text().replace("0.9", "0.8"))
+    edited = tmp_path / "validation" / "scores.csv"
+    edited.write_text(edited.read_text().replace("0.9", "0.8"))
     with pytest.raises(CalibrationError, match="its SHA-256 differs"):
-        compare(before, tmp_path)
+        compare(before, tmp_path / "validation")

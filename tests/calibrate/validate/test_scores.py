@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, levels_of, simulated
-from brushloop.calibrate.pool import threads
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.calibrate.scores import Row, Scores, similarities
 from brushloop.calibrate.stroke.preprocess import Measured
-from brushloop.calibrate.validate.command import open_session
-from brushloop.calibrate.validate.models import ANOTHER, REPEATED
-from brushloop.calibrate.validate.run import Options, ScoreJob, score_job, validate_presses
+from brushloop.calibrate.validate.run import score_job
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_models
 from brushloop.sessions.messages import encode_png
-from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Condition, Stroke
 from tests.calibrate.given import CALIBRATION
 
@@ -47,7 +42,7 @@ def scores_of(page: np.ndarray, depth_mm: float, tilt_deg: float) -> dict[str, n
     """(KEYS, 2) scores of every model's press of that command."""
     images = tuple(levels_of(simulated(model, depth_mm, tilt_deg, Field()))[None] for model in MODELS.values())
     press = np.rint(255 * images_of(page)).astype(np.uint8)
-    return dict(zip(MODELS, score_job(ScoreJob(press, images))["values"], strict=True))
+    return dict(zip(MODELS, score_job((press, images))["values"], strict=True))
 
 
 @pytest.mark.parametrize("model", ["ccd-bsm", "ellipse", "line"])
@@ -108,28 +103,3 @@ def test_the_table_is_in_order_of_capture_and_its_cells_in_order_of_session_and_
     assert scores.conditions() == {upright: [1, 5], tilted: [2], shallow: [0, 3, 4]}
     scores.values[4, 1] = 0.5
     assert [(s.session_id, s.stroke_id, s.model, s.csim) for s in scores] == [("a", "4", "circle", 0.5)] * len(KEYS)
-
-
-def test_the_repetition_is_scored_against_its_original_only(
-    session: Path, make_session: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    again = make_session(tmp_path, "again", repeats=1, blank=False, seed=90)
-    records = Recording.stroke_records
-
-    def repeating(recording: Recording) -> list[Stroke]:
-        """As a replay protocol records it: each stroke of the second session repeats one of the first."""
-        strokes = list(records(recording))
-        if "again" not in str(recording.path):
-            return strokes
-        return [s.model_copy(update={"again_of": s.stroke_id, "stroke_id": f"again-{s.stroke_id}"}) for s in strokes]
-
-    monkeypatch.setattr(Recording, "stroke_records", repeating)
-    sessions = [open_session(str(place), None, None) for place in (session, again)]
-    with threads(1) as pool:
-        scores = validate_presses(sessions, Options(held_out=False), pool, tmp_path).scores
-    repeated = scores.of(REPEATED)[:, :, 0]
-    repeats = [row.session == "again" for row in scores.rows]
-    assert np.array_equal(np.isfinite(repeated).all(axis=1), repeats)
-    assert sum(repeats) == 5
-    # Two presses of one command by one brush: about as alike as the originals among themselves.
-    assert np.nanmean(repeated) == pytest.approx(np.nanmean(scores.of(ANOTHER)[:10, :, 0]), abs=0.05)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from brushloop.calibrate.loop.compare import read_loop
+from brushloop.calibrate.loop import read_loop
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.recording import Recording
 from tests.waiting import wait_until
@@ -76,13 +76,12 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     # No patch was pressed twice: the brush's repeatability is not known, and nothing is claimed.
     assert report["verdicts"] == []
     with (session / "loop" / "loop.csv").open(encoding="utf-8") as file:
-        single = [row for row in csv.DictReader(file) if row["what"] == "re-pressed" and row["tone"] == "binary"]
+        single = [row for row in csv.DictReader(file) if row["model"] == "re-pressed" and row["tone"] == "binary"]
     assert len(single) == 12
     assert all(float(row["csim"]) > 0.88 for row in single)
     page = (session / "loop" / "loop.html").read_text(encoding="utf-8")
     assert '<span class="source">loopback rig</span>' in page
     assert 'src="http' not in page
-    assert (session / "loop" / "loop.png").stat().st_size > 10_000
 
     # Done is done: nothing is pressed again, and another loop does not go on in this one's folder.
     ran = bench.run(*again)

@@ -1,4 +1,4 @@
-"""Compare a session with the one that pressed its strokes again: paired by name, scored, and judged.
+"""`brushloop loop compare`: a session compared with the one that pressed its strokes again, pair by pair.
 
 A repetition is compared with its original as two presses of one condition are: the third row of Table 1.
 """
@@ -15,22 +15,42 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from brushloop.calibrate.artefact import load_artefact, made_by
+from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Image, Key, Tone, brush_of, simulated
+from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_1
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
-from brushloop.calibrate.report import Sealed, load_sealed
-from brushloop.calibrate.scores import MEASURES, Row, Scores, Stat, find_stat, similarities, statistics
+from brushloop.calibrate.report import (
+    BLUE,
+    Point,
+    Sealed,
+    Written,
+    about,
+    dress,
+    ink_uri,
+    load_sealed,
+    overlay_uri,
+    plot,
+    plot_uri,
+    recording_facts,
+    render,
+    source_point,
+    write_files,
+)
+from brushloop.calibrate.scores import MEASURES, Row, Scores, Stat, find_stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Interval, interval_over_groups
 from brushloop.model.ccdbsm import DomainError
+from brushloop.model.similarity import SSIM_SETTINGS
+from brushloop.sessions.disk import check_writable
 from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.terminal import Progress, unseen
 
 if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
-FILE = "loop.json"
+FILE, PAGE, TABLE = "loop.json", "loop.html", "loop.csv"
 FORMAT = "brushloop-loop-2"
 MAX_BYTES = 8 * 1024 * 1024
 AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated"
@@ -38,6 +58,25 @@ AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated
 GOAL_POINTS = 1.0
 """Points by which re-pressed strokes may score below the originals' own repeatability."""
 NOT_AGAIN = "was not pressed again"
+HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), (Alignment.MM, Tone.GRAY)
+SHEET_ROWS = slice(32, 96)
+"""Rows shown, the middle half: a press is at most half as thick as the field is high."""
+MAX_PAIRS_SHOWN = 150
+
+
+@dataclass(frozen=True, slots=True)
+class CompareRequest:
+    """Which sessions are compared, and where the report goes."""
+
+    original: Path
+    again: Path
+    """The session of the replay protocol."""
+    out: Path
+    command: str
+    """Named by the report as what made it."""
+    fit: Path | None = None
+    """Brush fit that recovered depth and tilt; None is CCD-BSM as published."""
+    mm_per_px: float = MM_PER_PX
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +144,28 @@ class LoopRecord(Sealed):
         """One row of the table, or None if nothing was compared in this way."""
         return find_stat(self.table_1, compared, key)
 
+    @property
+    def answer(self) -> Point:
+        """The result in one sentence."""
+        if not self.verdicts:
+            return Point(
+                None, f"{self.again}: no original condition was pressed twice, so its repeatability is unknown."
+            )
+        least = min(self.verdicts, key=lambda verdict: verdict.difference)
+        failed = sum(not verdict.holds for verdict in self.verdicts)
+        how = "at most" if not failed else f"in {failed} of {len(self.verdicts)} comparisons more than"
+        where = f"{least.difference:+.2f} points, {least.measure.upper()}, {least.alignment}, {least.tone}"
+        sure = "" if all(verdict.certain for verdict in self.verdicts) else "; not certain in all"
+        return Point(
+            not failed,
+            f"Strokes pressed again ({self.again}) are {how} {self.goal_points:g} point less similar to their "
+            f"originals than other presses of the same condition (least: {where}{sure}).",
+        )
 
-def read_loop(path: Path) -> LoopRecord:
-    """Read a `loop.json`, or the one in a loop's folder. Raises `CalibrationError` if it is invalid or was edited."""
-    return load_sealed(path / FILE if path.is_dir() else path, LoopRecord, MAX_BYTES)
+
+def read_loop(folder: Path) -> LoopRecord:
+    """Read the `loop.json` in a folder. Raises `CalibrationError` if it is invalid or was edited."""
+    return load_sealed(folder / FILE, LoopRecord, MAX_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,32 +180,38 @@ class LoopComparison:
     """Of the original of each pair, against `AGAIN`, `ANOTHER` and `SIMULATED`."""
 
 
-def compare_sessions(
-    original: Path, again: Path, fit: Path | None, view: Field, command: str, progress: Progress = unseen
-) -> LoopComparison:
+def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
+    """Compare presses with those that repeat them, and write the report. Raises `CalibrationError` and OSError."""
+    check_writable(request.out)
+    loop = compare_sessions(request, progress)
+    page = write_loop(loop, request.out)
+    return Written(page, (*summary(loop.record), f"Report:  {page}"))
+
+
+def compare_sessions(request: CompareRequest, progress: Progress = unseen) -> LoopComparison:
     """Compare pair by pair. Raises `CalibrationError` where the two do not belong together."""
-    first, second = open_session(original, kind="press"), open_session(again, kind="press")
-    where = str(second.recording.path)
-    if (first.header.source == Source.LOOPBACK) != (second.header.source == Source.LOOPBACK):
-        raise CalibrationError(where, f"is {second.header.source}, the original {first.header.source}")
+    view = Field(mm_per_px=request.mm_per_px)
+    first, second = (open_session(path, kind="press") for path in (request.original, request.again))
+    where, source = str(second.recording.path), second.header.source
+    if (first.header.source == Source.LOOPBACK) != (source == Source.LOOPBACK):
+        raise CalibrationError(where, f"is {source}, the original {first.header.source}")
     repeated = _replayed(second.header)
     if repeated != first.header.session_id:
         what = "is not a replay" if repeated is None else f"repeats {repeated}"
         raise CalibrationError(where, f"{what}, not {first.header.session_id}")
-    model, fitted_to = _model(first.header, fit)
+    model, fitted_to = _model(first.header, request.fit)
     refused: list[Refused] = []
-    every, repetitions = (
+    originals, repetitions = (
         list(read_presses(session, view, refused, uncommanded, too_thin, progress=progress))
         for session in (first, second)
     )
-    originals = by_name(every, refused)
     pairs = pair_up(originals, repetitions, model, view, refused)
     if not pairs:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(where, f"not one pair can be compared{why}")
-    scores = score_pairs(pairs, originals.values(), first.header)
+    scores = score_pairs(pairs, originals, first.header.model_copy(update={"source": source}))
     record = LoopRecord(
-        source=second.header.source,
+        source=source,
         original=first.header.session_id,
         original_sha256=first.sha256,
         again=second.header.session_id,
@@ -162,28 +225,20 @@ def compare_sessions(
         verdicts=tuple(verdicts(scores)),
         refused=tuple(refused),
         software=made_by(),
-        command=command,
+        command=request.command,
     ).sealed()
     return LoopComparison(record, first, second, pairs, scores)
 
 
-def by_name(originals: Iterable[Press], refused: list[Refused]) -> dict[str, Press]:
-    """The original presses by name; further ones of a name go to `refused`."""
-    presses: dict[str, Press] = {}
-    for press in originals:
-        if presses.setdefault(press.stroke.stroke_id, press) is not press:
-            refused.append((press.stroke.stroke_id, "two strokes have this name: the first is used"))
-    return presses
-
-
 def pair_up(
-    originals: dict[str, Press], repetitions: Iterable[Press], model: StrokeModel, view: Field, refused: list[Refused]
+    originals: Sequence[Press], repetitions: Iterable[Press], model: StrokeModel, view: Field, refused: list[Refused]
 ) -> list[Pair]:
     """Pair presses by `again_of`. Those without a partner, originals included, go to `refused`."""
+    by_name = {press.stroke.stroke_id: press for press in originals}
     pairs: list[Pair] = []
     for press in repetitions:
         name, of = press.stroke.stroke_id, press.stroke.again_of
-        if of is None or of not in originals:
+        if of is None or of not in by_name:
             why = "repeats no stroke" if of is None else f"repeats {of}, which does not exist or cannot be used"
             refused.append((name, why))
             continue
@@ -192,9 +247,9 @@ def pair_up(
         except DomainError as error:
             refused.append((name, f"the model does not predict it: {error}"))
             continue
-        pairs.append(Pair(originals[of], press, images))
+        pairs.append(Pair(by_name[of], press, images))
     repeated = {pair.original.stroke.stroke_id for pair in pairs}
-    refused.extend((name, NOT_AGAIN) for name in originals if name not in repeated)
+    refused.extend((name, NOT_AGAIN) for name in by_name if name not in repeated)
     return pairs
 
 
@@ -253,3 +308,90 @@ def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     from brushloop.model.fitted import fitted_model
 
     return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256
+
+
+def write_loop(loop: LoopComparison, folder: Path) -> Path:
+    """Write the report's files into `folder`; returns the page's path. Raises OSError."""
+    record, header = loop.record, loop.original.header
+    frame = about(header.model_copy(update={"source": record.source}))
+    facts = [
+        recording_facts(session.header, session.recording.path.name, session.sha256, session.calibration)
+        for session in (loop.original, loop.again)
+    ]
+    made = [("recovered by", record.model), ("compared with", record.software), ("command", record.command)]
+    page = render(
+        "loop.html.j2",
+        **frame,
+        header=header,
+        record=record,
+        trust=[source_point(record.source), *_trust(record)],
+        plot=_recovered(loop, frame["label"]),
+        beside=(TABLE, FILE),
+        tables=[(key, [row for row in record.table_1 if (row.alignment, row.tone) == key]) for key in KEYS],
+        paper=TABLE_1[ROBOT_WRITING],
+        rows=_rows(loop),
+        not_shown=max(0, len(loop.pairs) - MAX_PAIRS_SHOWN),
+        ssim_settings=SSIM_SETTINGS,
+        provenance=[*facts, made],
+    )
+    write_files(folder, {TABLE: scores_csv(loop.scores), FILE: record.to_json(), PAGE: page})
+    return folder / PAGE
+
+
+def summary(record: LoopRecord) -> Iterator[str]:
+    """Lines for the terminal."""
+    yield f"{record.pairs} presses repeated, {len(record.refused)} not compared ({record.source})"
+    for key in KEYS:
+        rows = [row for row in record.table_1 if (row.alignment, row.tone) == key]
+        parts = "; ".join(f"{row.model} {row.csim.avg:.2f} / {row.ssim.avg:.2f}" for row in rows)
+        yield f"{key[0]}, {key[1]}, CSIM / SSIM: {parts}"
+    yield record.answer.text
+
+
+def _rows(loop: LoopComparison) -> Iterator[dict[str, Any]]:
+    """The pairs, those that are least alike first."""
+    scores = loop.scores.of_key(AGAIN, HEADLINE)
+    order: list[int] = scores[:, 0].argsort(kind="stable").tolist()
+    for k in order[:MAX_PAIRS_SHOWN]:
+        pair = loop.pairs[k]
+        original, drawn, again = (
+            images[GRAY][SHEET_ROWS] for images in (pair.original.images, pair.simulated, pair.again.images)
+        )
+        images = {
+            "original": ink_uri(original),
+            "recovered, simulated": ink_uri(drawn),
+            "pressed again": ink_uri(again),
+            "original and pressed again": overlay_uri(original, again),
+        }
+        yield {"original": pair.original, "again": pair.again, "percent": 100.0 * scores[k], "images": images}
+
+
+def _trust(record: LoopRecord) -> Iterator[Point]:
+    if record.in_sample:
+        words = "The model that recovered them was fitted to these same presses, with their commanded depths and tilts"
+        yield Point(
+            None, f"{words}: recovered numbers near the commanded ones prove nothing about it. Compare the marks."
+        )
+    left = sum(why == NOT_AGAIN for _, why in record.refused)
+    if left:
+        yield Point(None, f"{'One original was' if left == 1 else f'{left} originals were'} not pressed again.")
+    if len(record.refused) > left:
+        yield Point(False, f"{len(record.refused) - left} strokes could not be compared; each is named below.")
+    else:
+        yield Point(True, "Every stroke that was pressed again was compared.")
+
+
+def _recovered(loop: LoopComparison, label: str) -> str:
+    """Depth and tilt as recovered against as commanded, with the line where both are equal."""
+    figure, axes = plot(1, 2, (10.0, 3.8))
+    asked, recovered = (
+        np.array([(press.condition.depth_mm, press.condition.tilt_deg) for press in presses])
+        for presses in zip(*((pair.original, pair.again) for pair in loop.pairs), strict=True)
+    )
+    for axis, name, x, y in zip(axes, ("depth H, mm", "tilt α, deg"), asked.T, recovered.T, strict=True):
+        low, high = min(x.min(), y.min()), max(x.max(), y.max())
+        margin = 0.05 * (high - low) or 0.5
+        axis.plot([low - margin, high + margin], [low - margin, high + margin], color="0.6", lw=1.0)
+        axis.plot(x, y, "o", ms=4, alpha=0.6, color=BLUE)
+        dress(axis, f"{name.split(',')[0]} ({label})", f"commanded {name}", f"recovered {name}")
+    return plot_uri(figure)

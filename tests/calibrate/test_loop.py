@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.compare.place import Alignment, Field, Tone
-from brushloop.calibrate.loop.compare import (
+from brushloop.calibrate.loop import (
     AGAIN,
     ANOTHER,
     SIMULATED,
     Pair,
-    by_name,
     pair_up,
     score_pairs,
     verdicts,
 )
 from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
 from brushloop.calibrate.scores import Scores
-from brushloop.calibrate.stats import interval_over_groups
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_model
@@ -60,7 +58,7 @@ def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of:
 def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
     """Pairs, and why presses are in none."""
     refused: list[tuple[str, str]] = []
-    return pair_up(by_name(originals, refused), again, MODEL, Field(), refused), dict(refused)
+    return pair_up(list(originals), list(again), MODEL, Field(), refused), dict(refused)
 
 
 def scored(pairs: list[Pair], originals: Iterable[Press]) -> Scores:
@@ -110,10 +108,9 @@ def test_what_repeats_nothing_is_named() -> None:
         press("y", (15.0, 5.0), (15.0, 5.0)),
         press("a-r01~1", (15.0, 5.0), (15.0, 5.0), "a-r01"),
     ]
-    pairs, refused = paired([*ORIGINALS, press("a-r01", (15.0, 5.0), (15.0, 5.0))], again)
+    pairs, refused = paired(ORIGINALS, again)
     assert len(pairs) == 1
     assert refused == {
-        "a-r01": "two strokes have this name: the first is used",
         "x~1": "repeats x, which does not exist or cannot be used",
         "y": "repeats no stroke",
         "a-r02": "was not pressed again",
@@ -126,12 +123,3 @@ def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
     scores = scored(paired(ORIGINALS, again)[0], ORIGINALS)
     assert np.isnan(scores.of(ANOTHER)).all()
     assert list(verdicts(scores)) == []
-
-
-def test_the_interval_draws_whole_groups() -> None:
-    # Three cells, each of which agrees with itself: ten presses a cell tell no more than three numbers do.
-    found = interval_over_groups(np.repeat([0.0, 1.0, 2.0], 10), np.repeat([0, 1, 2], 10))
-    assert found is not None
-    assert found[0] < 0.4
-    assert found[1] > 1.6
-    assert interval_over_groups(np.array([0.0, 1.0]), np.array([0, 1])) is None

@@ -1,1 +1,0 @@
-"""Strokes recovered from their images and pressed again, compared with the originals."""
