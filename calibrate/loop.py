@@ -22,17 +22,13 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
 from brushloop.calibrate.report import (
-    BLUE,
     Point,
     Sealed,
     Written,
     about,
-    dress,
     ink_uri,
     load_sealed,
     overlay_uri,
-    plot,
-    plot_uri,
     recording_facts,
     render,
     source_point,
@@ -282,9 +278,8 @@ def verdicts(scores: Scores) -> Iterator[Verdict]:
     again, another, cells = again[both], another[both], scores.cell_of[both]
     for (k, key), (j, measure) in itertools.product(enumerate(KEYS), enumerate(MEASURES)):
         differences = again[:, k, j] - another[:, k, j]
-        of_again, of_another, difference = (
-            float(values.mean()) for values in (again[:, k, j], another[:, k, j], differences)
-        )
+        points = again[:, k, j], another[:, k, j], differences
+        of_again, of_another, difference = (float(values.mean()) for values in points)
         interval, holds = interval_over_groups(differences, cells), difference >= -GOAL_POINTS
         yield Verdict(*key, measure, of_again, of_another, difference, interval, len(cells), holds)
 
@@ -313,7 +308,6 @@ def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
 def write_loop(loop: LoopComparison, folder: Path) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
     record, header = loop.record, loop.original.header
-    frame = about(header.model_copy(update={"source": record.source}))
     facts = [
         recording_facts(session.header, session.recording.path.name, session.sha256, session.calibration)
         for session in (loop.original, loop.again)
@@ -321,11 +315,10 @@ def write_loop(loop: LoopComparison, folder: Path) -> Path:
     made = [("recovered by", record.model), ("compared with", record.software), ("command", record.command)]
     page = render(
         "loop.html.j2",
-        **frame,
+        **about(header.model_copy(update={"source": record.source})),
         header=header,
         record=record,
-        trust=[source_point(record.source), *_trust(record)],
-        plot=_recovered(loop, frame["label"]),
+        trust=list(_trust(record)),
         beside=(TABLE, FILE),
         tables=[(key, [row for row in record.table_1 if (row.alignment, row.tone) == key]) for key in KEYS],
         paper=TABLE_1[ROBOT_WRITING],
@@ -367,6 +360,7 @@ def _rows(loop: LoopComparison) -> Iterator[dict[str, Any]]:
 
 
 def _trust(record: LoopRecord) -> Iterator[Point]:
+    yield source_point(record.source)
     if record.in_sample:
         words = "The model that recovered them was fitted to these same presses, with their commanded depths and tilts"
         yield Point(
@@ -379,19 +373,3 @@ def _trust(record: LoopRecord) -> Iterator[Point]:
         yield Point(False, f"{len(record.refused) - left} strokes could not be compared; each is named below.")
     else:
         yield Point(True, "Every stroke that was pressed again was compared.")
-
-
-def _recovered(loop: LoopComparison, label: str) -> str:
-    """Depth and tilt as recovered against as commanded, with the line where both are equal."""
-    figure, axes = plot(1, 2, (10.0, 3.8))
-    asked, recovered = (
-        np.array([(press.condition.depth_mm, press.condition.tilt_deg) for press in presses])
-        for presses in zip(*((pair.original, pair.again) for pair in loop.pairs), strict=True)
-    )
-    for axis, name, x, y in zip(axes, ("depth H, mm", "tilt α, deg"), asked.T, recovered.T, strict=True):
-        low, high = min(x.min(), y.min()), max(x.max(), y.max())
-        margin = 0.05 * (high - low) or 0.5
-        axis.plot([low - margin, high + margin], [low - margin, high + margin], color="0.6", lw=1.0)
-        axis.plot(x, y, "o", ms=4, alpha=0.6, color=BLUE)
-        dress(axis, f"{name.split(',')[0]} ({label})", f"commanded {name}", f"recovered {name}")
-    return plot_uri(figure)

@@ -12,9 +12,9 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExec
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
-from brushloop.calibrate.errors import one_line
+from brushloop.calibrate.errors import CalibrationError, one_line
 from brushloop.calibrate.store import VERSION, Arrays, Store
 
 J = TypeVar("J")
@@ -22,12 +22,6 @@ R = TypeVar("R")
 AHEAD = 2
 """Jobs submitted per worker; more would only hold photographs in memory."""
 CONNECT_S = 10.0
-
-
-class ClusterError(Exception):
-    """A cluster that cannot be used, with the reason in one line."""
-
-    exit_code: ClassVar[int] = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,17 +79,17 @@ def threads(workers: int | None = None) -> Generator[Scheduler]:
 def cluster(address: str) -> Generator[Scheduler]:
     """A running Dask cluster. The jobs of a lost worker are repeated by another.
 
-    Raises `ClusterError` if it cannot be reached or runs another version of this software.
+    Raises `CalibrationError` if it cannot be reached or runs another version of this software.
     """
     try:
         from distributed import Client
     except ImportError:
-        raise ClusterError("--scheduler needs Dask: pip install 'brushloop[cluster]'") from None
+        raise CalibrationError("--scheduler", "needs Dask: pip install 'brushloop[cluster]'") from None
     untyped: Any = Client
     try:
         client: Any = untyped(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError, ImportError) as error:
-        raise ClusterError(f"--scheduler {address}: no Dask scheduler there ({one_line(error)})") from None
+        raise CalibrationError(f"--scheduler {address}", f"no Dask scheduler there ({one_line(error)})") from None
     try:
         yield Scheduler(client.get_executor(pure=False), _workers(client, address))
     finally:
@@ -103,15 +97,15 @@ def cluster(address: str) -> Generator[Scheduler]:
 
 
 def _workers(client: Any, address: str) -> int:
-    """Threads of the cluster. Raises `ClusterError` where there are none, or where a worker has other software."""
+    """Threads of the cluster. Raises `CalibrationError` where there are none, or where a worker has other software."""
     threads: dict[str, int] = client.nthreads()
     if not threads:
-        raise ClusterError(f"--scheduler {address}: the cluster has no worker")
+        raise CalibrationError(f"--scheduler {address}", "the cluster has no worker")
     answers: dict[str, Any] = client.run(software, on_error="return")
     for worker, answer in answers.items():
         if answer != software():
             words = one_line(answer) if isinstance(answer, BaseException) else f"has {answer}"
-            raise ClusterError(f"--scheduler {address}: worker {worker} {words}; {software()} is needed there")
+            raise CalibrationError(f"--scheduler {address}", f"worker {worker} {words}; {software()} is needed there")
     return sum(threads.values())
 
 

@@ -53,11 +53,6 @@ def say(*parts: object, err: bool = False) -> None:
             plain_console(stderr=err).print(part)
 
 
-def narrow() -> bool:
-    """Whether the terminal has fewer than 80 columns; tables then leave out what can be spared."""
-    return plain_console().width < 80
-
-
 def text_of(parts: Iterable[object], columns: int) -> str:
     """Lay lines and tables out as plain text, for a page of that width."""
     with (console := plain_console(columns=columns)).capture() as captured:

@@ -82,41 +82,6 @@ class Field:
         left, top = self.anchor_mm
         return anchor[0] - left, anchor[1] - (self.side_mm - top), self.side_mm, self.side_mm
 
-    def corner_px(self, anchor_px: tuple[float, float]) -> tuple[int, int]:
-        """First column and row of the field around an anchor, both on the 20 px/mm raster."""
-        left, top = self.anchor_mm
-        return round(anchor_px[0] - left * PX_PER_MM), round(anchor_px[1] - top * PX_PER_MM)
-
-    def corner_around_px(self, mask: NDArray[np.bool_]) -> tuple[int, int]:
-        """The same for a stroke without an anchor: the field is centred on the stroke's bounding box."""
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        side = round(self.side_mm * PX_PER_MM)
-        return int(columns[0] + columns[-1] + 1 - side) // 2, int(rows[0] + rows[-1] + 1 - side) // 2
-
-
-def crop(prepared: Prepared, corner_px: tuple[int, int], view: Field) -> Prepared:
-    """Crop a raster to the field that begins at a corner; `cut` is set where ink is left out."""
-    side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
-    left, top = min(max(corner_px[0], -side), width), min(max(corner_px[1], -side), height)
-    window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
-    mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
-    anchor = prepared.anchor_px
-    return replace(
-        prepared,
-        mask=mask,
-        soft=soft,
-        anchor_px=None if anchor is None else (anchor[0] - left, anchor[1] - top),
-        cut=prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask)),
-    )
-
-
-def crop_at_anchor(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
-    """Crop to the field around an anchor. Raises `CaptureRefused` if the stroke lies outside it."""
-    cropped = crop(prepared, view.corner_px(anchor_px), view)
-    if not cropped.mask.any():
-        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
-    return cropped
-
 
 def covered(prepared: Prepared) -> Image:
     """(128, 128) share of each pixel that is ink in a capture that was rectified to the field."""
@@ -132,18 +97,29 @@ def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
     """(128, 128) image with the stroke's length scaled to 100 px and its bounding box in the middle."""
     rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
     source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
-    scale = FINE * NORMAL_LENGTH_PX / (columns[-1] + 1 - columns[0])
-    # Centre without rounding: an offset of half a pixel costs a perfect model several points of SSIM. cv2 puts pixel
-    # centres on integers; here a pixel covers [j, j + 1).
-    x, y = 0.5 * (columns[0] + columns[-1] + 1), 0.5 * (rows[0] + rows[-1] + 1)
-    middle = 0.5 * FINE * SIZE_PX
-    move = np.array([[scale, 0.0, middle - 0.5 - scale * (x - 0.5)], [0.0, scale, middle - 0.5 - scale * (y - 0.5)]])
-    fine = cv2.warpAffine(source, move, (FINE * SIZE_PX, FINE * SIZE_PX), flags=cv2.INTER_LINEAR)
-    return to_tone(_shrunk(fine), tone)
+    step_px = (columns[-1] + 1 - columns[0]) / NORMAL_LENGTH_PX
+    # Centre without rounding: an offset of half a pixel costs a perfect model several points of SSIM.
+    middle = 0.5 * (columns[0] + columns[-1] + 1), 0.5 * (rows[0] + rows[-1] + 1)
+    left, top = (float(at - 0.5 * SIZE_PX * step_px) for at in middle)
+    return to_tone(averaged(source, (left, top), step_px, SIZE_PX), tone)
 
 
-def _shrunk(image: cv2.typing.MatLike) -> Image:
-    return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
+def averaged(
+    image: NDArray[np.float32], corner_px: tuple[float, float], step_px: float, size_px: int, fine: int = FINE
+) -> Image:
+    """Average an image over (size_px, size_px) squares of `step_px` each, sampled `fine` times along each side.
+
+    `corner_px` is their upper left corner, x and y.
+    """
+    scale = fine / step_px
+    # cv2 puts pixel centres on integers, here a pixel covers [j, j + 1).
+    left, top = (scale * (0.5 - corner) - 0.5 for corner in corner_px)
+    move, side = np.array([[scale, 0.0, left], [0.0, scale, top]]), fine * size_px
+    return _shrunk(cv2.warpAffine(image, move, (side, side), flags=cv2.INTER_LINEAR), size_px)
+
+
+def _shrunk(image: cv2.typing.MatLike, size_px: int = SIZE_PX) -> Image:
+    return cast("Image", cv2.resize(image, (size_px, size_px), interpolation=cv2.INTER_AREA))
 
 
 def to_tone(coverage: Image, tone: Tone) -> Image:
@@ -192,7 +168,25 @@ def prepare_press(capture: Capture, calibration: Calibration | None, view: Field
         return steps.prepared
     if steps.prepared.anchor_px is None:
         raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
-    return crop_at_anchor(steps.prepared, steps.prepared.anchor_px, view)
+    return _cropped(steps.prepared, steps.prepared.anchor_px, view)
+
+
+def _cropped(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
+    """Crop a raster to the field around its anchor; `cut` is set where ink is left out.
+
+    Raises `CaptureRefused` if none of the stroke lies in the field.
+    """
+    side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
+    left, top = (
+        min(max(round(at - away_mm * PX_PER_MM), -side), most)
+        for at, away_mm, most in zip(anchor_px, view.anchor_mm, (width, height), strict=True)
+    )
+    window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
+    mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
+    if not mask.any():
+        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
+    cut = prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask))
+    return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
 
 
 def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
@@ -209,43 +203,31 @@ def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
 
 
 def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
-    """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.ccdbsm.DomainError`."""
-    return images_of(model.profile(depth_mm, tilt_deg), axis_mm(depth_mm, tilt_deg), field)
+    """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.ccdbsm.DomainError`.
+
+    The press tilts about the tip, then descends: the brush axis meets the paper H tan(alpha) from the zero-touch point,
+    toward the side the ferrule leans to.
+    """
+    return images_of(model.profile(depth_mm, tilt_deg), depth_mm * math.tan(math.radians(tilt_deg)), field)
 
 
 def images_of(mark: Outline, origin_x_mm: float, field: Field) -> dict[Key, Image]:
-    """A mark in every alignment and tone, (128, 128) each.
+    """A mark in every alignment and tone, (128, 128) each: its exact coverage.
 
     `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
     """
-    gray = drawn(mark, origin_x_mm, field)
+    left, top = field.anchor_mm
+    x_min_mm, x_max_mm = float(mark.x_min_mm[0]), float(mark.x_max_mm[0])
+    middle_mm, normal_mm = 0.5 * (x_min_mm + x_max_mm), (x_max_mm - x_min_mm) / NORMAL_LENGTH_PX
+    side_mm = SIZE_PX * normal_mm
+    views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
+    gray = dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(mark, views, SIZE_PX), strict=True))
     return {(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS}
 
 
 def levels_of(images: dict[Key, Image]) -> Pixels:
     """Images of every key in 256 levels, (len(KEYS), 128, 128)."""
     return np.stack([to_pixels(images[key]) for key in KEYS])
-
-
-def axis_mm(depth_mm: float, tilt_deg: float) -> float:
-    """Distance from the zero-touch point to where the brush axis meets the paper, toward the side the ferrule leans to.
-
-    The press tilts about the tip, then descends.
-    """
-    return depth_mm * math.tan(math.radians(tilt_deg))
-
-
-def drawn(loop: Outline, origin_x_mm: float, field: Field) -> dict[Alignment, Image]:
-    """(128, 128) exact coverage of a mark in each alignment.
-
-    `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
-    """
-    left, top = field.anchor_mm
-    x_min_mm, x_max_mm = float(loop.x_min_mm[0]), float(loop.x_max_mm[0])
-    middle_mm, normal_mm = 0.5 * (x_min_mm + x_max_mm), (x_max_mm - x_min_mm) / NORMAL_LENGTH_PX
-    side_mm = SIZE_PX * normal_mm
-    views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
-    return dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(loop, views, SIZE_PX), strict=True))
 
 
 def draw_loop(loop: Outline, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:

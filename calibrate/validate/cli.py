@@ -85,32 +85,17 @@ def captures(
     session: Annotated[list[str], typer.Argument(help="Sessions of presses.")],
     generator: Annotated[Path, typer.Option(help="The generator.safetensors to tune.")],
     out: Annotated[Path, typer.Option(help="The file for `brushloop train tune`.")] = Path("captures.safetensors"),
-    leave_out: Annotated[
-        list[str] | None, typer.Option(help="A cell to keep for evaluation, as H/alpha: 13/5.")
-    ] = None,
 ) -> None:
     """Write captured presses in the format that `brushloop train tune` reads."""
-    from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target
     from brushloop.calibrate.validate.command import one_source, open_session
     from brushloop.calibrate.validate.tuning import align_captures, write_captures
-    from brushloop.sessions.disk import number
-    from brushloop.sessions.records import Condition
 
-    cells: list[Condition] = []
-    for text in leave_out or ():
-        try:
-            depth_mm, tilt_deg = (number(part) for part in text.split("/"))
-        except ValueError:
-            raise CalibrationError(f"--leave-out {text}", "expected H/alpha, as 13/5") from None
-        cells.append(Condition(depth_mm, tilt_deg))
     check_target(out, ".safetensors", generator)
     opened = [open_session(place) for place in session]
     one_source(opened)
     aligned = align_captures(opened, generator)
-    count = write_captures(aligned, out, cells)
+    count = write_captures(aligned, out)
     for name, why in aligned.left_out:
         say(f"left out: {name}: {why}")
-    if cells:
-        say(f"left out, as requested: {len(aligned.images) - count} presses of {len(cells)} cells")
     say(f"{count} presses ({aligned.source}): {out}")

@@ -90,7 +90,7 @@ class Beside:
 def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     """Validate and write every file of the report; gates are checked by `check`.
 
-    Raises `CalibrationError`, `ClusterError`, and what reading a recording raises. Finished work is kept in the folders
+    Raises `CalibrationError`, and what reading a recording raises. Finished work is kept in the folders
     of the sessions, so that the same command resumes.
     """
     for text in request.gates:

@@ -27,8 +27,6 @@ Series = tuple[str, str, str, str]
 """Model, alignment, tone, measure."""
 Strokes = dict[tuple[str, ...], float]
 """Scores by (H, alpha) and, where the same strokes are compared, recording and stroke."""
-CELL = slice(2)
-"""The part of such a key that names the cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,30 +54,23 @@ class Difference:
 
     before: Report
     after: Report
-    paired_by: str
-    """`stroke` or `cell`."""
+    by_stroke: bool
+    """Whether the same strokes are paired; else the averages of the same cells."""
     changes: list[Change]
-    only_before: list[str]
-    """Models that only one of the two reports has."""
-    only_after: list[str]
 
     def lines(self) -> Iterator[object]:
         """What the command prints: what is compared, and the changes."""
-        named = [", ".join(session.session_id for session in side.sessions[:4]) for side in (self.before, self.after)]
-        versions = [side.software.get("brushloop", "?") for side in (self.before, self.after)]
-        yield f"Before: {named[0]}, brushloop {versions[0]}. After: {named[1]}, {versions[1]}."
-        what = "the same stroke" if self.paired_by == "stroke" else "the average of the same (H, α)"
+        for words, side in (("Before", self.before), ("After", self.after)):
+            names = ", ".join(session.session_id for session in side.sessions[:4])
+            yield f"{words}: {names}, brushloop {side.software['brushloop']}."
+        what = "the same stroke" if self.by_stroke else "the average of the same (H, α)"
         test = self.changes[0].test
         yield (
             f"Paired by {what}, n = {test.n} in {test.groups} cells; p by flipping the signs of whole cells, corrected "
             f"by Holm for {len(self.changes)} series ({self.before.label})."
         )
-        if self.paired_by == "cell":
+        if not self.by_stroke:
             yield "Two sessions also differ in things that were not meant to change: brush, ink, paper, zero touch."
-        if self.only_before:
-            yield f"Only before: {', '.join(self.only_before)}."
-        if self.only_after:
-            yield f"Only after: {', '.join(self.only_after)}."
         title = f"after minus before, points of percent ({self.before.label})"
         table = Table("model", "images", "", "before", "after", "change", "95 %", "p", "", title=title)
         for change in self.changes:
@@ -101,27 +92,19 @@ def compare(before: Path, after: Path) -> Difference:
         what = f"is of {new.source}, {paths[0]} of {old.source}: they cannot be compared"
         raise CalibrationError(str(paths[1]), what)
     by_stroke = bool({s.recording_sha256 for s in old.sessions} & {s.recording_sha256 for s in new.sessions})
-    first = read_scores(paths[0], old, by_stroke=by_stroke)
-    last = read_scores(paths[1], new, by_stroke=by_stroke)
-    tests: dict[Series, Paired] = {}
-    means: dict[Series, tuple[float, float]] = {}
+    first, last = (_scores(path, side, by_stroke=by_stroke) for path, side in zip(paths, (old, new), strict=True))
+    found: list[tuple[Series, float, float, Paired]] = []
     for series in (series for series in first if series in last):
         both = sorted(first[series].keys() & last[series].keys())
         values = 100.0 * np.array([[side[series][key] for key in both] for side in (first, last)])
-        cells = sorted({key[CELL] for key in both})
         # The error of a model is common to all strokes of a cell.
-        test = paired(values[0], values[1], np.array([cells.index(key[CELL]) for key in both], np.int64))
-        if test is not None:
-            tests[series], means[series] = test, (float(values[0].mean()), float(values[1].mean()))
-    if not tests:
+        cells = np.unique([",".join(key[:2]) for key in both], return_inverse=True)[1]
+        if both and (test := paired(values[0], values[1], cells)) is not None:
+            found.append((series, float(values[0].mean()), float(values[1].mean()), test))
+    if not found:
         raise CalibrationError(str(paths[1]), f"has no stroke, cell or model in common with {paths[0]}")
-    corrected = holm([test.p for test in tests.values()])
-    changes = [
-        Change(series, *means[series], test, p) for (series, test), p in zip(tests.items(), corrected, strict=True)
-    ]
-    models = [{series[0] for series in side} for side in (first, last)]
-    only = sorted(models[0] - models[1]), sorted(models[1] - models[0])
-    return Difference(old, new, "stroke" if by_stroke else "cell", changes, *only)
+    corrected = holm([test.p for *_, test in found])
+    return Difference(old, new, by_stroke, [Change(*change, p) for change, p in zip(found, corrected, strict=True)])
 
 
 def report_path(place: Path) -> Path:
@@ -142,14 +125,10 @@ def report_path(place: Path) -> Path:
     raise CalibrationError(str(place), why)
 
 
-def read_scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
+def _scores(path: Path, report: Report, *, by_stroke: bool) -> dict[Series, Strokes]:
     """Read scores by cell, recording and stroke, or averaged by cell. Raises `CalibrationError` for an edited table."""
     table = path.with_name("scores.csv")
-    try:
-        digest = file_sha256(table)
-    except OSError as error:
-        raise CalibrationError(str(table), error.strerror or str(error)) from None
-    if digest != report.scores_sha256:
+    if not table.is_file() or file_sha256(table) != report.scores_sha256:
         raise CalibrationError(str(table), f"is not the table of {path.name}: its SHA-256 differs")
     recordings = {s.session_id: s.recording_sha256 for s in report.sessions}
     scores: dict[Series, dict[tuple[str, ...], list[float]]] = {}

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,6 @@ from brushloop.calibrate.validate.models import (
     BEZIER_REFITTED,
     FITTED_HELD_OUT,
     GENERATOR_HELD_OUT,
-    LAMBDAS,
     FittedSession,
     ModelInfo,
 )
@@ -57,13 +55,8 @@ MAX_SAMPLES, MAX_CELLS, EXTREMES = 15, 5, 6
 MAX_CURVE_BYTES = 64 * 1024 * 1024
 
 
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """A training, from its folder: validation loss by step."""
-
-    name: str
-    steps: tuple[int, ...]
-    losses: tuple[float, ...]
+Curve = tuple[str, list[int], list[float]]
+"""Name, steps and validation losses of a training."""
 
 
 def read_curve(text: str) -> Curve:
@@ -72,7 +65,7 @@ def read_curve(text: str) -> Curve:
     path = Path(folder) / "validation.csv"
     try:
         rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_CURVE_BYTES).decode())))
-        return Curve(name, tuple(int(row["step"]) for row in rows), tuple(float(row["mse"]) for row in rows))
+        return name, [int(row["step"]) for row in rows], [float(row["mse"]) for row in rows]
     except (KeyError, TypeError, ValueError):
         raise CalibrationError(str(path), "is not a table of validation losses (step, mse)") from None
 
@@ -92,7 +85,6 @@ def page_of(
     shown, names = report.model(report.shown), [session.session_id for session in report.sessions]
     best, worst = _extremes(outcome, report.shown)
     columns = [model for name in CELL_COLUMNS if (model := report.model(name)) is not None]
-    figure_3 = (*LAMBDAS, "ccd-bsm") if any(report.model(name) for name in LAMBDAS) else ()
     return render(
         "presses.html.j2",
         report=report,
@@ -118,7 +110,6 @@ def page_of(
         shown=shown.label if shown is not None else "",
         best=[_pictured(outcome, k, report.shown) for k in best],
         worst=[_pictured(outcome, k, report.shown) for k in worst],
-        lambdas=list(_of_one_cell(outcome, figure_3)) if figure_3 else [],
         steps=_by_strokes(report) if report.by_strokes else "",
         curves=_curves(curves) if curves else "",
         refused=report.refused[:MAX_REFUSED],
@@ -161,23 +152,13 @@ def _pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
 
 
 def _side_by_side(outcome: Outcome) -> dict[str, Any]:
-    """Some captures next to the prediction of every model: the paper's figures 10 and 11."""
-    every = (model.info for group in outcome.models.values() for model in group)
-    labels = {info.name: info.label for info in every if info.name not in LAMBDAS}
-    rows = [outcome.scores.rows[k] for k in _first_of_cells(outcome, MAX_CELLS)]
-    return {"labels": list(labels.values()), "lines": [(row, _drawn(outcome, row, labels)) for row in rows]}
-
-
-def _of_one_cell(outcome: Outcome, names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """(label, image) of a capture of the middle cell, and of these models' predictions: the paper's figure 3."""
-    chosen = _first_of_cells(outcome, MAX_SAMPLES)
-    if not chosen:
-        return
-    row = outcome.scores.rows[chosen[len(chosen) // 2]]
-    labels = {model.name: model.info.label for model in outcome.models[row.session]}
-    captured, *drawn = _drawn(outcome, row, names)
-    yield "captured", captured
-    yield from ((labels[name], image) for name, image in zip(names, drawn, strict=True) if image)
+    """Some captures next to the prediction of every model: the paper's figures 3, 10 and 11."""
+    labels = {model.name: model.info.label for group in outcome.models.values() for model in group}
+    lines: list[tuple[Row, list[str]]] = []
+    for row in (outcome.scores.rows[k] for k in _first_of_cells(outcome, MAX_CELLS)):
+        drawn = [_captured(row), *(_predicted(outcome, row, name) for name in labels)]
+        lines.append((row, ["" if image is None else ink_uri(image) for image in drawn]))
+    return {"labels": list(labels.values()), "lines": lines}
 
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
@@ -185,12 +166,6 @@ def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
     first = [rows[0] for rows in outcome.scores.conditions().values()]
     count = min(len(first), most)
     return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
-
-
-def _drawn(outcome: Outcome, row: Row, names: Iterable[str]) -> list[str]:
-    """A capture and what each of these models predicts for it, as pictures; empty where it predicts nothing."""
-    predicted = (_predicted(outcome, row, name) for name in names)
-    return [ink_uri(_captured(row)), *("" if image is None else ink_uri(image) for image in predicted)]
 
 
 def _captured(row: Row) -> Image:
@@ -252,8 +227,8 @@ def _by_strokes(report: Report) -> str:
 def _curves(curves: Sequence[Curve]) -> str:
     """Validation losses of trained generators: the paper's figures 9 and 12."""
     figure, axis = plot(1, 1, (6.4, 3.2))
-    for curve in curves:
-        axis.semilogy(curve.steps, curve.losses, ".-", ms=4, label=curve.name)
+    for name, steps, losses in curves:
+        axis.semilogy(steps, losses, ".-", ms=4, label=name)
     title = "networks trained on exact images of stroke models"
     dress(axis, title, "step", "validation loss (MSE)", legend=True)
     return plot_uri(figure)
@@ -286,19 +261,17 @@ def _of_others(report: Report) -> Iterator[list[tuple[str, str]]]:
         model = f"{loop.model}{' (in sample)' if loop.in_sample else ''}"
         yield [
             ("pressed again", f"{loop.original} as {loop.again} ({loop.source}), recovered by {model}"),
-            ("recording", f"sha256 {loop.again_sha256}"),
-            ("strokes", f"{loop.pairs} pairs, {len(loop.refused)} strokes not compared"),
-            ("compared with", f"{loop.software}; {loop.command}"),
-            ("loop.json", f"digest {loop.digest}"),
+            ("recording", f"sha256 {loop.again_sha256}; {loop.pairs} pairs, {len(loop.refused)} strokes not compared"),
+            ("loop.json", f"digest {loop.digest}; {loop.software}; {loop.command}"),
         ]
     for record in report.written:
         yield [
-            ("characters", f"{' '.join(record.characters)} in {record.session} ({record.source})"),
-            ("recording", f"sha256 {record.recording_sha256}"),
-            ("brush", record.brush or "not named"),
-            ("planned by", record.model),
-            ("compared with", f"{record.software}; {record.command}; {len(record.refused)} strokes not compared"),
-            ("written.json", f"digest {record.digest}"),
+            (
+                "characters",
+                f"{' '.join(record.characters)} in {record.session} ({record.source}), brush {record.brush}",
+            ),
+            ("recording", f"sha256 {record.recording_sha256}; {len(record.refused)} strokes not compared"),
+            ("written.json", f"digest {record.digest}; planned by {record.model}; {record.software}; {record.command}"),
         ]
 
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import ClassVar, NamedTuple
 
-from rich.table import Column, Table
+from rich.table import Table
 
 from brushloop.calibrate.compare.place import Alignment, Key, Tone
 from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_1, TABLE_2, Polarity, Printed
@@ -23,7 +23,6 @@ from brushloop.calibrate.validate.report import NORMAL, STRICT, Report
 from brushloop.calibrate.writing.scores import ANOTHER as ANOTHER_WRITING
 from brushloop.calibrate.writing.scores import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row
 from brushloop.sessions.disk import csv_text
-from brushloop.sessions.terminal import narrow
 
 MISSING = {
     "ccd-bsmg": "not in this run: give a trained one with --generator",
@@ -151,31 +150,29 @@ def summary_csv(report: Report) -> str:
 
 
 def terminal_tables(report: Report) -> Iterator[Table]:
-    """Yield the tables for the terminal."""
-    for key in (NORMAL, STRICT):
-        rows = [*table_2(report, key), *robot_writing(report, key)]
-        yield _terminal_table(f"{key[0]}, binary, ink = 1, percent ({report.label})", key[0], rows)
-    for table in table_3(report):
-        title = f"Table 3: {table.character}, {table.alignment}, binary, percent ({report.label})"
-        yield _terminal_table(title, table.alignment, table.rows)
+    """Yield the tables for the terminal: averages; their extremes are on the page."""
+    rows = [[*table_2(report, key), *robot_writing(report, key)] for key in (NORMAL, STRICT)]
+    yield _terminal_table(f"averages, binary, ink = 1, percent ({report.label})", *rows)
+    for title, tables in itertools.groupby(table_3(report), lambda table: table.character):
+        yield _terminal_table(
+            f"Table 3: {title}, averages, binary, percent ({report.label})", *(t.rows for t in tables)
+        )
 
 
-def _terminal_table(title: str, alignment: Alignment, rows: Sequence[TableRow]) -> Table:
-    """A narrow terminal has room for averages only."""
-    # The paper's numbers stand only beside those that are made in the same way, as far as the paper describes it.
-    with_paper = alignment is Alignment.SIZE_NORMALISED
-    heads = ["CSIM\navg", "SSIM\navg"] if narrow() else ["CSIM\nmax", "min", "avg", "SSIM\nmax", "min", "avg"]
-    first = Column("model", min_width=len("simulated"))
-    table = Table(first, "n", *heads, *(["paper's avg"] if with_paper else []), title=title)
-    for row in rows:
-        if row.scores is None:
-            continue
-        ours = row.ours[2::3] if narrow() else row.ours
-        words = ["" if score is None else f"{score:.2f}" for score in ours]
-        if with_paper:
-            words.append(f"{row.paper.csim[2]:.2f} / {row.paper.ssim[2]:.2f}" if row.paper is not None else "")
-        table.add_row(row.label + SHORT.get(row.basis, ""), str(row.scores.csim.n), *words)
+def _terminal_table(title: str, like: Sequence[TableRow], strict: Sequence[TableRow]) -> Table:
+    """Each row in both alignments; the paper's numbers are of the first."""
+    table = Table("model", "n", "size-\nnormalised\nCSIM / SSIM", "paper's\navg", "mm\nCSIM / SSIM", title=title)
+    for row, other in itertools.zip_longest(like, strict):
+        if row.scores is not None:
+            words = [_pair(row.scores), "", "" if other is None else _pair(other.scores)]
+            if row.paper is not None:
+                words[1] = f"{row.paper.csim[2]:.2f} / {row.paper.ssim[2]:.2f}"
+            table.add_row(row.label + SHORT.get(row.basis, ""), str(row.scores.csim.n), *words)
     return table
+
+
+def _pair(scores: Stat | Table3Row | None) -> str:
+    return "" if scores is None else f"{scores.csim.avg:.2f} / {scores.ssim.avg:.2f}"
 
 
 class GateMissed(Exception):

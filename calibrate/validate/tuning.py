@@ -8,16 +8,13 @@ cells has its own tuning, in a folder named after a hash of its inputs; a killed
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import FINE, Field, Image, brush_of, prepare_press
+from brushloop.calibrate.compare.place import FINE, Field, Image, averaged, brush_of, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused
 from brushloop.calibrate.report import source_label
@@ -60,11 +57,10 @@ def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedP
     """Convert the presses of sessions of one source to the generator's image format. Raises as `load_generator`."""
     from brushloop.model.generator.stroke import load_generator
 
-    headers = [session.header for session in sessions]
-    label = source_label(headers[0].source, (header.brush for header in headers))
-    aligned = AlignedPresses(load_generator(generator, brush_of(headers[0])).target, label, [], [], [])
-    for session in sessions:
-        target = load_generator(generator, brush_of(session.header)).target
+    label = source_label(sessions[0].header.source, (session.header.brush for session in sessions))
+    targets = [load_generator(generator, brush_of(session.header)).target for session in sessions]
+    aligned = AlignedPresses(targets[0], label, [], [], [])
+    for session, target in zip(sessions, targets, strict=True):
         for capture in session.recording.captures():
             stroke = capture.stroke
             if stroke.depth_mm is None or stroke.tilt_deg is None:
@@ -103,10 +99,8 @@ def write_captures(
     images = np.array([aligned.images[k] for k in chosen])
     if fit is not None:
         drawn = target.draw(IMAGES, (0,))
-        inputs, images = (
-            np.concatenate([inputs, drawn]),
-            np.concatenate([images, target.images(drawn, fitted_model(fit))]),
-        )
+        images = np.concatenate([images, target.images(drawn, fitted_model(fit))])
+        inputs = np.concatenate([inputs, drawn])
     conditions = len(np.unique(inputs, axis=0))
     if conditions < 2:
         raise CalibrationError(str(out), f"{conditions} conditions are left, at least 2 are needed to tune on")
@@ -129,6 +123,9 @@ def tuned_by_cell(
     `folds` are the cells that are left out together and the brush that was fitted without them, None for a session
     without a fit. Raises what `load_generator` and training raise.
     """
+    from brushloop.model.generator.data import TuningFiles
+    from brushloop.model.generator.train import run_training
+
     digest = file_sha256(generator)
     files: dict[Condition, Path] = {}
     aligned: AlignedPresses | None = None
@@ -147,57 +144,28 @@ def tuned_by_cell(
             def stepped(step: int, what: str = what, before: int = number * steps) -> None:
                 progress(what, before + step, len(folds) * steps)
 
-            _tune(folder, captures, generator, steps, stepped)
+            tuning = TuningFiles(generator, captures)
+            settings = {"learning_rate": LEARNING_RATE, "validate_every": max(1, steps // 4), "picture_every": steps}
+            run_training(tuning.config(HELD_OUT, steps=steps, seed=0, **settings), folder, stepped, tuning)
         files |= dict.fromkeys(fold, path)
     return files
 
 
-def _tune(folder: Path, captures: Path, generator: Path, steps: int, stepped: Callable[[int], None]) -> None:
-    from brushloop.model.generator.data import TuningFiles
-    from brushloop.model.generator.train import run_training
-
-    files = TuningFiles(generator, captures)
-    config = files.config(
-        HELD_OUT,
-        steps=steps,
-        learning_rate=LEARNING_RATE,
-        seed=0,
-        validate_every=max(1, steps // 4),
-        picture_every=steps,
-    )
-    run_training(config, folder, stepped, files)
-
-
 def _placed(prepared: Prepared, target: Target) -> Image:
     """(N, N) share of ink in each pixel of the generator. Raises `CaptureRefused` if the stroke does not fit."""
-    side_mm = target.size_px * target.px_mm
+    step_px = target.px_mm * PX_PER_MM
+    side_px = target.size_px * step_px
     assert prepared.anchor_px is not None  # prepare_press aligns every press with its point of touch
     if target.placement is Placement.CENTRED:
         rows, columns = (np.flatnonzero(prepared.mask.any(axis=axis)) for axis in (1, 0))
-        middle = (columns[0] + columns[-1] + 1) / 2 / PX_PER_MM, (rows[0] + rows[-1] + 1) / 2 / PX_PER_MM
-        corner = middle[0] - side_mm / 2, middle[1] - side_mm / 2
+        left, top = (0.5 * (ends[0] + ends[-1] + 1 - side_px) for ends in (columns, rows))
     else:
-        anchor = (prepared.anchor_px[0] / PX_PER_MM, prepared.anchor_px[1] / PX_PER_MM)
-        corner = anchor[0] - ANCHOR_SHARE[0] * side_mm, anchor[1] - ANCHOR_SHARE[1] * side_mm
-    image = _resampled(prepared.mask, corner, target.px_mm, target.size_px)
-    inked = float(np.count_nonzero(prepared.mask)) / PX_PER_MM**2
-    if abs(float(image.sum()) * target.px_mm**2 - inked) > 0.01 * inked:
+        left, top = (at - share * side_px for at, share in zip(prepared.anchor_px, ANCHOR_SHARE, strict=True))
+    # At least as fine as the mask itself, else thin ink would fall between the samples.
+    fine = max(FINE, math.ceil(step_px))
+    coverage = averaged(prepared.mask.astype(np.float32), (float(left), float(top)), step_px, target.size_px, fine)
+    image = np.clip(coverage, 0.0, 1.0)
+    inked_px = float(np.count_nonzero(prepared.mask))
+    if abs(float(image.sum()) * step_px**2 - inked_px) > 0.01 * inked_px:
         raise CaptureRefused("capture", "is larger than the generator's image")
     return image
-
-
-def _resampled(mask: NDArray[np.bool_], corner_mm: tuple[float, float], px_mm: float, size_px: int) -> Image:
-    """Average the mask, from this upper left corner, over the pixels of a coarser raster."""
-    # At least as fine as the mask itself, else thin ink would fall between the samples.
-    fine_px = max(FINE, math.ceil(px_mm * PX_PER_MM))
-    scale = fine_px / (px_mm * PX_PER_MM)
-    # cv2 puts pixel centres on integers, a pixel here covers [j, j + 1).
-    move = np.array(
-        [
-            [scale, 0.0, scale * (0.5 - corner_mm[0] * PX_PER_MM) - 0.5],
-            [0.0, scale, scale * (0.5 - corner_mm[1] * PX_PER_MM) - 0.5],
-        ]
-    )
-    fine = cv2.warpAffine(mask.astype(np.float32), move, (fine_px * size_px, fine_px * size_px), flags=cv2.INTER_LINEAR)
-    small = cv2.resize(fine, (size_px, size_px), interpolation=cv2.INTER_AREA)
-    return np.clip(cast("Image", small), 0.0, 1.0)

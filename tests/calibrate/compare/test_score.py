@@ -6,16 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from skimage.metrics import structural_similarity
 
 from brushloop.calibrate.compare.place import Alignment
 from brushloop.calibrate.compare.score import BEST_SHIFT_PX, Polarity, best_shift, similarity
 from brushloop.model.similarity import binary_scores, csim, ssim
 
-images = hnp.arrays(np.float64, (16, 16), elements=st.floats(0, 1))
 NORMAL = Alignment.SIZE_NORMALISED
 
 
@@ -65,13 +61,8 @@ def test_csim_counts_the_ink_in_common(other: np.ndarray, cosine: float) -> None
     assert csim(image((1, 1), (2, 2)), other) == pytest.approx(cosine)
 
 
-@given(images, images)
-def test_ssim_is_scikit_images(a: np.ndarray, b: np.ndarray) -> None:
-    assert ssim(a, b) == pytest.approx(of_scikit_image(a, b), abs=1e-12)
-
-
 @pytest.mark.parametrize("tones", [1, 255])
-def test_marks_anywhere_on_the_field_score_the_same_though_only_their_surroundings_are_computed(tones: int) -> None:
+def test_ssim_is_scikit_images_though_only_the_surroundings_of_marks_are_computed(tones: int) -> None:
     rng = np.random.default_rng(tones)
     for a, b in zip(marks(rng, 8, tones), marks(rng, 8, tones), strict=True):
         assert ssim(a, b) == pytest.approx(of_scikit_image(a, b), abs=1e-12)

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from brushloop.calibrate import pool
-from brushloop.calibrate.pool import ClusterError
+from brushloop.calibrate.errors import CalibrationError
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [
@@ -91,8 +91,10 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
 def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     program = (
         "import brushloop.calibrate.store as store; store.VERSION = 'of tomorrow'\n"
-        "from brushloop.calibrate.pool import ClusterError, cluster\n"
-        f"try:\n    with cluster({cluster.address!r}):\n        pass\nexcept ClusterError as error:\n    print(error)\n"
+        "from brushloop.calibrate.errors import CalibrationError\n"
+        "from brushloop.calibrate.pool import cluster\n"
+        f"try:\n    with cluster({cluster.address!r}):\n        pass\n"
+        "except CalibrationError as error:\n    print(error)\n"
     )
     ran = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=PATIENCE_S
@@ -132,5 +134,5 @@ print(len(there), plain(there.items()) == plain(here.items()))
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ClusterError, match=r"brushloop\[cluster\]"), pool.cluster("tcp://127.0.0.1:9"):
+    with pytest.raises(CalibrationError, match=r"brushloop\[cluster\]"), pool.cluster("tcp://127.0.0.1:9"):
         pass

@@ -30,7 +30,7 @@ def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_report_does_not_differ_from_itself(before: Path) -> None:
     found = compare(before, before / "report.json")
-    assert found.paired_by == "stroke"
+    assert found.by_stroke
     assert len(found.changes) == 3 * 4 * 2
     assert {change.verdict for change in found.changes} == {"no significant difference"}
     assert all(change.test.mean == 0.0 and change.test.n == 10 for change in found.changes)
@@ -55,7 +55,7 @@ def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Pa
     other = make_session(tmp_path, "other", seed=500, blank=False)  # pyright: ignore[reportCallIssue]
     invoke("validate", other, *MODELS)
     found = compare(before, other)  # the session's own folder
-    assert found.paired_by == "cell"
+    assert not found.by_stroke
     assert all(change.test.n == 5 for change in found.changes)
     assert {change.verdict for change in found.changes} == {"no significant difference"}
 

@@ -66,8 +66,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_generator_is_scored_beside_what_it_was_trained_on(session: Path, generator: Path, tmp_path: Path) -> None:
     training = generator.parent
     given = ("--generator", generator, "--curves", f"CCD-BSMG={training}", "--no-held-out")
-    said = invoke("validate", session, "--out", tmp_path, *given)
-    assert "CCD-BSMG trained on exact images of CCD-BSM, given only the brush's size" in said
+    invoke("validate", session, "--out", tmp_path, *given)
     report = load_report(tmp_path / "report.json")
     drawn, exact = (report.stat(name, NORMAL) for name in ("ccd-bsmg", "ccd-bsm"))
     assert drawn is not None
@@ -84,7 +83,7 @@ def test_a_tuned_generator_is_judged_on_cells_that_it_has_not_seen(
     session: Path, generator: Path, tmp_path: Path
 ) -> None:
     given = ("--generator", generator, "--tune", "80", "--model", "ccd-bsmg", "--model", "ccd-bsmg-heldout")
-    assert "Tuned to this brush, CCD-BSMG reaches" in invoke("validate", session, "--out", tmp_path, *given)
+    invoke("validate", session, "--out", tmp_path, *given)
     report = load_report(tmp_path / "report.json")
     rival = report.model("ccd-bsmg-heldout")
     assert rival is not None
@@ -117,15 +116,14 @@ def test_captures_go_through_the_file_into_a_tuning(
         invoke("train", "--config", tmp_path / "train.toml", "--out", tmp_path / "made")
         generator = tmp_path / "made" / "generator.safetensors"
     captures = tmp_path / "captures.safetensors"
-    said = invoke("validate", "captures", session, "--generator", generator, "--out", captures, "--leave-out", "15/5")
+    said = invoke("validate", "captures", session, "--generator", generator, "--out", captures)
     assert "left out: blank" in said
-    assert "left out, as requested: 2 presses of 1 cells" in said
-    assert "8 presses (imported photographs)" in said
+    assert "10 presses (imported photographs)" in said
 
     kept, source = load_captures(captures, read_generator(generator).config.target)
     inputs, truth = kept.pick(np.arange(len(kept)))
     assert source == "imported photographs"
-    assert truth.shape == (8, 32, 32)
+    assert truth.shape == (10, 32, 32)
     assert inputs.tolist()[:2] == [[11.0, 0.0], [11.0, 10.0]]
     # The ink of a deeper press is more; none is cut off, and it lies where the generator puts it.
     area = truth.sum(axis=(1, 2))
