@@ -31,7 +31,7 @@ from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.start import engine_for
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Target
+from brushloop.collect.teach.guide import Question, Target
 from brushloop.collect.teach.watch import watched
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.collect.tui.app import OperatorApp
@@ -42,7 +42,7 @@ from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.collect.tui.teach_app import TeachApp
-from brushloop.collect.tui.teach_guide import Question, ScreenGuide
+from brushloop.collect.tui.teach_guide import ScreenGuide
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View

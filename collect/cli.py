@@ -121,7 +121,7 @@ def plan(
     from brushloop.collect.rig.paper import PaperPlane
 
     if picture is not None:
-        from brushloop.collect.rig.picture import check_picture
+        from brushloop.collect.rig.show import check_picture
 
         check_picture(picture)
     rig, wanted = load_rig(config), load_protocol(protocol)
@@ -189,7 +189,7 @@ def _first_report(config: Path, report: Path) -> bool:
     """Write the archive from what was taught so far, where there is no rig.toml yet; False if nothing was."""
     import asyncio
 
-    from brushloop.collect.teach.report import write_first_report
+    from brushloop.collect.teach.find_arm import write_first_report
     from brushloop.collect.teach.store import TaughtFile
 
     taught = TaughtFile(config)

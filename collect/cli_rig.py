@@ -82,8 +82,7 @@ def show(
     import json
 
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.picture import check_picture, draw_rig
-    from brushloop.collect.rig.places import rig_json, rig_table
+    from brushloop.collect.rig.show import check_picture, draw_rig, rig_json, rig_table
 
     if picture is not None:
         check_picture(picture)
@@ -100,6 +99,7 @@ def check(rig: RigFile, as_json: Json = False) -> None:
     Ends with code 5 if values contradict each other.
     """
     import json
+    from dataclasses import asdict
 
     from brushloop.collect.rig.check import check_page, check_rig, contradictions
     from brushloop.collect.rig.config import load_rig
@@ -107,7 +107,7 @@ def check(rig: RigFile, as_json: Json = False) -> None:
 
     checks = [*check_rig(load_rig(rig)), *gaps(TaughtFile(rig).load())]
     if as_json:
-        say(json.dumps({"contradictions": contradictions(checks), "checks": [c.as_json() for c in checks]}))
+        say(json.dumps({"contradictions": contradictions(checks), "checks": [asdict(check) for check in checks]}))
     else:
         say(check_page(checks))
     if contradictions(checks):

@@ -13,7 +13,7 @@ from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import Drawn
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.paper import Sheet, to_base
-from brushloop.collect.rig.picture import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
+from brushloop.collect.rig.show import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
 from brushloop.collect.touch.selfcheck import partners
 
 MOST_SHEETS = 11
@@ -21,7 +21,7 @@ MOST_SHEETS = 11
 
 
 def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
-    """Write the picture, in the format of the file's ending. `collect.rig.picture.check_picture` must have passed.
+    """Write the picture, in the format of the file's ending. `collect.rig.show.check_picture` must have passed.
 
     Raises OSError if it cannot be written.
     """

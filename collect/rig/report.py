@@ -10,22 +10,24 @@
 
 from __future__ import annotations
 
+import getpass
 import importlib.metadata
 import json
 import os
 import platform
 import re
+import socket
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.check import check_rig
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.doctor import Finding
-from brushloop.collect.rig.scrub import Scrubber, numbers_only, scrubber_of
-from brushloop.drivers.arcs.survey import Exchange, rtde_answers, survey
+from brushloop.drivers.arcs.survey import rtde_answers, survey
 from brushloop.drivers.arcs.wire import Framing
 
 FORMAT = 1
@@ -38,6 +40,87 @@ rtde.json    what the controller's telemetry offers, if it is configured
 Taken out: names of hosts and users, addresses, paths, URLs, values of environment variables, every text of rig.toml.
 There are no photographs in it.
 """
+SHORTEST = 3
+"""A shorter name would be found within ordinary words."""
+PATTERNS = (
+    (re.compile(r"\b[a-z][a-z0-9+.-]*://\S+", re.IGNORECASE), "<url>"),
+    (re.compile(r"\S+@[\w-]+(\.[\w-]+)+"), "<e-mail>"),
+    (re.compile(r"\b(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}\b", re.IGNORECASE), "<address>"),
+    (re.compile(r"\b\d{1,3}(?:\.\d{1,3}){3}\b"), "<address>"),
+    (re.compile(r"(?<![\w.])(?:[0-9a-f]{0,4}:){3,7}[0-9a-f]{0,4}(?![\w.])", re.IGNORECASE), "<address>"),
+    (re.compile(r"(?<![\w<>/])(?:~|/)[\w.~+-]*/[^\s'\",;]+"), "<path>"),
+    (re.compile(r"\b[A-Za-z]:\\[^\s'\",;]+"), "<path>"),
+)
+KEPT = frozenset({"kind", "interface", "framing", "dictionary", "method"})
+"""Fields of `rig.toml` whose text is one of a few fixed words; all other text in it is left out."""
+
+
+class Scrubber:
+    """Replaces what identifies a person or a network: reports are sent to people outside the lab."""
+
+    def __init__(self, known: Mapping[str, str]) -> None:
+        """`known` are names of this rig, and what stands for each."""
+        names = {value: "<environment>" for name, value in os.environ.items() if name.upper().startswith(PREFIX)}
+        names |= known
+        names |= {
+            socket.gethostname(): "<host>",
+            socket.getfqdn(): "<host>",
+            _user(): "<user>",
+            str(Path.home()): "<path>",
+            str(Path.cwd()): "<path>",
+        }
+        self._names = sorted(((k, v) for k, v in names.items() if len(k) >= SHORTEST), key=lambda pair: -len(pair[0]))
+
+    def text(self, text: str) -> str:
+        """The text with all of these replaced."""
+        for name, stands_for in self._names:
+            text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", stands_for, text)
+        for pattern, stands_for in PATTERNS:
+            text = pattern.sub(stands_for, text)
+        return text
+
+    def value(self, value: Any) -> Any:
+        """The same for every text in a JSON value."""
+        match value:
+            case str():
+                return self.text(value)
+            case dict():
+                return {key: self.value(inner) for key, inner in cast("dict[str, Any]", value).items()}
+            case list() | tuple():
+                return [self.value(inner) for inner in cast("list[Any]", value)]
+            case _:
+                return value
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a process whose user has no name
+        return ""
+
+
+def scrubber_of(config: RigConfig) -> Scrubber:
+    """A scrubber that knows the names in `rig.toml`."""
+    force, device = config.force, config.ink.device
+    names = {config.robot.host: "<host>", config.camera.source: "<camera>"}
+    names |= {force.host or "": "<host>"} if force is not None else {}
+    names |= {device.port: "<port>"} if device is not None else {}
+    return Scrubber(names)
+
+
+def numbers_only(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A table of `rig.toml` without its texts, which may name anything."""
+
+    def kept(name: str, value: Any) -> Any:
+        match value:
+            case str() if name not in KEPT:
+                return "<text>"
+            case dict():
+                return numbers_only(cast("dict[str, Any]", value))
+            case _:
+                return value
+
+    return {name: kept(name, value) for name, value in table.items()}
 
 
 def check_report(path: Path) -> None:
@@ -56,46 +139,30 @@ async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -
     Raises OSError if it cannot be written.
     """
     robot, scrubber = config.robot, scrubber_of(config)
-    files = {
-        "report.json": json.dumps(_report(config, findings, scrubber), indent=2),
-        "arcs.jsonl": await transcript(robot.host, robot.port, robot.framing, scrubber),
+    known = {
+        "framing": robot.framing,
+        "findings": scrubber.value([finding.as_json() for finding in findings]),
+        "rig": numbers_only(config.model_dump(mode="json")),
+        "checks": scrubber.value([asdict(check) for check in check_rig(config)]),
     }
+    files = {"arcs.jsonl": await transcript(robot.host, robot.port, robot.framing, scrubber)}
     if robot.rtde_port is not None:
         answers = await rtde_answers(robot.host, robot.rtde_port)
         files["rtde.json"] = json.dumps(scrubber.value(answers), indent=2)
-    write_archive(path, files)
-
-
-def write_archive(path: Path, files: dict[str, str]) -> None:
-    """Write these files, and a README that describes them. Raises OSError."""
-    with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in {"README.txt": ABOUT, **files}.items():
-            archive.writestr(name, text)
+    write_archive(path, known, files)
 
 
 async def transcript(host: str, port: int, framing: Framing, scrubber: Scrubber) -> str:
     """Every question to the controller and its answer, one JSON object a line, without names."""
-    exchanges = await survey(host, port, framing)
-    return "".join(json.dumps(scrubber.value(_line(exchange))) + "\n" for exchange in exchanges)
+    lines = [
+        asdict(exchange) | {"took_ms": round(exchange.took_ms, 3)} for exchange in await survey(host, port, framing)
+    ]
+    return "".join(json.dumps(scrubber.value(line)) + "\n" for line in lines)
 
 
-def _line(exchange: Exchange) -> dict[str, Any]:
-    return asdict(exchange) | {"took_ms": round(exchange.took_ms, 3)}
-
-
-def _report(config: RigConfig, findings: list[Finding], scrubber: Scrubber) -> dict[str, Any]:
-    return {
-        **about_this_machine(),
-        "framing": config.robot.framing,
-        "findings": scrubber.value([finding.as_json() for finding in findings]),
-        "rig": numbers_only(config.model_dump(mode="json")),
-        "checks": scrubber.value([check.as_json() for check in check_rig(config)]),
-    }
-
-
-def about_this_machine() -> dict[str, Any]:
-    """What every report begins with: its format, versions and the platform."""
-    return {
+def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> None:
+    """Write `report.json` with what is `known`, a README and these files. Raises OSError."""
+    report = {
         "format": FORMAT,
         "versions": _versions(),
         "platform": {
@@ -105,14 +172,18 @@ def about_this_machine() -> dict[str, Any]:
             "python": platform.python_version(),
             "cores": os.cpu_count(),
         },
+        **known,
     }
+    texts = {"README.txt": ABOUT, "report.json": json.dumps(report, indent=2), **files}
+    with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in texts.items():
+            archive.writestr(name, text)
 
 
 def _versions() -> dict[str, str]:
     """Versions of brushloop and of its libraries."""
-    named = ["brushloop", *(importlib.metadata.requires("brushloop") or ())]
     found: dict[str, str] = {}
-    for requirement in named:
+    for requirement in ("brushloop", *(importlib.metadata.requires("brushloop") or ())):
         name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
         try:
             found[name] = importlib.metadata.version(name)

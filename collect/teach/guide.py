@@ -40,20 +40,64 @@ class Target:
     """Which one, from 0: direction of the pin, turn of the wrist of an upright brush, pose of a held board."""
     corner: str = ""
     """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
-    may_jog: bool = False
-    """Whether the tip may also be brought there by keys: the arm was armed."""
-    may_skip: bool = False
-    """Whether the step can go on without it, or can say what to do where it is out of reach."""
 
 
 class Brought(StrEnum):
-    """How a person answered a request."""
+    """How a person answered a request to bring the tip to a thing."""
 
     DONE = "done"
     SKIP = "skip"
-    """Go on without it; only where the target may be skipped."""
+    """Go on without it; only where the question allows it."""
     JOG = "jog"
-    """Bring it there by keys; only where the target may be jogged to."""
+    """Bring it there by keys; only where the question allows it."""
+
+
+@dataclass(frozen=True, slots=True)
+class JogView:
+    """Where the tip is while a person jogs it by keys."""
+
+    moved_mm: tuple[float, float, float]
+    """From where the jog began, along the axes of the base frame."""
+    steps_mm: tuple[float, ...]
+    """Sizes of a step that are allowed, smallest first."""
+    refused: str = ""
+    """Why the last step was not made; empty if it was."""
+
+
+@dataclass(frozen=True, slots=True)
+class JogStep:
+    """One step along an axis of the base frame."""
+
+    axis: Literal["x", "y", "z"]
+    mm: float
+
+
+Answer = str | float | Brought | JogStep
+"""Key of a choice or a line of text, a number, how a thing was brought, or a step of a jog (DONE ends it)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question that a step waits for."""
+
+    kind: Literal["choose", "number", "text", "bring", "jog"]
+    text: str
+    choices: tuple[Choice, ...] = ()
+    default: str = ""
+    """Key of a choice, or what an empty line stands for; empty if an empty line is no answer."""
+    unit: str = ""
+    low: float = 0.0
+    high: float = 0.0
+    """Range of a number."""
+    target: Target | None = None
+    """What the tip is to be brought to."""
+    may_jog: bool = False
+    """Whether it may also be brought there by keys: the arm was armed."""
+    may_skip: bool = False
+    """Whether the step can go on without it, or can say what to do where it is out of reach."""
+    jog: JogView | None = None
+    number: int = 0
+    """From 1, set by a screen: an answer to an older question is dropped."""
 
 
 Tone = Literal["finding", "warning", "trouble", "progress"]
@@ -84,27 +128,6 @@ class StepState:
     """What was taught, in a few words."""
 
 
-@dataclass(frozen=True, slots=True)
-class JogView:
-    """Where the tip is while a person jogs it by keys."""
-
-    question: str
-    moved_mm: tuple[float, float, float]
-    """From where the jog began, along the axes of the base frame."""
-    steps_mm: tuple[float, ...]
-    """Sizes of a step that are allowed, smallest first."""
-    refused: str = ""
-    """Why the last step was not made; empty if it was."""
-
-
-@dataclass(frozen=True, slots=True)
-class JogStep:
-    """One step along an axis of the base frame."""
-
-    axis: Literal["x", "y", "z"]
-    mm: float
-
-
 def number_in(line: str, unit: str, low: float, high: float) -> float:
     """The number that a person typed, with a point or a comma. Raises ValueError, worded for that person."""
     try:
@@ -125,7 +148,7 @@ class WentBack(Exception):
 
 
 class Guide(Protocol):
-    """A person at the rig. Every question may raise `WentBack` and `LeftOff`."""
+    """A person at the rig."""
 
     async def overview(self, steps: tuple[StepState, ...]) -> None:
         """Show which steps are taught and which one is current; called whenever that changes."""
@@ -135,22 +158,6 @@ class Guide(Protocol):
         """Show a finding."""
         ...
 
-    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        """The key of one of the choices; `default` is taken for an empty answer, which is none if it is empty."""
-        ...
-
-    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
-        """A number in [low, high]; `default` is taken for an empty answer, None allows no empty answer."""
-        ...
-
-    async def text(self, question: str, default: str) -> str:
-        """A line of text; `default` is taken for an empty answer."""
-        ...
-
-    async def bring(self, target: Target, how: str) -> Brought:
-        """Ask for the tip to be guided to a thing by hand, and wait until the person says that it is there."""
-        ...
-
-    async def jog(self, view: JogView) -> JogStep | Brought:
-        """The next step by key, or DONE where the tip is at its place. The caller checks the step and moves the arm."""
+    async def ask(self, question: Question) -> Answer:
+        """Wait for the answer, which is one that the question allows. Raises `WentBack` and `LeftOff`."""
         ...

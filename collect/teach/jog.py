@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.devices import sole_driver
-from brushloop.collect.teach.arm_reader import ArmReader
+from brushloop.collect.teach.arm import ArmReader, tip_of
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Brought, JogStep, JogView, Target, TargetKind, WentBack
-from brushloop.collect.teach.maths.tip import tip_of
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, Question, Target, TargetKind, WentBack
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
 from brushloop.drivers.devices import Pose, Robot
@@ -38,21 +37,22 @@ JOGGED: frozenset[TargetKind] = frozenset(
 """Places to which the last millimetres may be jogged."""
 
 
-async def touch(day: Day, reader: ArmReader, target: Target, how: str, name: str) -> Pose | None:
+async def touch(
+    day: Day, reader: ArmReader, target: Target, how: str, name: str, *, may_skip: bool = False
+) -> Pose | None:
     """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
 
     A thing that was touched before is not asked for again. The person may jog to it where the arm is armed.
     """
     if name in day.notebook.touches:
         return day.notebook.touches[name].pose()
-    target = replace(target, may_jog=day.armed and target.kind in JOGGED)
-    brought = await day.guide.bring(target, how)
-    while brought is Brought.JOG:
-        if not target.may_jog:
+    may_jog = day.armed and target.kind in JOGGED
+    question = Question("bring", how, target=target, may_jog=may_jog, may_skip=may_skip)
+    while (brought := await day.ask(question)) is Brought.JOG:
+        if not may_jog:
             await day.say("Nothing is moved without --arm: guide the arm by hand.", tone="warning")
         elif await jogged(day, how):
             break
-        brought = await day.guide.bring(target, how)
     if brought is Brought.SKIP:
         return None
     flange = await reader.flange()
@@ -77,10 +77,10 @@ async def jogged(day: Day, what: str) -> bool:
             here = await robot.where()
             x, y, z = (now - then for now, then in zip(here.position_mm, began.position_mm, strict=True))
             try:
-                answer = await day.guide.jog(JogView(what, (x, y, z), STEPS_MM, refused))
+                answer = await day.guide.ask(Question("jog", what, jog=JogView((x, y, z), STEPS_MM, refused)))
             except WentBack:
                 return False
-            if isinstance(answer, Brought):
+            if not isinstance(answer, JogStep):
                 return True
             refused = await _step(robot, answer)
 
@@ -105,7 +105,11 @@ async def _enabled(day: Day) -> AsyncGenerator[Robot]:
     host, port = str(book.get("robot.host")), int(book.number("robot.port"))
     async with day.arm() as reader:
         flange, cabinet = await reader.flange(), await reader.tool()
-    tool = taught_tool(book) or _as_set(cabinet)
+    x, y, z, rx, ry, rz = cabinet
+    tool: Tool = (1e3 * x, 1e3 * y, 1e3 * z), (math.degrees(rx), math.degrees(ry), math.degrees(rz))
+    if "robot.tcp_offset_mm" in book.values:
+        (x, y, z), (rx, ry, rz) = book.numbers("robot.tcp_offset_mm"), book.numbers("robot.tcp_rotation_deg")
+        tool = (x, y, z), (rx, ry, rz)
     options = ArcsOptions(host, port, *tool, framing=book.framing)
     robot = AuboArcs(options, limits_so_far(book, flange, tool), day.clock)
     with sole_driver(host, port):
@@ -116,20 +120,6 @@ async def _enabled(day: Day) -> AsyncGenerator[Robot]:
             yield robot
         finally:
             await robot.close()
-
-
-def taught_tool(book: Notebook) -> Tool | None:
-    """The tool as it was taught; None before that."""
-    if "robot.tcp_offset_mm" not in book.values:
-        return None
-    x, y, z = book.numbers("robot.tcp_offset_mm")
-    rx, ry, rz = book.numbers("robot.tcp_rotation_deg")
-    return (x, y, z), (rx, ry, rz)
-
-
-def _as_set(wire: Sequence[float]) -> Tool:
-    x, y, z, rx, ry, rz = wire
-    return (1e3 * x, 1e3 * y, 1e3 * z), (math.degrees(rx), math.degrees(ry), math.degrees(rz))
 
 
 def limits_so_far(book: Notebook, flange: Pose, tool: Tool) -> Limits:

@@ -1,4 +1,4 @@
-"""What has been taught so far: one file beside the future `rig.toml`, written whole after each value.
+"""What has been taught so far: one file beside the future `rig.toml`, written whole after each value; and `rig.toml`.
 
 It holds what was observed (where the flange stood at each thing) and what was found from it, so that a session that
 was interrupted asks nothing again, and a value that depends on others is computed again when they change.
@@ -6,25 +6,29 @@ was interrupted asks nothing again, and a value that depends on others is comput
 
 from __future__ import annotations
 
+import json
+import textwrap
+from collections import defaultdict
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, ValidationError
 
+from brushloop.calibrate.files import replacing, write_whole
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.check import Check, unmeasured
+from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
+from brushloop.collect.rig.optics import with_optics
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.disk import fsync_folder, sync
 
 MAX_BYTES = 1024 * 1024
-ENDING = ".taught.json"
-
-Plain = bool | int | float | str
-Value = Plain | list[Finite] | list[list[Finite]]
+ENDING, ASIDE = ".taught.json", "aside."
+Value = bool | int | float | str | list[Finite] | list[list[Finite]]
 """What a field of `rig.toml` can hold."""
 FieldName = Annotated[str, Field(min_length=3, max_length=100, pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)*$")]
 ThingName = Annotated[str, Field(max_length=60)]
@@ -33,6 +37,13 @@ StepName = Literal["arm", "camera", "tip", "sheet", "places", "brush", "force", 
 STEPS: tuple[StepName, ...] = get_args(StepName)
 UNKNOWN = "not "
 """Beginning of the text for a value that was taken over without a measurement."""
+HEAD = "# Made by `brushloop rig new`. Each value: how it was obtained, how well it is known, when."
+UNPROVEN = "# NOT PROVEN: `brushloop rig teach proof --arm` has not been run since the last value was taught."
+PROVEN = "# Proven by a dry run, a touch, the self-check and a judged press"
+UNTRIED = """\
+# The software that wrote this file has never been tried on a real cabinet. A difference would show in:
+#   framing, ports, modes: step 1 of `brushloop rig new`; flange poses: the residuals of step 3;
+#   speeds and stops: the dry run of the last step; forces: the push in the step of the brush."""
 
 
 class Taught(Config):
@@ -56,6 +67,13 @@ class Taught(Config):
         return f"{self.how}{error}{'; ' if self.known else ''}{self.known} ({self.at})"
 
 
+def taught(
+    step: StepName, value: Value, how: str, unit: str = "", *, sigma: float | None = None, known: str = ""
+) -> Taught:
+    """A value of now."""
+    return Taught(value=value, unit=unit, how=how, sigma=sigma, known=known, at=now_utc(), step=step)
+
+
 class Touch(Config):
     """Pose of the flange in the base frame while the tip was at a thing, and when."""
 
@@ -66,6 +84,16 @@ class Touch(Config):
     def pose(self) -> Pose:
         """The flange."""
         return Pose(*self.position_mm, *self.quaternion)
+
+
+def touch_of(pose: Pose) -> Touch:
+    """The pose of the flange as a touch of now."""
+    return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion, at=now_utc())
+
+
+def now_utc() -> str:
+    """The current time in UTC as text, to the second, as the notebook keeps it."""
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 class Notebook(Config):
@@ -79,42 +107,15 @@ class Notebook(Config):
     done: dict[StepName, str] = Field(default_factory=dict[StepName, str])
     """Steps that were finished, and when."""
 
-    def with_values(self, values: dict[str, Taught]) -> Notebook:
-        """The same with these values; others stay."""
-        return self.model_copy(update={"values": {**self.values, **values}})
-
-    def with_touch(self, name: str, touch: Touch) -> Notebook:
-        """The same with one more touch, or another one in its place."""
-        return self.model_copy(update={"touches": {**self.touches, name: touch}})
-
     @property
     def framing(self) -> Framing:
         """Framing that the controller answered; `sof` until that is known."""
         return "bare" if self.get("robot.framing") == "bare" else "sof"
 
-    def without(self, *beginnings: str) -> Notebook:
-        """The same without the values whose paths begin like this."""
-        kept = {field: taught for field, taught in self.values.items() if not field.startswith(beginnings)}
-        return self.model_copy(update={"values": kept})
-
-    def without_touches(self, *things: str) -> Notebook:
-        """The same without what was touched of these kinds, such as `pin`, or of these names, such as `pin 0`."""
-        kept = {n: touch for n, touch in self.touches.items() if n not in things and n.split(" ")[0] not in things}
-        return self.model_copy(update={"touches": kept})
-
-    def finished(self, step: StepName, *, reopens: tuple[StepName, ...] = ()) -> Notebook:
-        """The same with this step done, and others to be done again."""
-        done = {name: at for name, at in self.done.items() if name not in reopens}
-        return self.model_copy(update={"done": {**done, step: now_utc()}})
-
-    def reopened(self, step: StepName) -> Notebook:
-        """The same with this step to be done again."""
-        return self.model_copy(update={"done": {name: at for name, at in self.done.items() if name != step}})
-
     def get(self, field: str) -> Value | None:
         """The value of a field; None where it was not taught."""
-        taught = self.values.get(field)
-        return None if taught is None else taught.value
+        known = self.values.get(field)
+        return None if known is None else known.value
 
     def number(self, field: str) -> float:
         """A value that is one number. Raises KeyError where it was not taught."""
@@ -128,9 +129,37 @@ class Notebook(Config):
         assert isinstance(value, list)
         return tuple(float(v) for v in value if not isinstance(v, list))
 
+    def table(self, beginning: str) -> dict[str, Value]:
+        """The values whose paths begin like this, by the rest of their paths."""
+        return {name.removeprefix(beginning): t.value for name, t in self.values.items() if name.startswith(beginning)}
+
     def touched(self, kind: str) -> dict[str, Pose]:
         """Everything touched of one kind, by the rest of its name, in the order in which it was touched."""
         return {name[len(kind) + 1 :]: t.pose() for name, t in self.touches.items() if name.split(" ")[0] == kind}
+
+    def with_values(self, values: dict[str, Taught]) -> Notebook:
+        """The same with these values; others stay."""
+        return self.model_copy(update={"values": {**self.values, **values}})
+
+    def with_touch(self, name: str, touch: Touch) -> Notebook:
+        """The same with one more touch, or another one in its place."""
+        return self.model_copy(update={"touches": {**self.touches, name: touch}})
+
+    def without(self, *names: str) -> Notebook:
+        """The same without the values whose paths begin like this, and without what was touched of these kinds, such
+        as `pin`, or of these names, such as `pin 0`."""
+        values = {field: known for field, known in self.values.items() if not field.startswith(names)}
+        touches = {n: touch for n, touch in self.touches.items() if n not in names and n.split(" ")[0] not in names}
+        return self.model_copy(update={"values": values, "touches": touches})
+
+    def finished(self, step: StepName) -> Notebook:
+        """The same with this step done. Only the proof proves what it rests on: after another step it is done again."""
+        done = {name: at for name, at in self.done.items() if name != "proof"}
+        return self.model_copy(update={"done": {**done, step: now_utc()}})
+
+    def reopened(self, step: StepName) -> Notebook:
+        """The same with this step to be done again."""
+        return self.model_copy(update={"done": {name: at for name, at in self.done.items() if name != step}})
 
 
 class TaughtFile:
@@ -149,29 +178,17 @@ class TaughtFile:
             raise refusal(self.path, error, Notebook) from None
 
     def save(self, notebook: Notebook) -> None:
-        """Write the whole file beside the old one, wait for the disk, then take its place. Raises `ConfigError`."""
+        """Replace the whole file, safe against a loss of power. Raises `ConfigError`."""
         text = notebook.model_dump_json(indent=1)
         if len(text) > MAX_BYTES:
             raise ConfigError(self.path, "", f"would be larger than {MAX_BYTES} bytes")
-        part = self.path.with_name(self.path.name + ".part")
         try:
-            with part.open("w", encoding="utf-8") as file:
+            with replacing(self.path) as part, part.open("w", encoding="utf-8") as file:
                 file.write(text)
                 sync(file)
-            part.replace(self.path)
             fsync_folder(self.path.absolute().parent)
         except OSError as error:
             raise ConfigError(self.path, "", error.strerror or str(error)) from None
-
-
-def now_utc() -> str:
-    """The current time in UTC as text, to the second, as the notebook keeps it."""
-    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-
-
-def touch_of(pose: Pose) -> Touch:
-    """The pose of the flange as a touch, with the current time."""
-    return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion, at=now_utc())
 
 
 def gaps(notebook: Notebook) -> Iterator[Check]:
@@ -182,6 +199,67 @@ def gaps(notebook: Notebook) -> Iterator[Check]:
         if step not in notebook.done:
             arm = " --arm" if step == "proof" else ""
             yield unmeasured(f"step {step}", "not done since something was taught", f"brushloop rig teach {step}{arm}")
-    for field, taught in notebook.values.items():
-        if taught.known.startswith(UNKNOWN) and not field.startswith("aside."):
-            yield unmeasured(field, f"{taught.value} {taught.unit}".rstrip(), f"{taught.how}, {taught.known}")
+    for field, known in notebook.values.items():
+        if known.known.startswith(UNKNOWN) and not field.startswith(ASIDE):
+            yield unmeasured(field, f"{known.value} {known.unit}".rstrip(), f"{known.how}, {known.known}")
+
+
+def rig_of(notebook: Notebook, rig_path: Path) -> RigConfig:
+    """The configuration that the notebook gives, without overrides from the environment. Raises `ConfigError`."""
+    tables: dict[str, Any] = {}
+    for field, value in _fields(notebook, rig_path).items():
+        *above, name = field.split(".")
+        table = tables
+        for part in above:
+            table = table.setdefault(part, {})
+        table[name] = _rounded(value)
+    try:
+        rig = RigConfig.model_validate(tables)
+    except ValidationError as error:
+        raise refusal(rig_path, error, RigConfig) from None
+    return rig.model_copy(update={"camera": with_optics(rig_path, rig.camera)})
+
+
+def rig_text(notebook: Notebook, rig_path: Path) -> str:
+    """`rig.toml`: every value with how it was obtained, how well it is known, and when."""
+    proven = notebook.done.get("proof")
+    lines = [HEAD, UNPROVEN if proven is None else f"{PROVEN}, {proven}.", *UNTRIED.splitlines()]
+    tables = defaultdict[str, list[str]](list)
+    for field, value in _fields(notebook, rig_path).items():
+        table, _, name = field.rpartition(".")
+        if (known := notebook.values.get(field)) is not None:
+            tables[table] += [f"# {line}" for line in textwrap.wrap(known.comment().replace("\n", " "), 116)]
+        # TOML writes numbers, strings, lists and booleans as JSON does.
+        tables[table].append(f"{name} = {json.dumps(_rounded(value), ensure_ascii=False)}")
+    for table in sorted(tables, key=lambda name: (name != "", name.split(".")[0] != "robot", name)):
+        lines += ["", *([f"[{table}]"] if table else []), *tables[table]]
+    return "\n".join(lines) + "\n"
+
+
+def write_rig(rig_path: Path, notebook: Notebook) -> tuple[Path, Path | None]:
+    """Write `rig.toml`; returns its path, and that of the old file, which is kept. Raises `ConfigError`, OSError."""
+    rig_of(notebook, rig_path)
+    text, kept = rig_text(notebook, rig_path), None
+    if rig_path.exists():
+        old = rig_path.read_text(encoding="utf-8")
+        if old == text:
+            return rig_path, None
+        names = (f"{rig_path.name}.bak{number}" for number in ("", *(f"-{n}" for n in range(2, 10_000))))
+        kept = next(path for name in names if not (path := rig_path.with_name(name)).exists())
+        with kept.open("x", encoding="utf-8") as file:
+            file.write(old)
+    write_whole(rig_path, text)
+    return rig_path, kept
+
+
+def _fields(notebook: Notebook, rig_path: Path) -> dict[str, Value]:
+    """Every field of `rig.toml` by its path; values without a table come first."""
+    kept = {field: known.value for field, known in notebook.values.items() if not field.startswith(ASIDE)}
+    return {"name": rig_path.stem, "paper.name": "Xuan paper", **kept}
+
+
+def _rounded(value: Value) -> Any:
+    """Round a value for the file: no value is known better than 0.001 mm or 0.0001 deg."""
+    if isinstance(value, list):
+        return [_rounded(v) for v in value]
+    return round(value, 4) + 0.0 if isinstance(value, float) else value

@@ -7,10 +7,10 @@ import contextlib
 from collections.abc import AsyncGenerator, Awaitable, Callable
 
 from brushloop.collect.rig.optics import gray
-from brushloop.collect.teach.cameras import taught_camera
+from brushloop.collect.teach.arm import tip_of
+from brushloop.collect.teach.camera import taught_camera
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Picture
-from brushloop.collect.teach.maths.tip import tip_of
 from brushloop.drivers.devices import Pose, Stamp
 from brushloop.drivers.errors import DeviceError
 

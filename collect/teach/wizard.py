@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach, CollectAborted, ConfigError, StepError
 from brushloop.collect.operator import Choice
+from brushloop.collect.teach.brush import BrushStep
+from brushloop.collect.teach.camera import CameraStep
 from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.guide import LeftOff, StepState, WentBack
-from brushloop.collect.teach.rig_text import write_rig
-from brushloop.collect.teach.steps import all_steps
-from brushloop.collect.teach.store import Notebook, StepName, Value
+from brushloop.collect.teach.find_arm import ArmStep
+from brushloop.collect.teach.force import ForceStep
+from brushloop.collect.teach.guide import LeftOff, Question, StepState, WentBack
+from brushloop.collect.teach.places import LimitsStep, PlacesStep
+from brushloop.collect.teach.proof import ProofStep
+from brushloop.collect.teach.sheet import SheetStep
+from brushloop.collect.teach.store import Notebook, Value, write_rig
+from brushloop.collect.teach.tip import TipStep
 from brushloop.drivers.errors import DeviceError
 
+STEPS = (
+    ArmStep(),
+    CameraStep(),
+    TipStep(),
+    SheetStep(),
+    PlacesStep(),
+    BrushStep(),
+    ForceStep(),
+    LimitsStep(),
+    ProofStep(),
+)
 AGAIN, LEAVE = Choice("a", "try this step again, where it was"), Choice("q", "stop here; what was taught is kept")
 AFRESH, EARLIER = Choice("f", "teach this step from its beginning"), Choice("b", "teach the step before it again")
 STOPPED = "stopped; the same command resumes from there"
-SAME = 1e-6
 Refused = CannotTeach | DeviceError | CalibrationError | StepError | ConfigError
 
 
 class Wizard:
     """Leads a person through the steps."""
 
-    def __init__(self, day: Day, steps: Sequence[Step] | None = None) -> None:
+    def __init__(self, day: Day, steps: Sequence[Step] = STEPS) -> None:
         self._day = day
-        self._steps = tuple(all_steps() if steps is None else steps)
+        self._steps = tuple(steps)
 
     async def run(self) -> Path:
         """Teach every step that is not done, then write `rig.toml`; returns its path.
@@ -36,10 +51,13 @@ class Wizard:
         It is written before the proof too, and says then that it is not proven. Raises `CollectAborted` where the
         person stops: the same command resumes from there.
         """
-        while (step := self._open()) is not None:
+        while (
+            step := next((step for step in self._steps if step.name not in self._day.notebook.done), None)
+        ) is not None:
             if step.name == "proof":
                 await self._written()
-            await self._attempt(step, self._before(step))
+            number = self._steps.index(step)
+            await self._attempt(step, self._steps[number - 1] if number else None)
         await self._overview(None)
         return await self._written()
 
@@ -48,31 +66,24 @@ class Wizard:
 
         Raises `ConfigError` for an unknown name, otherwise as `run` does.
         """
-        step = next((one for one in self._steps if one.name == name), None)
+        step = next((step for step in self._steps if step.name == name), None)
         if step is None:
-            raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(one.name for one in self._steps)}")
+            raise ConfigError("STEP", "", f"{name!r} is not one of {', '.join(step.name for step in self._steps)}")
         missing = [need for need in step.needs if need not in self._day.notebook.done]
         if missing:
             raise CollectAborted(
                 f"`{name}` depends on {', '.join(missing)}, which is not taught yet: `brushloop rig new` resumes there"
             )
-        self._day.guide.mark()
-        self._day.save(step.forget(self._day.notebook).reopened(step.name))
+        self._forget(step)
         while step.name not in self._day.notebook.done:
             await self._attempt(step, None)
-        rest = [one.name for one in self._steps if one.name not in self._day.notebook.done]
-        if rest and rest != ["proof"]:
-            return None
-        return await self._written()
+        open_steps = [step.name for step in self._steps if step.name not in self._day.notebook.done]
+        return await self._written() if open_steps in ([], ["proof"]) else None
 
-    def _open(self) -> Step | None:
-        """The first step that is not done."""
-        return next((step for step in self._steps if step.name not in self._day.notebook.done), None)
-
-    def _before(self, step: Step) -> Step | None:
-        """The step before this one."""
-        number = self._steps.index(step)
-        return self._steps[number - 1] if number else None
+    def _forget(self, step: Step) -> None:
+        """Forget what a step observed; going back undoes that."""
+        self._day.mark()
+        self._day.save(self._day.notebook.without(*step.observes).reopened(step.name))
 
     async def _attempt(self, step: Step, earlier: Step | None) -> None:
         """Teach a step once. Where the person goes back, or where it fails, the notebook says what comes next.
@@ -96,72 +107,54 @@ class Wizard:
         await self._ask_how(step, earlier)
 
     async def _ask_how(self, step: Step, earlier: Step | None) -> None:
-        """Ask how to go on with a step that could not be finished."""
-        day, choices = self._day, (AGAIN, AFRESH, *((EARLIER,) if earlier is not None else ()), LEAVE)
+        choices = (AGAIN, AFRESH, *((EARLIER,) if earlier is not None else ()), LEAVE)
+        question = Question("choose", "How do you want to go on?", choices, AGAIN.key)
         try:
-            answer = await day.person.choose("How do you want to go on?", choices, AGAIN.key)
+            answer = await self._day.guide.ask(question)
         except LeftOff:
             answer = LEAVE.key
         except WentBack:
-            day.back()
+            self._day.back()
             return
         if answer == LEAVE.key:
             raise CollectAborted(STOPPED)
-        day.guide.settle()
         if answer != AGAIN.key:
-            day.guide.mark()
-            one = earlier if answer == EARLIER.key and earlier is not None else step
-            day.save(one.forget(day.notebook).reopened(one.name))
+            self._forget(earlier if answer == EARLIER.key and earlier is not None else step)
 
     async def _derive(self, step: Step, before: Notebook) -> None:
         """Finish a step: compute again what depends on it, list what changed, and void an earlier proof."""
-        notebook = self._day.notebook
-        dependent = self._resting_on(step.name)
-        for one in self._steps:
-            if one.name == step.name or (one.name in dependent and one.name in notebook.done):
-                notebook = notebook.with_values(one.derived(notebook))
-        reopened: tuple[StepName, ...] = ("proof",) if step.name != "proof" else ()
-        self._day.save(notebook.finished(step.name, reopens=reopened))
+        notebook, resting = self._day.notebook, {step.name}
+        for other in self._steps:
+            if resting & set(other.needs):
+                resting.add(other.name)
+            if other.name == step.name or (other.name in resting and other.name in notebook.done):
+                notebook = notebook.with_values(other.derived(notebook))
+        self._day.save(notebook.finished(step.name))
         changed = [
             f"{field}: {_shown(old.value)} -> {_shown(new.value)}"
             for field, new in notebook.values.items()
             if new.step != step.name
             and (old := before.values.get(field)) is not None
-            and not _same(old.value, new.value)
+            and _shown(old.value) != _shown(new.value)
         ]
         if changed:
             await self._day.say("Changed with it, because it depends on this step:", *changed)
         await self._day.say(f"{step.title}: {step.summary(notebook)}")
 
-    def _resting_on(self, name: StepName) -> set[StepName]:
-        found: set[StepName] = {name}
-        for step in self._steps:
-            if found & set(step.needs):
-                found.add(step.name)
-        return found - {name}
-
     async def _written(self) -> Path:
         path, kept = write_rig(self._day.rig_path, self._day.notebook)
-        await self._day.say(
-            f"{path}: written, with how each value was obtained"
-            + (f"; as it was before: {kept}" if kept is not None else "")
-        )
+        before = "" if kept is None else f"; as it was before: {kept}"
+        await self._day.say(f"{path}: written, with how each value was obtained{before}")
         return path
 
-    async def _overview(self, current: StepName | None) -> None:
-        done = self._day.notebook.done
-        await self._day.guide.overview(
-            tuple(
-                StepState(
-                    step.name,
-                    step.title,
-                    step.minutes,
-                    "current" if step.name == current else "taught" if step.name in done else "open",
-                    step.summary(self._day.notebook) if step.name in done else "",
-                )
-                for step in self._steps
-            )
-        )
+    async def _overview(self, current: str | None) -> None:
+        notebook, lines = self._day.notebook, list[StepState]()
+        for step in self._steps:
+            taught = step.name in notebook.done
+            state = "current" if step.name == current else "taught" if taught else "open"
+            summary = step.summary(notebook) if taught else ""
+            lines.append(StepState(step.name, step.title, step.minutes, state, summary))
+        await self._day.guide.overview(tuple(lines))
 
 
 def _in_lines(error: Refused) -> tuple[str, ...]:
@@ -174,14 +167,6 @@ def _in_lines(error: Refused) -> tuple[str, ...]:
             return " ".join(filter(None, state)), error.remedy or "Check power, cable and address."
         case _:
             return (str(error),)
-
-
-def _same(old: Value, new: Value) -> bool:
-    if isinstance(old, list) and isinstance(new, list):
-        return len(old) == len(new) and all(_same(a, b) for a, b in zip(old, new, strict=True))
-    if isinstance(old, int | float) and isinstance(new, int | float):
-        return math.isclose(old, new, abs_tol=SAME)
-    return old == new
 
 
 def _shown(value: Value) -> str:

@@ -9,56 +9,14 @@ import time
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.operator import Choice
-from brushloop.collect.teach.guide import (
-    Brought,
-    JogStep,
-    JogView,
-    LeftOff,
-    Picture,
-    Shown,
-    StepState,
-    Target,
-    WentBack,
-)
+from brushloop.collect.teach.guide import Answer, LeftOff, Picture, Question, Shown, StepState, WentBack
 from brushloop.drivers.devices import Pose
 
-Kind = Literal["choose", "number", "text", "bring", "jog"]
-Answer = str | float | Brought | JogStep
 MOST_FINDINGS = 200
 """Findings that can be scrolled back to."""
-
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """A question that the steps wait for."""
-
-    number: int
-    """From 1; an answer to an older question is dropped."""
-    kind: Kind
-    text: str
-    choices: tuple[Choice, ...] = ()
-    default: str = ""
-    """Key of a choice, or what an empty line stands for; empty if an empty line is no answer."""
-    unit: str = ""
-    low: float = 0.0
-    high: float = 0.0
-    jog: JogView | None = None
-    target: Target | None = None
-    """What the tip is to be brought to."""
-
-    @property
-    def may_jog(self) -> bool:
-        """Whether it may be brought there by keys."""
-        return self.target is not None and self.target.may_jog
-
-    @property
-    def may_skip(self) -> bool:
-        """Whether the step can go on without it."""
-        return self.target is not None and self.target.may_skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,32 +70,22 @@ class ScreenGuide:
         findings = (*self.view.findings, what)[-MOST_FINDINGS:]
         self._change(findings=findings, picture=self.view.picture if what.picture is None else what.picture)
 
-    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        """The key of one of the choices."""
-        return str(await self._ask("choose", question, choices=choices, default=default))
-
-    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
-        """A number in [low, high]; the screen checks it."""
-        empty = "" if default is None else f"{default:g}"
-        answer = await self._ask("number", question, unit=unit, low=low, high=high, default=empty)
-        assert isinstance(answer, float)
-        return answer
-
-    async def text(self, question: str, default: str) -> str:
-        """A line of text."""
-        return str(await self._ask("text", question, default=default))
-
-    async def bring(self, target: Target, how: str) -> Brought:
-        """Wait until the person says that the tip is there."""
-        answer = await self._ask("bring", how, target=target)
-        assert isinstance(answer, Brought)
-        return answer
-
-    async def jog(self, view: JogView) -> JogStep | Brought:
-        """The next step by key."""
-        answer = await self._ask("jog", view.question, jog=view)
-        assert isinstance(answer, JogStep | Brought)
-        return answer
+    async def ask(self, question: Question) -> Answer:
+        """Show the question and wait for the answer; the screen takes only one that the question allows."""
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Answer] = loop.create_future()
+        with self._lock:
+            if self._leaving:
+                raise LeftOff
+            self._count += 1
+            self._open = (loop, future)
+            self._view = replace(self._view, question=replace(question, number=self._count))
+        try:
+            return await future
+        finally:
+            with self._lock:
+                self._open = None
+                self._view = replace(self._view, question=None, doing="", doing_since_s=time.monotonic())
 
     def see_pose(self, tip: Pose | None, tip_known: bool) -> None:
         """Show where the arm is."""
@@ -177,22 +125,6 @@ class ScreenGuide:
             loop, future = self._open
             self._open = None
         loop.call_soon_threadsafe(lambda: None if future.done() else settle(future))
-
-    async def _ask(self, kind: Kind, text: str, **more: Any) -> Answer:
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[Answer] = loop.create_future()
-        with self._lock:
-            if self._leaving:
-                raise LeftOff
-            self._count += 1
-            self._open = (loop, future)
-            self._view = replace(self._view, question=Question(self._count, kind, text, **more))
-        try:
-            return await future
-        finally:
-            with self._lock:
-                self._open = None
-                self._view = replace(self._view, question=None, doing="", doing_since_s=time.monotonic())
 
     def _change(self, **fields: Any) -> None:
         with self._lock:

@@ -14,9 +14,9 @@ from textual.screen import Screen
 from textual.widgets import Input
 
 from brushloop.collect.rig.optics import gray
-from brushloop.collect.teach.guide import Brought, JogStep, JogView, Picture, Shown, StepState, number_in
+from brushloop.collect.teach.guide import Brought, JogStep, JogView, Picture, Question, Shown, StepState, number_in
 from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.teach_guide import Question, ScreenGuide, TeachView
+from brushloop.collect.tui.teach_guide import ScreenGuide, TeachView
 from brushloop.collect.tui.text import SHORT_STOP, one_line, plain, tip_text
 from brushloop.collect.tui.widgets import NARROW_COLUMNS, Key, KeyBar, Line
 

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.collect.rig.doctor import Finding
-from brushloop.collect.rig.report import write_report
-from brushloop.collect.rig.scrub import numbers_only, scrubber_of
+from brushloop.collect.rig.report import numbers_only, scrubber_of, write_report
 from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -42,7 +43,7 @@ def test_the_loopback_rig_contradicts_nothing_and_what_is_missing_is_said(rig: P
     ran = brushloop("rig", "check", rig)
     assert ran.returncode == 0
     assert "plausible     tool length" in ran.stdout
-    assert "not measured  lens                        not calibrated" in ran.stdout
+    assert re.search(r"not measured  lens +not calibrated", ran.stdout)
     assert ran.stdout.rstrip().endswith("15 values are plausible, 0 contradict others, 7 were not measured")
 
 

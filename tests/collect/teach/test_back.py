@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.collect.errors import CannotTeach, CollectAborted
-from brushloop.collect.operator import Choice
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.teach import brush
+from brushloop.collect.teach.brush import STATION, BrushStep
+from brushloop.collect.teach.camera import CameraStep
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import LeftOff, Shown, StepState, WentBack
-from brushloop.collect.teach.steps import brush
-from brushloop.collect.teach.steps.brush import STATION, BrushStep
-from brushloop.collect.teach.steps.camera import CameraStep
-from brushloop.collect.teach.steps.force import ForceStep
+from brushloop.collect.teach.force import ForceStep
+from brushloop.collect.teach.guide import LeftOff, Question, Shown, StepState, WentBack
 from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.errors import DeviceTimeout
@@ -42,24 +41,15 @@ class Typing:
         if what.tone == "trouble":
             self.trouble += what.lines
 
-    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        answer = self._next(question) or default
-        assert answer in {choice.key for choice in choices}, question
-        return answer
-
-    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
-        return float(self._next(question) or str(default))
-
-    async def text(self, question: str, default: str) -> str:
-        return self._next(question) or default
-
-    def _next(self, question: str) -> str:
-        self.asked.append(question.split(":")[0].split(",")[0])
+    async def ask(self, question: Question) -> str | float:
+        self.asked.append(question.text.split(":")[0].split(",")[0])
         if not self.answers:
             raise LeftOff
         if (answer := self.answers.pop(0)) == BACK:
             raise WentBack
-        return answer
+        answer = answer or question.default
+        assert question.kind != "choose" or answer in {choice.key for choice in question.choices}, question
+        return float(answer) if question.kind == "number" else answer
 
 
 def begun(person: Typing, folder: Path) -> Day:
@@ -108,7 +98,7 @@ async def test_back_goes_on_to_the_first_question_and_into_the_step_before(tmp_p
 async def test_after_a_refusal_back_leads_to_what_was_typed_before_it(tmp_path: Path) -> None:
     person = Typing("6", "190", BACK, "47")
     await led(person, tmp_path)
-    assert "L = 190 mm cannot be" in person.trouble[0]
+    assert "190 mm cannot be (5 to 180 mm)" in person.trouble[0]
     assert person.asked == [R, L, "How do you want to go on?", L, DEEPEST]
 
 
@@ -141,7 +131,7 @@ async def test_going_back_doses_nothing_again(tmp_path: Path, monkeypatch: pytes
     await led(person, tmp_path)
     give = person.asked[6]
     assert give.startswith("Give 0.5 ml")
-    assert person.asked == [R, L, DEEPEST, NAME, WELL, "Its serial line", give, give, give, INK, WELL]
+    assert person.asked == [R, L, DEEPEST, NAME, WELL, "Its serial line", give, give, give, INK, give]
     assert len(doses) == 2
 
 
@@ -168,10 +158,7 @@ class LeavingAtOnce:
     async def show(self, what: Shown) -> None:
         self.shown += what.lines
 
-    async def choose(self, *_: object) -> str:
-        raise LeftOff
-
-    async def number(self, *_: object) -> float:
+    async def ask(self, _: Question) -> str:
         raise LeftOff
 
 
@@ -207,17 +194,8 @@ async def test_a_step_that_failed_says_in_what_state_the_arm_is(
     )
 
 
-class Enter:
-    """A person who has an ink station, and presses Enter when asked for its serial line."""
-
-    async def choose(self, *_: object) -> str:
-        return STATION.key
-
-    async def text(self, _question: str, default: str) -> str:
-        return default
-
-
 async def test_an_ink_device_without_a_serial_line_is_refused_with_the_way_out(tmp_path: Path) -> None:
-    day = Day(Enter(), tmp_path / "rig.toml", HostClock(), armed=False)  # type: ignore[arg-type]
-    with pytest.raises(CannotTeach, match=r"no serial line was named\. Type its path"):
-        await BrushStep()._ink(day)
+    person = Typing("6", "48", "20", "", STATION.key, "")
+    await led(person, tmp_path)
+    assert person.trouble[0] == "no serial line was named."
+    assert person.trouble[1].startswith("Type its path")

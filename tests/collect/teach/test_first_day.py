@@ -13,11 +13,10 @@ import pytest
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.doctor import Finding
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.collect.teach import cameras
+from brushloop.collect.teach import camera, proof
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Brought, Target
-from brushloop.collect.teach.steps import proof
-from brushloop.collect.teach.steps.proof import ProofStep, Proven, read_proof
+from brushloop.collect.teach.proof import ProofStep, Proven, read_proof
 from brushloop.collect.teach.store import Notebook, TaughtFile
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import Clock, HostClock
@@ -57,7 +56,7 @@ class Killed(BaseException):
 @pytest.fixture(autouse=True)
 def quick_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """No lab's camera but the slow one is later than this."""
-    monkeypatch.setattr(cameras, "LATE_MS", 800.0)
+    monkeypatch.setattr(camera, "LATE_MS", 800.0)
 
 
 @pytest.fixture
@@ -66,7 +65,7 @@ def soaking(monkeypatch: pytest.MonkeyPatch) -> None:
 
     Pictures are drawn by the processor that also takes them, and six simulated seconds pass in one of the host's.
     """
-    monkeypatch.setattr(cameras, "LATE_MS", 2500.0)
+    monkeypatch.setattr(camera, "LATE_MS", 2500.0)
     for name, value in {
         "MOTION__LEAST_DWELL_S": 0.05 * SOAK_RATE,
         "FORCE__STALE_MS": 2000,
@@ -80,8 +79,8 @@ def hurried(person: InLab) -> InLab:
     """A person who leaves the lens out."""
     bring = person.bring
 
-    async def without_lens(target: Target, how: str) -> Brought:
-        return Brought.SKIP if target.kind == "hold-board" else await bring(target, how)
+    async def without_lens(target: Target) -> Brought:
+        return Brought.SKIP if target.kind == "hold-board" else await bring(target)
 
     person.bring = without_lens
     return person

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.collect.operator import Choice
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Brought, JogStep, JogView, Shown, Target
+from brushloop.collect.teach.guide import Answer, Brought, JogStep, JogView, Question, Shown, Target
 from brushloop.collect.teach.jog import BELOW_MM, touch
 from brushloop.collect.teach.store import touch_of
 from brushloop.collect.tui.teach_app import TeachApp
@@ -40,16 +39,14 @@ class Jogger:
     async def show(self, what: Shown) -> None:
         self.said += what.lines
 
-    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        return "a" if self.allows else default
-
-    async def bring(self, target: Target, how: str) -> Brought:
+    async def ask(self, question: Question) -> Answer:
+        if question.jog is not None:
+            self.views.append(question.jog)
+            return self.steps.pop(0) if self.steps else Brought.DONE
+        if question.target is None:
+            return "a" if self.allows else question.default
         self.asked += 1
         return Brought.JOG if self.asked == 1 else Brought.SKIP
-
-    async def jog(self, view: JogView) -> JogStep | Brought:
-        self.views.append(view)
-        return self.steps.pop(0) if self.steps else Brought.DONE
 
 
 @pytest.fixture

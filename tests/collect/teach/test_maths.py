@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.teach.jog import hull
-from brushloop.collect.teach.maths.sheet import CORNERS, Point, check_board, corners_of, fit_sheet
-from brushloop.collect.teach.maths.tip import AxisFit, elsewhere, find_axis, find_tip
+from brushloop.collect.teach.sheet_fit import CORNERS, Point, check_board, corners_of, fit_sheet
+from brushloop.collect.teach.tip import AxisFit, elsewhere, find_axis, find_tip
 from brushloop.drivers.devices import Pose
 
 BOARD = BoardSpec(squares=(26, 20), square_mm=12.0, marker_mm=9.0, origin_mm=(0.0, 0.0))
@@ -169,7 +169,7 @@ def test_a_sheet_is_found_exactly_from_exact_touches(yaw_deg: float, x_mm: float
     assert abs(math.remainder(fit.yaw_deg - yaw_deg, 360.0)) < 1e-5
     assert np.allclose(fit.size_mm, (240.0, 170.0), atol=1e-4)
     assert np.allclose(fit.board_origin_mm, (-34.0, -34.0), atol=1e-4)
-    assert fit.plane.plane.slope_x == pytest.approx(slope, abs=1e-6)
+    assert fit.plane.slope_x == pytest.approx(slope, abs=1e-6)
 
 
 @pytest.mark.parametrize("pair", list(itertools.combinations(CORNERS, 2)))

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.operator import Choice
 from brushloop.collect.photograph.frames import Thumbnail
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Shown
-from brushloop.collect.teach.steps.places import VIEW, PlacesStep, check_pot, check_wipe, text_of
+from brushloop.collect.teach.guide import Question, Shown
+from brushloop.collect.teach.places import VIEW, PlacesStep, check_pot, check_wipe, text_of
 from brushloop.collect.teach.store import Notebook, Taught, now_utc, touch_of
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.host import HostClock
@@ -164,8 +163,8 @@ async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(server: ArcsServ
     defaults: list[str] = []
 
     class Asked(Watching):
-        async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-            defaults.append(default)
+        async def ask(self, question: Question) -> str:
+            defaults.append(question.default)
             return "n"
 
     day = day_of(server.port, tmp_path, AWAY_MM, picture(arm=False), picture(arm=False))

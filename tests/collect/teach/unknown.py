@@ -19,7 +19,7 @@ from brushloop.collect.operator import Choice
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import to_base
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Brought, JogStep, JogView, LeftOff, Shown, StepState, Target
+from brushloop.collect.teach.guide import Answer, Brought, LeftOff, Question, Shown, StepState, Target
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.lab.facts import Trap
@@ -49,8 +49,19 @@ class InLab:
     async def show(self, what: Shown) -> None:
         self.lines += [f"{what.tone}: {line}" for line in what.lines]
 
-    async def choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        self._asked(question)
+    async def ask(self, question: Question) -> Answer:
+        if question.target is not None:
+            return await self.bring(question.target)
+        self.asked.append(question.text)
+        match question.kind:
+            case "choose":
+                return await self._choose(question.text, question.choices, question.default)
+            case "number":
+                return self._number(question)
+            case _:
+                return self._text(question.text, question.default)
+
+    async def _choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
         keys = {choice.key for choice in choices}
         if question.startswith("How do you want to go on"):
             if self.mends:
@@ -66,8 +77,7 @@ class InLab:
         assert answer in keys, question
         return answer
 
-    async def number(self, question: str, unit: str, low: float, high: float, default: float | None) -> float:
-        self._asked(question)
+    def _number(self, question: Question) -> float:
         seen = self.seen
         printed = {
             "Squares along its longer": seen.squares[0],
@@ -79,13 +89,12 @@ class InLab:
             "Deepest press": seen.max_depth_mm,
             "Delivery per revolution": 0.1,
         }
-        value = next((float(v) for start, v in printed.items() if question.startswith(start)), default)
-        assert value is not None, question
-        assert low <= value <= high, question
-        return value
+        value = next((v for start, v in printed.items() if question.text.startswith(start)), question.default)
+        assert value, question
+        assert question.low <= float(value) <= question.high, question
+        return float(value)
 
-    async def text(self, question: str, default: str) -> str:
-        self._asked(question)
+    def _text(self, question: str, default: str) -> str:
         seen = self.seen
         read = {
             "Address of the cabinet": seen.host,
@@ -96,16 +105,13 @@ class InLab:
         }
         return next((v for start, v in read.items() if question.startswith(start)), default)
 
-    async def bring(self, target: Target, how: str) -> Brought:
+    async def bring(self, target: Target) -> Brought:
         if self.leave_after is not None and len(self.brought) >= self.leave_after:
             raise LeftOff
         self.brought.append(target)
         answer = await self._in_lab(self.lab.bring(target.kind, target.index, target.corner))
         self.lines.append(f"person: {answer['says']}")
         return Brought.DONE if answer["reached"] else Brought.SKIP
-
-    async def jog(self, view: JogView) -> JogStep | Brought:
-        return Brought.DONE
 
     @property
     def seen(self) -> Seen:
@@ -117,9 +123,6 @@ class InLab:
 
     async def _in_lab(self, work: Any) -> Any:
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self.loop))
-
-    def _asked(self, question: str) -> None:
-        self.asked.append(question)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice
-from brushloop.collect.teach.guide import Brought, JogView, Shown, StepState, Target
+from brushloop.collect.teach.guide import Brought, JogView, Question, Shown, StepState, Target
 from brushloop.collect.tui.teach_app import TeachApp
 from brushloop.collect.tui.teach_guide import ScreenGuide
 from brushloop.drivers.geometry import brush_pose
@@ -26,7 +26,6 @@ FOUND = Shown(("five directions: the tip is known to 0.11 mm", "residuals 0.10, 
 WARNED = Shown(("direction 2 is like direction 1: lean the brush farther",), tone="warning")
 YES, NO = Choice("y", "yes, take it"), Choice("n", "no, touch it again")
 JOG = JogView(
-    "Lower the tip onto the paper.",
     (0.0, 0.1, -1.3),
     (0.1, 0.5, 2.0, 5.0),
     "not made: z = 97.900 mm is outside [98.200, 148.000] mm. Guide the arm by hand to go farther",
@@ -58,21 +57,24 @@ class Asking:
     async def _ask(self, guide: ScreenGuide, kind: str) -> Any:
         match kind:
             case "choose":
-                return await guide.choose("Take this tip?", (YES, NO), "y")
+                return await guide.ask(Question("choose", "Take this tip?", (YES, NO), "y"))
             case "no default":
-                return await guide.choose("Is there a pot of water?", (YES, NO), "")
+                return await guide.ask(Question("choose", "Is there a pot of water?", (YES, NO)))
             case "number":
-                return await guide.number("Squares along its longer side", "squares", 3, 50, None)
+                return await guide.ask(
+                    Question("number", "Squares along its longer side", unit="squares", low=3, high=50)
+                )
             case "text":
-                return await guide.text("Address of the cabinet", "192.0.2.7")
+                return await guide.ask(Question("text", "Address of the cabinet", default="192.0.2.7"))
             case "empty":
-                return await guide.text("CAN bus of the force sensor; Enter: no sensor", "")
+                return await guide.ask(Question("text", "CAN bus of the force sensor; Enter: no sensor"))
             case "bring":
                 await guide.show(Shown(("the board as the camera sees it",), board()))
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
-                return await guide.bring(Target("pin", 2, may_jog=True, may_skip=True), how)
+                return await guide.ask(Question("bring", how, target=Target("pin", 2), may_jog=True, may_skip=True))
             case "jog":
-                while not isinstance(answer := await guide.jog(JOG), Brought):
+                lower = Question("jog", "Lower the tip onto the paper.", jog=JOG)
+                while not isinstance(answer := await guide.ask(lower), Brought):
                     self.answers.append(answer)
                 return answer
             case _:

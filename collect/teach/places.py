@@ -1,25 +1,30 @@
-"""Step 5: well, wipe, pot of water and park position, taught by going there."""
+"""Steps 5 and 8: well, wipe, pot of water and park position, taught by going there; and the smallest box around all."""
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import math
 
 import cv2
 import numpy as np
 
-from brushloop.collect.errors import CannotTeach
+from brushloop.calibrate.files import read_gray
+from brushloop.collect.errors import CannotTeach, ConfigError
 from brushloop.collect.photograph.frames import ARM_SHARE, Thumbnail, changed_share, thumbnail
-from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig
+from brushloop.collect.planning.limit_check import ask_reach
+from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import to_base, to_paper
-from brushloop.collect.teach.arm_reader import ArmReader
-from brushloop.collect.teach.cameras import side_by_side, still, taught_camera
-from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.rig.show import draw_rig
+from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.camera import side_by_side, still, taught_camera
+from brushloop.collect.teach.day import Asked, Day, Step
 from brushloop.collect.teach.guide import Target, TargetKind
-from brushloop.collect.teach.jog import touch
-from brushloop.collect.teach.maths.sheet import Point, corners_of
-from brushloop.collect.teach.maths.tip import tip_of
-from brushloop.collect.teach.store import Notebook, StepName, Taught, Value, now_utc
+from brushloop.collect.teach.jog import hull, touch
+from brushloop.collect.teach.sheet_fit import Point, corners_of
+from brushloop.collect.teach.store import Notebook, Taught, Value, rig_of, taught
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import brush_pose
 
 TRAVEL_MM = 60.0
 """Travel height above the highest corner of the sheet: room for a dry run 30 mm above it."""
@@ -33,15 +38,31 @@ APART_MM = 150.0
 """Between two places of the arm: farther apart, no part of it that is in both pictures hides the same in both."""
 VIEW: dict[TargetKind, str] = {"park": "aside.view_parked", "clear-view": "aside.view_elsewhere"}
 """The small picture that was taken with the arm there."""
+INK: tuple[TargetKind, ...] = ("well-rim", "well", "wash-rim", "wash-pot")
+MARGIN_MM = 25.0
+"""Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
+BELOW_MM = 2.0
+"""Room below the deepest press and the dip, for a sheet that is found a little lower."""
+BOX = tuple(f"robot.limits.{axis}_mm" for axis in "xyz")
+SPEEDS = (
+    Asked("robot.limits.tilt_deg", "Widest lean of the brush", "deg", 1.0, 30.0, default="15"),
+    Asked("robot.limits.speed_mm_s", "Highest speed of the tip in any motion", "mm/s", 1.0, 500.0, default="150"),
+    Asked("robot.limits.acc_mm_s2", "Highest acceleration in any motion", "mm/s2", 1.0, 5000.0, default="800"),
+    Asked("motion.travel_speed_mm_s", "Speed of travel above the sheet", "mm/s", 1.0, 500.0, default="100"),
+    Asked("motion.press_speed_mm_s", "Speed down into a press", "mm/s", 1.0, 100.0, default="15"),
+    Asked("motion.acc_mm_s2", "Acceleration of travel and press", "mm/s2", 1.0, 5000.0, default="500"),
+)
+"""With cautious defaults, and the most that `rig.toml` takes."""
 
 
 class PlacesStep(Step):
     """Where ink, water and rest are, and how high the arm travels between them."""
 
-    name: StepName = "places"
+    name = "places"
     title = "Well, wash and park"
     minutes = 5
-    needs: tuple[StepName, ...] = ("camera", "tip", "sheet")
+    needs = ("camera", "tip", "sheet")
+    observes = (*INK, *VIEW, *VIEW.values(), "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
 
     async def teach(self, day: Day) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
@@ -73,7 +94,7 @@ class PlacesStep(Step):
         )
         if wipe:
             how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
-            wipe = await touch(day, reader, Target("well-rim", 1, may_skip=True), how, "well-rim 1") is not None
+            wipe = await touch(day, reader, Target("well-rim", 1), how, "well-rim 1", may_skip=True) is not None
         if wipe:
             with day.touched_again_if_refused("well-rim 1"):
                 check_wipe(day.notebook)
@@ -96,7 +117,7 @@ class PlacesStep(Step):
         """Have the arm brought out of the picture, and keep pose and picture together: one says nothing alone."""
         if VIEW[target.kind] not in day.notebook.values:
             with day.together():
-                day.save(day.notebook.without_touches(target.kind))
+                day.save(day.notebook.without(target.kind))
                 await touch(day, reader, target, how, f"{target.kind} 0")
                 await day.working("waiting for a picture without the arm")
                 async with taught_camera(day.notebook, day.clock) as camera:
@@ -108,7 +129,7 @@ class PlacesStep(Step):
         offset_mm, touches = day.notebook.numbers("robot.tcp_offset_mm"), day.notebook.touches
         parked_mm, away_mm = (tip_of(touches[f"{kind} 0"].pose(), offset_mm) for kind in ("park", "clear-view"))
         if (apart_mm := math.dist(parked_mm, away_mm)) < APART_MM:
-            day.save(without_views(day.notebook, "park", "clear-view"))
+            day.save(day.notebook.without(*VIEW, *VIEW.values()))
             raise CannotTeach(
                 f"the arm was only {apart_mm:.0f} mm apart in the two pictures: they show the same.",
                 f"Bring it to two places {APART_MM:g} mm or more apart; both are asked again.",
@@ -118,7 +139,7 @@ class PlacesStep(Step):
         if share >= ARM_SHARE:
             beside = side_by_side([picture.astype(np.uint8) for picture in pictures])
             await day.say("The arm parked (1), and elsewhere (2):", picture=beside)
-            day.save(without_views(day.notebook, "park", "clear-view"))
+            day.save(day.notebook.without(*VIEW, *VIEW.values()))
             raise CannotTeach(
                 f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
                 "Park it farther from the sheet, or higher; both places are asked again.",
@@ -133,42 +154,32 @@ class PlacesStep(Step):
         rim_z_mm = max(z for name, (_, _, z) in places.items() if name.startswith("well-rim "))
         highest_rim_mm = max(z for name, (_, _, z) in places.items() if name.split(" ")[0] in ("well-rim", "wash-rim"))
         safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, highest_rim_mm + RIM_CLEAR_MM)
+        park_x, park_y, park_z = places["park 0"]
         by_hand = "the tip was brought there by hand"
 
-        def taught(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
-            return Taught(value=value, unit="mm", how=how, known=known, at=now_utc(), step="places")
+        def at(value: Value, how: str = by_hand, known: str = "one touch by hand, within a mm") -> Taught:
+            return taught("places", value, how, "mm", known=known)
 
-        park_x, park_y, park_z = places["park 0"]
-        found = {
-            "ink.well_mm": taught(list(to_paper(paper, x, y))),
-            "ink.dip_z_mm": taught(dip_z_mm),
-            "aside.well_radius_mm": taught(math.dist((x, y), (rim_x, rim_y))),
-            "aside.rim_z_mm": taught(rim_z_mm),
-            "motion.safe_z_mm": taught(
-                safe_mm,
-                f"the higher of sheet + {TRAVEL_MM:g} mm and highest rim + {RIM_CLEAR_MM:g} mm",
-                "a stated clearance",
-            ),
-            "motion.park_mm": taught(
-                [park_x, park_y, max(park_z, safe_mm)],
-                by_hand + ("" if park_z >= safe_mm else ", and lifted to travel height"),
-            ),
+        travel = f"the higher of sheet + {TRAVEL_MM:g} mm and highest rim + {RIM_CLEAR_MM:g} mm"
+        lifted = "" if park_z >= safe_mm else ", and lifted to travel height"
+        values = {
+            "ink.well_mm": at(list(to_paper(paper, x, y))),
+            "ink.dip_z_mm": at(dip_z_mm),
+            "aside.well_radius_mm": at(math.dist((x, y), (rim_x, rim_y))),
+            "aside.rim_z_mm": at(rim_z_mm),
+            "motion.safe_z_mm": at(safe_mm, travel, "a stated clearance"),
+            "motion.park_mm": at([park_x, park_y, max(park_z, safe_mm)], by_hand + lifted),
         }
         if "well-rim 1" in places:
             end, z_mm = wipe_of(notebook)
             how = f"{WIPE_PAST_MM:g} mm beyond the rim, which was touched there by hand"
-            found["ink.wipe.rim_mm"] = taught(list(end), how)
-            found["ink.wipe.z_mm"] = taught(z_mm, f"{WIPE_BELOW_MM:g} mm below the rim, which was touched by hand")
+            values["ink.wipe.rim_mm"] = at(list(end), how)
+            values["ink.wipe.z_mm"] = at(z_mm, f"{WIPE_BELOW_MM:g} mm below the rim, which was touched by hand")
         if "wash-pot 0" in places:
             wash_x, wash_y, wash_z = places["wash-pot 0"]
-            found["ink.wash.pot_mm"] = taught(list(to_paper(paper, wash_x, wash_y)))
-            found["ink.wash.dip_z_mm"] = taught(wash_z)
-        return found
-
-    def forget(self, notebook: Notebook) -> Notebook:
-        """Without what was touched here."""
-        cleared = notebook.without("aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
-        return without_views(cleared.without_touches("well-rim", "well", "wash-rim", "wash-pot"), "park", "clear-view")
+            values["ink.wash.pot_mm"] = at(list(to_paper(paper, wash_x, wash_y)))
+            values["ink.wash.dip_z_mm"] = at(wash_z)
+        return values
 
     def summary(self, notebook: Notebook) -> str:
         """Well and park."""
@@ -243,11 +254,6 @@ def check_wipe(notebook: Notebook) -> None:
         )
 
 
-def without_views(notebook: Notebook, *kinds: TargetKind) -> Notebook:
-    """The notebook without the arm at these places, and without the pictures from there."""
-    return notebook.without_touches(*kinds).without(*(VIEW[kind] for kind in kinds))
-
-
 def text_of(picture: Thumbnail) -> str:
     """A small picture as PNG in base64."""
     return base64.b64encode(cv2.imencode(".png", picture.astype(np.uint8))[1].tobytes()).decode()
@@ -257,3 +263,90 @@ def picture_of(text: str) -> Thumbnail:
     """The picture again."""
     coded = np.frombuffer(base64.b64decode(text), np.uint8)
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.float32)
+
+
+class LimitsStep(Step):
+    """Box, cone and speeds."""
+
+    name = "limits"
+    title = "Limits"
+    minutes = 3
+    needs = ("tip", "sheet", "places", "brush")
+    observes = ("aside.agreed_", *(asked.field for asked in SPEEDS))
+
+    async def teach(self, day: Day) -> None:
+        """Show the box, have each limit confirmed, and ask the controller whether the arm reaches every corner."""
+        rig = rig_of(day.notebook.with_values(self.derived(day.notebook)), day.rig_path)
+        picture = day.rig_path.with_name(f"{day.rig_path.stem}.limits.png")
+        await day.working("drawing box and places")
+        await asyncio.to_thread(draw_rig, rig, picture)
+        await day.say(
+            f"{picture} shows box, sheet, board, well and park from above.",
+            picture=await asyncio.to_thread(read_gray, picture),
+        )
+        for axis, field in zip("xyz", BOX, strict=True):
+            box = self.derived(day.notebook)[field]
+            if day.notebook.get(f"aside.agreed_{axis}") == str(box.value):
+                continue
+            if not await day.yes(f"The box along base {axis}: {box.value} {box.unit} ({box.how}; {field}). Agreed?"):
+                raise CannotTeach(
+                    f"{field} was not agreed.",
+                    "Teach the place again that makes the box too large: `brushloop rig teach`.",
+                )
+            day.keep("limits", f"aside.agreed_{axis}", str(box.value), "agreed")
+        await day.values("limits", *SPEEDS)
+        rig = rig_of(day.notebook.with_values(self.derived(day.notebook)), day.rig_path)
+        try:
+            count = await ask_reach(day.rig_path, rig, _to_reach(rig, day.notebook))
+        except ConfigError as error:
+            raise CannotTeach(
+                f"the arm does not reach the whole sheet: {error.what}.",
+                "Move the board with the sheet nearer to the arm, and teach sheet and places again.",
+            ) from None
+        await day.say(f"The controller finds joints for all {count} corners of the space above sheet and well.")
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """The box around what was taught, and the defaults that were not taught otherwise."""
+        beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
+        floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
+        ranges = zip(BOX, hull(_within(notebook), MARGIN_MM), (beside, beside, floor), strict=True)
+        box = {field: taught("limits", list(range_mm), how, "mm") for field, range_mm, how in ranges}
+        cautious = {
+            asked.field: taught("limits", float(str(asked.default)), "cautious default", asked.unit)
+            for asked in SPEEDS
+            if asked.field not in notebook.values
+        }
+        return box | cautious
+
+    def summary(self, notebook: Notebook) -> str:
+        """The box."""
+        ranges = (notebook.numbers(field) for field in BOX)
+        return " x ".join(f"{low:.0f}..{high:.0f}" for low, high in ranges) + " mm"
+
+
+def _within(notebook: Notebook) -> list[Point]:
+    """Everything that the tip must reach, in the base frame."""
+    places, safe_mm = tips(notebook), notebook.number("motion.safe_z_mm")
+    reached = [
+        point for name, point in places.items() if name.split(" ")[0] in ("well-rim", "well", "wash-pot", "wash-rim")
+    ]
+    park_x, park_y, park_z = notebook.numbers("motion.park_mm")
+    corners = sheet_corners(notebook)
+    deepest_mm = min(sheet_heights(notebook)) - notebook.number("brush.max_depth_mm") - BELOW_MM
+    x, y, _ = corners[0]
+    dip_mm = notebook.number("ink.dip_z_mm") - BELOW_MM
+    return [*reached, (park_x, park_y, park_z), *corners, (x, y, deepest_mm), (x, y, dip_mm), (x, y, safe_mm)]
+
+
+def _to_reach(rig: RigConfig, notebook: Notebook) -> list[tuple[Pose, float, str]]:
+    """Poses over and in the sheet's corners and the well, and the park position, upright and at the cone's edge."""
+    yaw, speed, tilt = rig.paper.yaw_deg, rig.motion.press_speed_mm_s, rig.robot.limits.tilt_deg
+    found: list[tuple[Pose, float, str]] = []
+    for number, (x, y, z) in enumerate(sheet_corners(notebook), 1):
+        found.append((brush_pose(x, y, rig.motion.safe_z_mm, heading_deg=yaw), speed, f"over corner {number}"))
+        low_mm = z - rig.brush.max_depth_mm
+        found.append((brush_pose(x, y, low_mm, heading_deg=yaw, tilt_deg=tilt), speed, f"pressed at corner {number}"))
+    x, y, z = tips(notebook)["well 0"]
+    found.append((brush_pose(x, y, z, heading_deg=yaw), speed, "in the well"))
+    found.append((brush_pose(*rig.motion.park_mm, heading_deg=yaw), speed, "parked"))
+    return found

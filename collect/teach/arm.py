@@ -1,45 +1,24 @@
-"""Reads an arm before there is a `rig.toml`: a list of questions that set nothing, power nothing and move nothing."""
+"""Reads an arm before there is a `rig.toml`: asks only what sets nothing, powers nothing and moves nothing."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, six
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, Controller, six
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire
 
-READ_ONLY = frozenset(
-    {
-        "getRobotNames",
-        "SystemInfo.getInterfaceVersionCode",
-        "SystemInfo.getControlSoftwareFullVersion",
-        "RobotConfig.getRobotType",
-        "RobotConfig.getRobotSubType",
-        "RobotConfig.getControlBoxType",
-        "RobotConfig.getTcpOffset",
-        "RobotConfig.getPayload",
-        "RobotConfig.getCollisionLevel",
-        "RobotManage.getOperationalMode",
-        "RobotState.getRobotModeType",
-        "RobotState.getSafetyModeType",
-        "RobotState.getTcpPose",
-        "RobotState.getJointPositions",
-        "RobotState.isSteady",
-        "RobotAlgorithm.inverseKinematics",
-    }
-)
-"""All methods that are called before there is a `rig.toml`."""
 FRAMINGS: tuple[Framing, ...] = ("sof", "bare")
 STILL_MM, STILL_DEG = 0.02, 0.01
 """An arm that is held still by hand moves by less than this between two readings."""
@@ -94,23 +73,22 @@ class Cabinet:
 
 
 class ArmReader:
-    """One connection on which only `READ_ONLY` is asked."""
+    """One connection on which nothing but what is below is asked. Every method may raise `DeviceError`."""
 
-    def __init__(self, connection: RpcConnection, robot: str) -> None:
-        self._connection = connection
-        self._robot = robot
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
 
-    async def ask(self, method: str, **params: object) -> Any:
-        """The unchecked answer. Raises ValueError for a method that is not in the list, and `DeviceError`."""
-        if method not in READ_ONLY:
-            raise ValueError(f"{method} is not one of the questions that change nothing")
-        if self._connection.lost:
-            await self._connection.reopen()
-        return await self._connection.call(f"{self._robot}.{method}", params)
+    async def _ask(self, method: str) -> Any:
+        if self._controller.connection.lost:
+            await self._controller.connection.reopen()
+        return await self._controller.ask(method)
+
+    async def _name(self, method: str) -> str:
+        return str(await self._ask(method))[:MOST_CHARACTERS]
 
     async def tool(self) -> tuple[float, ...]:
         """Flange to tool as the cabinet has it: x, y, z in m, rx, ry, rz in rad."""
-        return tuple(six("getTcpOffset", await self.ask("RobotConfig.getTcpOffset")))
+        return tuple(six("getTcpOffset", await self._ask("RobotConfig.getTcpOffset")))
 
     async def flange(self) -> Pose:
         """Wait until the arm is held still, and return the pose of the flange in the base frame.
@@ -134,21 +112,24 @@ class ArmReader:
             ) from None
 
     async def flange_now(self) -> Pose:
-        """Pose of the flange in the base frame, whether or not the arm rests. Raises `DeviceError`."""
+        """Pose of the flange in the base frame, whether or not the arm rests."""
         tool = await self.tool()
-        at = from_wire(six("getTcpPose", await self.ask("RobotState.getTcpPose")))
+        at = from_wire(six("getTcpPose", await self._ask("RobotState.getTcpPose")))
         turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()
         x, y, z = np.array(at.position_mm) - turn.apply(1e3 * np.array(tool[:3]))
         qx, qy, qz, qw = (float(v) for v in turn.as_quat())
         return Pose(float(x), float(y), float(z), qx, qy, qz, qw)
 
     async def cabinet(self, framing: Framing) -> Cabinet:
-        """Everything that the cabinet reports about itself. Raises `DeviceError`."""
-        version = await self._connection.call("SystemInfo.getInterfaceVersionCode")
-        tool, level = await self.tool(), await self.ask("RobotConfig.getCollisionLevel")
+        """Everything that the cabinet reports about itself."""
+        call = self._controller.connection.call
+        firmware = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
+        with contextlib.suppress(RpcError):
+            firmware += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
+        tool, level = await self.tool(), await self._ask("RobotConfig.getCollisionLevel")
         if type(level) is not int:
             raise ProtocolViolation(DEVICE, "getCollisionLevel", f"expected a whole number, got {level!r}")
-        payload = await self.ask("RobotConfig.getPayload")
+        payload = await self._ask("RobotConfig.getPayload")
         try:
             mass_kg, cog_m, *_ = payload
             [payload_kg], cog_mm = numbers([mass_kg], 1), tuple(1e3 * v for v in numbers(cog_m, 3))
@@ -156,39 +137,35 @@ class ArmReader:
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
         return Cabinet(
             framing,
-            _name(await self.ask("RobotConfig.getRobotType")),
-            _name(await self.ask("RobotConfig.getControlBoxType")),
-            _name(await self._firmware(version)),
-            _name(await self.ask("RobotState.getRobotModeType")),
-            _name(await self.ask("RobotState.getSafetyModeType")),
-            _name(await self.ask("RobotManage.getOperationalMode")),
+            await self._name("RobotConfig.getRobotType"),
+            await self._name("RobotConfig.getControlBoxType"),
+            firmware[:MOST_CHARACTERS],
+            await self._name("RobotState.getRobotModeType"),
+            await self._name("RobotState.getSafetyModeType"),
+            await self._name("RobotManage.getOperationalMode"),
             (*(1e3 * v for v in tool[:3]), *(math.degrees(v) for v in tool[3:])),
             payload_kg,
             cog_mm,
             level,
         )
 
-    async def _firmware(self, version: object) -> str:
-        with contextlib.suppress(RpcError):
-            return f"interface {version}, {await self._connection.call('SystemInfo.getControlSoftwareFullVersion')}"
-        return f"interface {version}"
 
-
-def _name(answer: object) -> str:
-    return str(answer)[:MOST_CHARACTERS]
+def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, float]:
+    """Where the tip is while the flange is there, in the base frame."""
+    x, y, z = np.array(flange.position_mm) + Rotation.from_quat(flange.quaternion).apply(offset_mm)
+    return float(x), float(y), float(z)
 
 
 @contextlib.asynccontextmanager
 async def reading(address: Address, framing: Framing) -> AsyncGenerator[ArmReader]:
     """Connect to a controller, yield a reader, and disconnect. Raises `WrongGeneration` and other `DeviceError`s."""
     connection = RpcConnection(address.host, address.port, framing=framing)
+    controller = Controller(connection)
     try:
         await open_arcs(connection, AUBOPE_PORT)
         await connection.login()
-        names = await connection.call("getRobotNames")
-        if not isinstance(names, list) or not names:
-            raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
-        yield ArmReader(connection, str(names[0]))  # pyright: ignore[reportUnknownArgumentType]
+        [controller.robot, *_] = await controller.robot_names()
+        yield ArmReader(controller)
     finally:
         await connection.close()
 

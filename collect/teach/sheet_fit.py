@@ -1,4 +1,4 @@
-"""Where the sheet and the board lie, from their touched corners; and which corners were taken for one another."""
+"""Where sheet and board lie, from their touched corners and by the camera; and which corners were mistaken."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from brushloop.calibrate.board.detect import BoardView
+from brushloop.calibrate.board.pix2len import apply, homography
 from brushloop.calibrate.board.spec import BoardSpec, size_mm
+from brushloop.calibrate.board.view import paper_mm
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.rig.paper import PlaneFit, fit_plane
+from brushloop.collect.rig.paper import PaperPlane, fit_plane
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -38,7 +42,7 @@ class SheetFit:
     yaw_deg: float
     size_mm: tuple[float, float]
     board_origin_mm: tuple[float, float]
-    plane: PlaneFit
+    plane: PaperPlane
     """Through all touched corners."""
     residuals_mm: dict[str, float]
     """Residual of each touch, along the sheet."""
@@ -113,8 +117,7 @@ def expected_mm(touched: Mapping[str, Sequence[Point]], name: str, spec: BoardSp
     """Where a corner of the board must lie, (x, y) in the base frame, by two or three others that were touched."""
     printed, known = corners_of(*size_mm(spec)), [CORNERS.index(corner) for corner in touched]
     places = np.array([np.mean(points, axis=0)[:2] for points in touched.values()])
-    angle = _turn(printed[known], places)
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turn = _rotation(_turn(printed[known], places))
     x, y = turn @ (printed[CORNERS.index(name)] - printed[known].mean(axis=0)) + places.mean(axis=0)
     return float(x), float(y)
 
@@ -134,56 +137,38 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
 
     def off(values: Floats) -> Floats:
         yaw, bx, by, sx, sy, width, height = values
-        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-        board_at = printed[bk] @ turn.T + [bx, by]
-        sheet_at = (corners_of(width, height)[sk] + [sx, sy]) @ turn.T + [bx, by]
+        turn = _rotation(yaw)
+        board_at, sheet_at = printed[bk] @ turn.T + [bx, by], corners_of(width, height)[sk] @ turn.T + [sx, sy]
         return np.concatenate([(b - board_at).ravel(), (s - sheet_at).ravel()])
 
     yaw0 = _turn(printed[bk], b)
-    turn0 = np.array([[math.cos(yaw0), -math.sin(yaw0)], [math.sin(yaw0), math.cos(yaw0)]])
-    at0 = b.mean(axis=0) - turn0 @ printed[bk].mean(axis=0)
-    local = (s - at0) @ turn0
-    left, low = local.min(axis=0)
-    right, high = local.max(axis=0)
-    solved = least_squares(off, np.array([yaw0, *at0, left, low, right - left, high - low]))
+    local = s @ _rotation(yaw0)
+    low, high = local.min(axis=0), local.max(axis=0)
+    board0 = b.mean(axis=0) - _rotation(yaw0) @ printed[bk].mean(axis=0)
+    solved = least_squares(off, np.array([yaw0, *board0, *(_rotation(yaw0) @ low), *(high - low)]))
     yaw, bx, by, sx, sy, width, height = (float(v) for v in solved.x)
     residuals = np.asarray(solved.fun, np.float64).reshape(-1, 2)
-    freedom = max(residuals.size - 7, 1)
-    noise_mm = max(math.sqrt(float((residuals**2).sum()) / freedom), HAND_MM)
+    noise_mm = max(math.sqrt(float((residuals**2).sum()) / max(residuals.size - 7, 1)), HAND_MM)
     slopes = np.asarray(solved.jac, np.float64)
-    spread = noise_mm**2 * np.asarray(np.linalg.inv(slopes.T @ slopes), np.float64)
-    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    origin = turn @ np.array([sx, sy]) + [bx, by]
-    by_values = _origin_slopes(yaw, sx, sy)
-    origin_spread = by_values @ spread @ by_values.T
+    sigmas = noise_mm * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    turn, origin = _rotation(yaw), np.array([sx, sy])
+    board_x, board_y = (float(v) for v in (np.array([bx, by]) - origin) @ turn)
     points = [p for _, p in (*on_board, *on_sheet)]
-    level = [(*((np.array(p[:2]) - origin) @ turn).tolist(), p[2]) for p in points]
-    plane = fit_plane([(float(x), float(y), float(z)) for x, y, z in level])
+    plane = fit_plane([(*((np.array(p[:2]) - origin) @ turn).tolist(), p[2]) for p in points])
     names = [f"board {CORNERS[k]}" for k in bk] + [f"sheet {CORNERS[k]}" for k in sk]
     lengths = [float(v) for v in np.linalg.norm(residuals, axis=1)]
     above_mm = max(math.sqrt(sum(r * r for r in plane.residuals_mm) / max(len(points) - 3, 1)), HAND_MM)
     return SheetFit(
-        (float(origin[0]), float(origin[1])),
+        (sx, sy),
         math.degrees(math.remainder(yaw, math.tau)),
         (width, height),
-        (-sx, -sy),
-        plane,
+        (board_x, board_y),
+        plane.plane,
         {f"{name} {number}": length for number, (name, length) in enumerate(zip(names, lengths, strict=True), 1)},
-        math.sqrt(float(np.diag(origin_spread).max())),
-        math.degrees(math.sqrt(float(spread[0, 0]))),
+        float(max(sigmas[3:5])),
+        math.degrees(float(sigmas[0])),
         above_mm / math.sqrt(len(points)),
         _scale(printed[bk], b),
-    )
-
-
-def _origin_slopes(yaw: float, sx: float, sy: float) -> Floats:
-    """(2, 7) change of the sheet's origin with yaw, bx, by, sx, sy, width, height."""
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return np.array(
-        [
-            [-sin * sx - cos * sy, 1.0, 0.0, cos, -sin, 0.0, 0.0],
-            [cos * sx - sin * sy, 0.0, 1.0, sin, cos, 0.0, 0.0],
-        ]
     )
 
 
@@ -208,6 +193,11 @@ def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Fl
         )
 
 
+def _rotation(angle: float) -> Floats:
+    """(2, 2) turn by an angle in rad."""
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
 def _turn(printed: Floats, touched: Floats) -> float:
     """Angle of the rigid fit, in rad."""
     a, b = printed - printed.mean(axis=0), touched - touched.mean(axis=0)
@@ -221,7 +211,90 @@ def _scale(printed: Floats, touched: Floats) -> float:
 
 
 def _distances(printed: Floats, touched: Floats) -> list[float]:
-    angle = _turn(printed, touched)
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    turn = _rotation(_turn(printed, touched))
     off = touched - touched.mean(axis=0) - (printed - printed.mean(axis=0)) @ turn.T
     return [float(v) for v in np.linalg.norm(off, axis=1)]
+
+
+# Where the camera sees the sheet end on its board
+
+
+Margins = tuple[float, float, float, float]
+"""How much of the board is free beside the sheet in mm: left, right, lower, upper."""
+SIDES = ("left", "right", "lower", "upper")
+STEP_MM = 0.25
+MIDDLE = 0.5
+"""Share of the sheet's width or height over which an edge is looked for: corners may be bent."""
+LEAST_CONTRAST = 12.0
+"""Least difference in gray levels between the board's pattern and the plain sheet, as standard deviations along it."""
+TIMES_PLAIN = 2.5
+"""Least ratio of the two: a board without a sheet must not pass for plain paper."""
+OFF_MM = 2.5
+"""A touched edge that the camera sees farther off than this is doubted: hand and camera together err by 1 mm."""
+MISTAKEN = (
+    ((1, 0, 3, 2), "the corners were named turned by half a turn: upper for lower, right for left"),
+    ((1, 0, 2, 3), "left and right corners were taken for one another, as in a mirror"),
+    ((0, 1, 3, 2), "lower and upper corners were taken for one another, as in a mirror"),
+)
+"""Which touched side each seen one is, if corners were taken for one another."""
+
+
+def touched_margins(fit: SheetFit, spec: BoardSpec) -> Margins:
+    """As they follow from the touched corners."""
+    (x, y), (width, height), (board_width, board_height) = fit.board_origin_mm, fit.size_mm, size_mm(spec)
+    return -x, board_width + x - width, -y, board_height + y - height
+
+
+def seen_margins(image: NDArray[np.uint8], view: BoardView, spec: BoardSpec, touched: Margins) -> Margins | None:
+    """Where the board's pattern ends on each side, looking outward from the middle of the touched sheet.
+
+    `image` is an undistorted photograph, `view` its board, whose spec has its origin at (0, 0). None where an edge is
+    not seen.
+    """
+    left, right, lower, upper = touched
+    board = np.array(size_mm(spec))
+    to_pixels = homography(paper_mm(view, spec), view.pixels, "camera")
+    middle = (np.array([left - right, lower - upper]) + board) / 2.0
+    half = MIDDLE * (board - [left + right, lower + upper]) / 2.0
+    seen: list[float] = []
+    for axis, outward in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        far = middle[axis] if outward < 0 else board[axis] - middle[axis]
+        out_mm = np.arange(0.0, far, STEP_MM)
+        beside_mm = np.arange(-half[1 - axis], half[1 - axis], STEP_MM)
+        points = np.empty((len(out_mm), len(beside_mm), 2))
+        points[..., axis] = middle[axis] + outward * out_mm[:, None]
+        points[..., 1 - axis] = middle[1 - axis] + beside_mm
+        at = apply(to_pixels, points.reshape(-1, 2)).reshape(points.shape).astype(np.float32)
+        gray = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        # The spread along the edge rises from that of plain paper to that of the pattern.
+        spread = np.asarray(gray, np.float64).std(axis=1)
+        plain, pattern = float(np.median(spread[: len(spread) // 3])), float(np.quantile(spread, 0.95))
+        if pattern - plain < LEAST_CONTRAST or pattern < TIMES_PLAIN * plain:
+            return None
+        seen.append(float(far - out_mm[int(np.argmax(spread > (plain + pattern) / 2.0))]))
+    return seen[0], seen[1], seen[2], seen[3]
+
+
+def check_seen(seen: Margins, touched: Margins) -> float:
+    """How far the touched edges are from the seen ones at worst, in mm.
+
+    Raises `CannotTeach` where that is more than `OFF_MM`, and says whether sides were taken for one another.
+    """
+
+    def off_mm(sides: tuple[int, ...]) -> float:
+        return max(abs(seen[k] - touched[side]) for k, side in enumerate(sides))
+
+    if (as_named_mm := off_mm((0, 1, 2, 3))) <= OFF_MM:
+        return as_named_mm
+    for sides, what in MISTAKEN:
+        if off_mm(sides) <= OFF_MM:
+            raise CannotTeach(
+                f"the camera sees the sheet elsewhere on its board: {what}.",
+                "Touch the corners of board and sheet again; lower left is the one beside the beginning of its name.",
+            )
+    pairs = zip(SIDES, seen, touched, strict=True)
+    listed = ", ".join(f"{side} {far:.1f} mm ({by_hand:.1f} touched)" for side, far, by_hand in pairs)
+    raise CannotTeach(
+        f"the camera sees other margins of the board beside the sheet than were touched: {listed}.",
+        "Sheet or board has moved, or a corner was touched beside the sheet: touch all corners again.",
+    )

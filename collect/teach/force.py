@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.config_devices import ForceConfig
 from brushloop.collect.rig.devices import make_force
-from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.guide import Target
-from brushloop.collect.teach.maths.sheet import corners_of
-from brushloop.collect.teach.store import Notebook, StepName, Taught, now_utc
+from brushloop.collect.teach.day import Asked, Day, Step
+from brushloop.collect.teach.guide import Question, Target
+from brushloop.collect.teach.sheet_fit import corners_of
+from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import ForceSample
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 
+BUS = Asked("aside.bus", "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor")
 CHANNEL = "can0"
 """Channel of a gateway, unless one was typed."""
 REST_S = 1.0
@@ -40,23 +41,23 @@ INSET_MM = 6.0
 class ForceStep(Step):
     """Where the sensor is, which way it points, and how zero touch is done."""
 
-    name: StepName = "force"
+    name = "force"
     title = "Force sensor"
     minutes = 3
-    needs: tuple[StepName, ...] = ("sheet",)
+    needs = ("sheet",)
+    observes = ("force.", "touch.", "aside.bus", "aside.force_noise_n")
 
     async def teach(self, day: Day) -> None:
         """Find the sensor and have it pushed. Raises `CannotTeach`, `DeviceError`."""
-        question = "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor"
-        if "aside.bus" not in day.notebook.values:
-            bus = (await day.guide.text(question, "")).strip()
-            with day.together():
-                for field, value in _addressed(bus).items():
-                    day.keep("force", f"force.{field}", value, "typed")
-                if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
-                    how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
-                    day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, unit="ms")
-                day.keep("force", "aside.bus", bus, "typed")
+        await day.values("force", BUS)
+        with day.touched_again_if_refused("aside.bus"):
+            fields = _addressed(str(day.notebook.get("aside.bus")))
+        with day.together():
+            for field, value in fields.items():
+                day.keep("force", f"force.{field}", value, "typed")
+            if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
+                how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
+                day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, "ms")
         if not day.notebook.get("aside.bus"):
             await day.say(
                 "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
@@ -67,7 +68,7 @@ class ForceStep(Step):
 
     async def _pushed(self, day: Day) -> None:
         samples = list[ForceSample]()
-        sensor = make_force(config_of(day.notebook), day.clock)
+        sensor = make_force(ForceConfig.model_validate(day.notebook.table("force.")), day.clock)
         try:
             await day.working("listening to the sensor; let nothing touch the brush")
             identity = await sensor.connect()
@@ -81,7 +82,7 @@ class ForceStep(Step):
                 "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
                 "then take the finger away."
             )
-            await day.guide.bring(Target("push-sensor"), how)
+            await day.ask(Question("bring", how, target=Target("push-sensor")))
             await day.working("waiting for the end of the push")
             force_n = await self._push(samples)
         finally:
@@ -96,7 +97,7 @@ class ForceStep(Step):
             )
         with day.together():
             day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
-            day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", unit="N")
+            day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", "N")
 
     async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
         """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
@@ -110,27 +111,18 @@ class ForceStep(Step):
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """How zero touch is done: by force, or by jogging, at four points."""
         size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
-        sensor = bool(notebook.get("aside.bus"))
+        method, why = ("force", "a sensor was found") if notebook.get("aside.bus") else ("jog", "no sensor")
         middle = np.array([size_x_mm, size_y_mm]) / 2.0
         points = middle + (corners_of(size_x_mm, size_y_mm) - middle) * (1.0 - INSET_MM / middle)
-
-        def taught(value: str | float | list[list[float]], how: str) -> Taught:
-            return Taught(value=value, how=how, at=now_utc(), step="force")
-
-        found = {"touch.method": taught("force" if sensor else "jog", "a sensor was found" if sensor else "no sensor")}
         _, slope_x, slope_y = notebook.numbers("aside.plane")
         lean_deg = math.degrees(math.atan(math.hypot(slope_x, slope_y)))
         widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
-        return found | {
-            "touch.points_mm": taught(points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
-            "touch.lean_deg": taught(
-                widest_deg, f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
-            ),
+        leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
+        return {
+            "touch.method": taught("force", method, why),
+            "touch.points_mm": taught("force", points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
+            "touch.lean_deg": taught("force", widest_deg, leans),
         }
-
-    def forget(self, notebook: Notebook) -> Notebook:
-        """Without bus and push."""
-        return notebook.without("force.", "touch.", "aside.bus", "aside.force_noise_n")
 
     def summary(self, notebook: Notebook) -> str:
         """The bus and the axis."""
@@ -152,14 +144,6 @@ def _addressed(bus: str) -> dict[str, str | int]:
         raise CannotTeach(f"{bus!r} is no bus.", "Type can0, or HOST:PORT/can0 of a gateway.")
     at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or CHANNEL}
     return {**at, "host": host, "port": int(port)}
-
-
-def config_of(notebook: Notebook) -> ForceConfig:
-    """The sensor as it was addressed."""
-    fields = {
-        field.removeprefix("force."): t.value for field, t in notebook.values.items() if field.startswith("force.")
-    }
-    return ForceConfig.model_validate(fields)
 
 
 def strongest(samples: list[ForceSample], over: int = 20) -> NDArray[np.float64]:

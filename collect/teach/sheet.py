@@ -10,26 +10,27 @@ import numpy as np
 
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import read_lens
-from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.teach.arm_reader import ArmReader
-from brushloop.collect.teach.cameras import still, taught_camera
+from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.camera import board_of, still, taught_camera
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.guide import Target, TargetKind
 from brushloop.collect.teach.jog import touch
-from brushloop.collect.teach.maths.sheet import (
+from brushloop.collect.teach.sheet_fit import (
     CORNERS,
+    OFF_MM,
     Point,
     SheetFit,
     check_board,
+    check_seen,
     corners_of,
     expected_mm,
     fit_sheet,
+    seen_margins,
+    touched_margins,
 )
-from brushloop.collect.teach.maths.sheet_seen import OFF_MM, check_seen, seen_margins, touched_margins
-from brushloop.collect.teach.maths.tip import tip_of
-from brushloop.collect.teach.store import Notebook, StepName, Taught, now_utc
+from brushloop.collect.teach.store import Notebook, Taught, taught
 
 BOARD: TargetKind = "board-corner"
 SHEET: TargetKind = "sheet-corner"
@@ -48,10 +49,11 @@ INSET_MM = 2.0
 class SheetStep(Step):
     """Origin, turn, size and plane of the sheet, and the board's place on it."""
 
-    name: StepName = "sheet"
+    name = "sheet"
     title = "Sheet and board"
     minutes = 8
-    needs: tuple[StepName, ...] = ("camera", "tip")
+    needs = ("camera", "tip")
+    observes = (BOARD, SHEET, VIEW, SEEN)
 
     async def teach(self, day: Day) -> None:
         """Have the corners touched until the origin is known well enough. Raises `CannotTeach`, `StepError`."""
@@ -67,26 +69,29 @@ class SheetStep(Step):
                         continue  # the sheet's own corners give its origin, and need more touches
                     for corner in CORNERS:
                         how = f"Bring the tip to the {corner} corner of {thing}" + (" once more." if number else ".")
-                        await touch(
-                            day, reader, Target(kind, number, corner, may_skip=True), how, f"{kind} {number} {corner}"
-                        )
+                        target = Target(kind, number, corner)
+                        await touch(day, reader, target, how, f"{kind} {number} {corner}", may_skip=True)
                     if kind == BOARD:
                         with day.touched_again_if_refused(BOARD):
-                            check_board(all_corners(day.notebook, BOARD, "board"), board_of(day.notebook))
+                            check_board(all_corners(day.notebook, BOARD), board_of(day.notebook))
                 with day.touched_again_if_refused(SHEET):
                     fit = fitted(day.notebook)
                 await day.say(*in_words(fit))
                 if fit.origin_sigma_mm <= GOOD_MM:
                     break
             with day.touched_again_if_refused(BOARD, SHEET):
-                check_known(fitted(day.notebook))
+                if (sigma_mm := fitted(day.notebook).origin_sigma_mm) > WORST_MM:
+                    raise CannotTeach(
+                        f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
+                        "Fix the sheet, hold still while you press Enter, and touch the corners again.",
+                    )
             if SEEN not in day.notebook.values:
                 await self._seen(day, reader)
 
     async def _seen(self, day: Day, reader: ArmReader) -> None:
         """Compare the touched sheet with the one that the camera sees on the board. Raises `CannotTeach`."""
         how = "Guide the arm so far away that it hides neither board nor sheet from the camera."
-        if await touch(day, reader, Target("clear-view", 1, may_skip=True), how, f"{VIEW} 0") is None:
+        if await touch(day, reader, Target("clear-view", 1), how, f"{VIEW} 0", may_skip=True) is None:
             found = "not checked against the camera: the arm was in its way"
         else:
             await day.working("looking for the sheet's edges on the board")
@@ -98,37 +103,26 @@ class SheetStep(Step):
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Everything that follows from the touched corners and the tip."""
         fit = fitted(notebook)
+        plane, sigma_mm, point = fit.plane, fit.origin_sigma_mm, touch_point(fit)
         touches = len(notebook.touched(BOARD)) + len(notebook.touched(SHEET))
-        worst_mm = max(fit.residuals_mm.values())
-        by_hand = f"{touches} corners of board and sheet touched by hand"
-        known = f"residuals up to {worst_mm:.2f} mm; {notebook.get(SEEN) or 'not checked against the camera'}"
-        point = touch_point(fit)
-
-        def taught(
-            value: list[float] | float, unit: str, sigma: float | None, how: str = by_hand, more: str = known
-        ) -> Taught:
-            return Taught(value=value, unit=unit, how=how, sigma=sigma, known=more, at=now_utc(), step="sheet")
-
+        how = f"{touches} corners of board and sheet touched by hand"
+        known = (
+            f"residuals up to {max(fit.residuals_mm.values()):.2f} mm; "
+            f"{notebook.get(SEEN) or 'not checked against the camera'}"
+        )
+        leaning = f"the sheet leans by {plane.slope_deg:.2f} deg; not yet measured by touch"
+        z_mm, depth_mm = plane.touch_z_mm(*point), fit.depth_sigma_mm
         return {
-            "paper.origin_mm": taught(list(fit.origin_mm), "mm", fit.origin_sigma_mm),
-            "paper.yaw_deg": taught(fit.yaw_deg, "deg", fit.yaw_sigma_deg),
-            "paper.size_mm": taught(list(fit.size_mm), "mm", fit.origin_sigma_mm),
-            "paper.touch_point_mm": taught(list(point), "mm", None, "beside every patch", ""),
-            "paper.touch_z_mm": taught(
-                fit.plane.plane.touch_z_mm(*point),
-                "mm",
-                fit.depth_sigma_mm,
-                more=f"the sheet leans by {fit.plane.plane.slope_deg:.2f} deg; not yet measured by touch",
-            ),
-            "board.origin_mm": taught(list(fit.board_origin_mm), "mm", fit.origin_sigma_mm),
+            "paper.origin_mm": taught("sheet", list(fit.origin_mm), how, "mm", sigma=sigma_mm, known=known),
+            "paper.yaw_deg": taught("sheet", fit.yaw_deg, how, "deg", sigma=fit.yaw_sigma_deg, known=known),
+            "paper.size_mm": taught("sheet", list(fit.size_mm), how, "mm", sigma=sigma_mm, known=known),
+            "paper.touch_point_mm": taught("sheet", list(point), "beside every patch", "mm"),
+            "paper.touch_z_mm": taught("sheet", z_mm, how, "mm", sigma=depth_mm, known=leaning),
+            "board.origin_mm": taught("sheet", list(fit.board_origin_mm), how, "mm", sigma=sigma_mm, known=known),
             "aside.plane": taught(
-                [fit.plane.plane.z0_mm, fit.plane.plane.slope_x, fit.plane.plane.slope_y], "mm", fit.depth_sigma_mm
+                "sheet", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=depth_mm, known=known
             ),
         }
-
-    def forget(self, notebook: Notebook) -> Notebook:
-        """Without the touches of both."""
-        return notebook.without(SEEN).without_touches(BOARD, SHEET, VIEW)
 
     def summary(self, notebook: Notebook) -> str:
         """Origin and turn."""
@@ -139,7 +133,7 @@ class SheetStep(Step):
 async def _compared(day: Day) -> str:
     """What the camera says of the touched sheet. Raises `CannotTeach` where it sees it elsewhere."""
     spec, fit = board_of(day.notebook), fitted(day.notebook)
-    touched = touched_margins(fit.board_origin_mm, fit.size_mm, spec)
+    touched = touched_margins(fit, spec)
     try:
         async with taught_camera(day.notebook, day.clock) as camera:
             picture = await still(camera, day.clock)
@@ -158,36 +152,18 @@ async def _compared(day: Day) -> str:
 
 def touch_point(fit: SheetFit) -> tuple[float, float]:
     """Inside the lowest corner of the sheet: the floor of every press is counted from there."""
-    points = np.array(fit.size_mm) / 2.0 + (corners_of(*fit.size_mm) - np.array(fit.size_mm) / 2.0) * (
-        1.0 - 2.0 * INSET_MM / np.array(fit.size_mm)
-    )
-    x, y = min(points.tolist(), key=lambda at: fit.plane.plane.touch_z_mm(at[0], at[1]))
+    middle = np.array(fit.size_mm) / 2.0
+    points = middle + (corners_of(*fit.size_mm) - middle) * (1.0 - INSET_MM / middle)
+    x, y = min(points.tolist(), key=lambda at: fit.plane.touch_z_mm(at[0], at[1]))
     return round(x, 3), round(y, 3)
 
 
-def board_of(notebook: Notebook) -> BoardSpec:
-    """The print as it was described, its lower left corner at the origin."""
-    across, along = notebook.numbers("board.squares")
-    return BoardSpec(
-        squares=(int(across), int(along)),
-        square_mm=notebook.number("board.square_mm"),
-        marker_mm=notebook.number("board.marker_mm"),
-        dictionary=str(notebook.get("board.dictionary")),
-        origin_mm=(0.0, 0.0),
-    )
-
-
-def corners(notebook: Notebook, kind: str) -> dict[str, list[Point]]:
-    """The tip at every touch of each corner, in the base frame."""
+def all_corners(notebook: Notebook, kind: TargetKind) -> dict[str, list[Point]]:
+    """The tip at every touch of each corner, in the base frame. Raises `CannotTeach` where a corner was skipped."""
     offset_mm, found = notebook.numbers("robot.tcp_offset_mm"), defaultdict[str, list[Point]](list)
     for name, flange in notebook.touched(kind).items():
         found[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
-    return dict(found)
-
-
-def all_corners(notebook: Notebook, kind: str, thing: str) -> dict[str, list[Point]]:
-    """The same as `corners`. Raises `CannotTeach` where a corner was skipped."""
-    found = corners(notebook, kind)
+    thing = kind.removesuffix("-corner")
     missing = [f"{thing} {name}" for name in CORNERS if name not in found]
     if missing:
         how_far = _how_far(found, notebook) if kind == BOARD else "nearer to it"
@@ -196,7 +172,7 @@ def all_corners(notebook: Notebook, kind: str, thing: str) -> dict[str, list[Poi
             "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
             f"board with the sheet {how_far}, and touch all corners again.",
         )
-    return found
+    return dict(found)
 
 
 def _how_far(found: dict[str, list[Point]], notebook: Notebook) -> str:
@@ -205,28 +181,18 @@ def _how_far(found: dict[str, list[Point]], notebook: Notebook) -> str:
         return "nearer to it"
     spec = board_of(notebook)
     away_mm = [math.hypot(*expected_mm(found, name, spec)) for name in CORNERS if name not in found]
-    if max(away_mm) > EASY_MM[1]:
-        return (
-            f"by {max(away_mm) - EASY_MM[1]:.0f} mm nearer to its foot, from which that corner is {max(away_mm):.0f} mm"
-        )
-    if min(away_mm) < EASY_MM[0]:
-        return f"by {EASY_MM[0] - min(away_mm):.0f} mm away from its foot, to which that corner is too near"
+    nearest_mm, farthest_mm = EASY_MM
+    if max(away_mm) > farthest_mm:
+        more_mm = max(away_mm) - farthest_mm
+        return f"by {more_mm:.0f} mm nearer to its foot, from which that corner is {max(away_mm):.0f} mm"
+    if min(away_mm) < nearest_mm:
+        return f"by {nearest_mm - min(away_mm):.0f} mm away from its foot, to which that corner is too near"
     return "nearer to it, or turn its wrist the other way round"
 
 
 def fitted(notebook: Notebook) -> SheetFit:
     """The sheet from everything touched so far. Raises `CannotTeach` where a corner was skipped."""
-    board, sheet = all_corners(notebook, BOARD, "board"), all_corners(notebook, SHEET, "sheet")
-    return fit_sheet(board, sheet, board_of(notebook))
-
-
-def check_known(fit: SheetFit) -> None:
-    """Raise `CannotTeach` unless the origin is known well enough."""
-    if fit.origin_sigma_mm > WORST_MM:
-        raise CannotTeach(
-            f"the corner of the sheet is known to {fit.origin_sigma_mm:.2f} mm only.",
-            "Fix the sheet, hold still while you press Enter, and touch the corners again.",
-        )
+    return fit_sheet(all_corners(notebook, BOARD), all_corners(notebook, SHEET), board_of(notebook))
 
 
 def in_words(fit: SheetFit) -> tuple[str, ...]:
@@ -236,7 +202,7 @@ def in_words(fit: SheetFit) -> tuple[str, ...]:
     return (
         f"sheet of {width:.1f} x {height:.1f} mm, origin ({x:.2f}, {y:.2f}) mm, known to {fit.origin_sigma_mm:.2f} mm "
         f"(goal {GOOD_MM:g}), turned by {fit.yaw_deg:.2f} +- {fit.yaw_sigma_deg:.2f} deg, leaning by "
-        f"{fit.plane.plane.slope_deg:.2f} deg",
+        f"{fit.plane.slope_deg:.2f} deg",
         f"largest residual: {worst}, {fit.residuals_mm[worst]:.2f} mm; "
         f"the board measures {100 * fit.scale:.2f} % of its printed size",
     )

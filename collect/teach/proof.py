@@ -18,8 +18,8 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.rig_text import rig_of, rig_text
-from brushloop.collect.teach.store import Notebook, StepName
+from brushloop.collect.teach.guide import Question
+from brushloop.collect.teach.store import Notebook, rig_of, rig_text
 from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
@@ -39,10 +39,10 @@ POLL_S = 0.1
 class ProofStep(Step):
     """Prove the whole rig; it is ready once it has passed."""
 
-    name: StepName = "proof"
+    name = "proof"
     title = "Proof"
     minutes = 20
-    needs: tuple[StepName, ...] = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
+    needs = ("arm", "camera", "tip", "sheet", "places", "brush", "force", "limits")
 
     async def teach(self, day: Day) -> None:
         """Prove what was taught, and measure height and delay by it. Raises `CannotTeach` and what the run raises."""
@@ -115,24 +115,24 @@ class ProofStep(Step):
                 doing = now.step
                 await day.working(f"run: {doing}")
             if (asked := now.prompt) is not None:
-                engine.answer(asked.number, await day.person.choose(asked.question, asked.choices, asked.default))
+                question = Question("choose", asked.question, asked.choices, asked.default)
+                engine.answer(asked.number, str(await day.guide.ask(question)))
             await asyncio.sleep(POLL_S)
 
     async def _keep(self, day: Day, proven: Proven) -> None:
-        plane, touch_point = proven.plane, day.notebook.numbers("paper.touch_point_mm")
-        z_mm = plane.touch_z_mm(touch_point[0], touch_point[1])
-        by_hand_mm = day.notebook.number("paper.touch_z_mm")
+        plane, by_hand_mm = proven.plane, day.notebook.number("paper.touch_z_mm")
+        x, y = day.notebook.numbers("paper.touch_point_mm")
+        z_mm, sigma_mm, delay_ms = plane.touch_z_mm(x, y), max(proven.sigma_mm, 0.01), proven.delay_ms
         known = f"residuals up to {proven.worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
-        sigma = max(proven.sigma_mm, 0.01)
         how = f"touched by {proven.method}, leaning by {plane.slope_deg:.2f} deg"
+        later, jitter = (
+            "the arm was seen to leave the picture later than it did",
+            f"trips differ by {proven.jitter_ms:.0f} ms",
+        )
         with day.together():
-            day.keep("proof", "paper.touch_z_mm", z_mm, how, unit="mm", sigma=sigma, known=known)
-            plane_mm = [plane.z0_mm, plane.slope_x, plane.slope_y]
-            day.keep("proof", "aside.plane", plane_mm, how, unit="mm", sigma=sigma)
-            delay_ms = proven.delay_ms
-            how = "the arm was seen to leave the picture later than it did"
-            known_to = f"trips differ by {proven.jitter_ms:.0f} ms"
-            day.keep("proof", "camera.latency_ms", delay_ms, how, unit="ms", known=known_to)
+            day.keep("proof", "paper.touch_z_mm", z_mm, how, "mm", sigma=sigma_mm, known=known)
+            day.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=sigma_mm)
+            day.keep("proof", "camera.latency_ms", delay_ms, later, "ms", known=jitter)
         await day.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
             f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "
@@ -159,15 +159,15 @@ class ProofStep(Step):
 def slowly(rig: RigConfig) -> RigConfig:
     """The same rig, with no move faster than 50 mm/s, and a delay of the camera that is measured to a tenth."""
     motion, limits = rig.motion, rig.robot.limits
-    slow = motion.model_copy(
+    slow = {name: min(getattr(motion, name), SLOW_MM_S) for name in ("travel_speed_mm_s", "press_speed_mm_s")}
+    capped = limits.model_copy(update={"speed_mm_s": min(limits.speed_mm_s, 50.0)})
+    return rig.model_copy(
         update={
-            "travel_speed_mm_s": min(motion.travel_speed_mm_s, SLOW_MM_S),
-            "press_speed_mm_s": min(motion.press_speed_mm_s, SLOW_MM_S),
+            "motion": motion.model_copy(update=slow),
+            "robot": rig.robot.model_copy(update={"limits": capped}),
+            "camera": rig.camera.model_copy(update={"exact_delay": True}),
         }
     )
-    capped = limits.model_copy(update={"speed_mm_s": min(limits.speed_mm_s, 50.0)})
-    robot, camera = rig.robot.model_copy(update={"limits": capped}), rig.camera.model_copy(update={"exact_delay": True})
-    return rig.model_copy(update={"motion": slow, "robot": robot, "camera": camera})
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,8 +232,8 @@ def folder_beside(rig_path: Path) -> Path:
 
 def _with_lens_at(day: Day) -> str:
     """`rig.toml` for another folder: it names the lens file by its whole path."""
-    field = "camera.lens_file"
-    if (taught := day.notebook.values.get(field)) is None:
-        return rig_text(day.notebook, day.rig_path)
-    path = str((day.rig_path.parent / str(taught.value)).absolute())
-    return rig_text(day.notebook.with_values({field: taught.model_copy(update={"value": path})}), day.rig_path)
+    field, notebook = "camera.lens_file", day.notebook
+    if (lens := notebook.values.get(field)) is not None:
+        path = str((day.rig_path.parent / str(lens.value)).absolute())
+        notebook = notebook.with_values({field: lens.model_copy(update={"value": path})})
+    return rig_text(notebook, day.rig_path)

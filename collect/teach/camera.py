@@ -1,0 +1,337 @@
+"""Step 2: the camera, the print of the board, and the lens by photographs of the board held in hand."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import itertools
+import time
+from collections.abc import AsyncGenerator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from brushloop.calibrate.board.detect import BoardView, find_board
+from brushloop.calibrate.board.intrinsics import (
+    GOOD_VIEWS,
+    LensFile,
+    distinct_views,
+    fit_lens,
+    guidance,
+    held,
+    nominal_normals,
+)
+from brushloop.calibrate.board.spec import BoardSpec, describe
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.files import read_gray
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.operator import Choice
+from brushloop.collect.rig.optics import gray
+from brushloop.collect.teach.day import Asked, Day, Step
+from brushloop.collect.teach.guide import Brought, Question, Target
+from brushloop.collect.teach.store import Notebook
+from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
+from brushloop.drivers.devices import Stamp
+from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.host import Clock
+
+Gray = NDArray[np.uint8]
+LATE_MS = 2500.0
+"""Until the delay is measured, a picture counts as taken this long before it came: no useful camera is slower."""
+RATE_S = 2.0
+"""How long frames are counted."""
+TILE_PX, NUMBER_PX = (480, 360), 64
+"""Width and height of one picture beside others, and the side of the square with its number."""
+VIEW = "aside.lens_view_"
+"""Beginning of the names of the photographs of the held board: their digests."""
+MOST_VIEWS = 20
+HOLD = (
+    "flat in the middle of the picture",
+    "slanted to the left",
+    "slanted to the right",
+    "slanted away from the camera",
+    "slanted toward the camera",
+    "in the upper left of the picture",
+    "in the upper right of the picture",
+    "in the lower right of the picture",
+    "in the lower left of the picture",
+    "turned by a quarter and slanted",
+)
+MIRRORED = (
+    "Switch mirroring (`flip`) off in the camera's own set-up, or take the mirror out of its way; then try again."
+)
+OTHER_PRINT = (
+    "Count the squares of the print again, the outermost ones too, and measure one; then teach the camera again."
+)
+FROM_PRINT = "typed from the board's print"
+PRINT = (
+    Asked("aside.squares_across", "Squares along its longer side, as printed", "squares", 3, 50, whole=True),
+    Asked("aside.squares_along", "Squares along its shorter side, as printed", "squares", 3, 50, whole=True),
+    Asked(
+        "board.square_mm", "Side of a square (ten of them by calipers, divided by ten)", "mm", 2.0, 100.0, FROM_PRINT
+    ),
+    Asked(
+        "board.marker_mm",
+        "Side of a marker",
+        "mm",
+        1.0,
+        100.0,
+        FROM_PRINT,
+        default=lambda book: f"{0.75 * book.number('board.square_mm'):g}",
+    ),
+    Asked("board.dictionary", "Markers of the print", how=FROM_PRINT, default="DICT_5X5_1000"),
+)
+PRINTED = ("board.squares", "board.square_mm", "board.marker_mm", "board.dictionary", "aside.squares_")
+
+
+class CameraStep(Step):
+    """Source, settings, frame rate, print of the board, lens."""
+
+    name = "camera"
+    title = "Find the camera"
+    minutes = 12
+    needs = ("arm",)
+    observes = ("camera.", *PRINTED, "aside.sources", "aside.frame_rate_hz", "aside.lens_folder", VIEW)
+
+    async def teach(self, day: Day) -> None:
+        """Ask for source and print, measure the rest. Raises `CannotTeach`, `DeviceError`, `CalibrationError`."""
+        if "board.squares" not in day.notebook.values:
+            await self._print(day)
+        if "camera.source" not in day.notebook.values:
+            await self._source(day)
+        async with taught_camera(day.notebook, day.clock) as camera:
+            await day.working("counting frames, looking for the board")
+            if "aside.frame_rate_hz" not in day.notebook.values:
+                rate_hz = await frame_rate_hz(camera)
+                day.keep("camera", "aside.frame_rate_hz", rate_hz, "frames counted", "Hz")
+                await day.say(f"{rate_hz:.1f} frames per second; the delay is measured in the last step, by the arm.")
+            await self._first_look(day, await still(camera, day.clock))
+            await self._lens(day, camera)
+
+    async def _print(self, day: Day) -> None:
+        await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
+        await day.values("camera", *PRINT)
+        squares: list[float] = [int(day.notebook.number(f"aside.squares_{side}")) for side in ("across", "along")]
+        try:
+            with day.together():
+                day.keep("camera", "board.squares", squares, FROM_PRINT)
+                board_of(day.notebook)
+        except ValueError as error:
+            day.save(day.notebook.without(*PRINTED))
+            raise CannotTeach(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
+
+    async def _source(self, day: Day) -> None:
+        devices = sorted((p.name[5:] for p in Path("/dev").glob("video*") if p.name[5:].isdecimal()), key=int)
+        if devices:
+            await day.say(f"Video devices of this computer: {', '.join(devices)}")
+        question = "Address of the camera's stream, as http://192.0.2.8/stream.mjpg (several: separated by spaces)"
+        await day.values("camera", Asked("aside.sources", question))
+        typed = str(day.notebook.get("aside.sources")).split()
+        seen = {source: await self._looked_at(day, source) for source in dict.fromkeys([*typed, *devices])}
+        usable = {source: look for source, look in seen.items() if look is not None}
+        if not usable:
+            day.save(day.notebook.without("aside.sources"))
+            raise CannotTeach("no camera gives a picture.", "Check power, cable and address; then try again.")
+        source = max(usable, key=lambda source: usable[source][0])
+        if len(usable) > 1:
+            choices = tuple(Choice(str(number), source) for number, source in enumerate(usable, 1))
+            pictures = side_by_side([picture for _, picture in usable.values()])
+            await day.say(f"{len(usable)} cameras give a picture, numbered as below.", picture=pictures)
+            best = next(choice.key for choice in choices if choice.label == source)
+            chosen = await day.choose("Which of them looks at the sheet?", choices, best)
+            source = next(choice.label for choice in choices if choice.key == chosen)
+        # What a device chose by itself; the settings of a stream only its own set-up can change.
+        locked = await asyncio.to_thread(found_settings, int(source), RATE_S) if source.isdecimal() else {}
+        if not locked:
+            await day.say(
+                "The settings of a stream cannot be set from here: switch automatic exposure, white balance and focus "
+                "off in the camera's own set-up.",
+                tone="warning",
+            )
+        with day.together():
+            day.keep("camera", "camera.kind", "opencv", "the only kind")
+            for name, value in locked.items():
+                whole = int(value) if name in ("width", "height") else value
+                day.keep("camera", f"camera.locked.{name}", whole, "chosen by the camera itself, locked, read back")
+            day.keep("camera", "camera.source", source, "typed or found, and its picture was seen")
+
+    async def _looked_at(self, day: Day, source: str) -> tuple[int, Gray] | None:
+        """Show a picture of a camera; return how many corners of the board it shows, and the picture, if any."""
+        await day.working(f"waiting for a picture of {source}")
+        try:
+            async with opened(source, day.clock) as camera:
+                picture = await still(camera, day.clock)
+        except DeviceError as error:
+            await day.say(f"{source}: {error.what}", tone="warning")
+            return None
+        height, width = picture.shape
+        try:
+            corners = len((await asyncio.to_thread(find_board, picture, board_of(day.notebook), source)).ids)
+            what = f"{corners} corners of the board are seen"
+        except CalibrationError as error:
+            corners, what = 0, error.what
+        await day.say(f"{source}: {width} x {height} px; {what}", picture=picture)
+        return corners, picture
+
+    async def _first_look(self, day: Day, picture: Gray) -> None:
+        """The board where it lies: a mirrored camera and a wrong print show at once."""
+        try:
+            await asyncio.to_thread(find_board, picture, board_of(day.notebook), "camera")
+        except CalibrationError as error:
+            if "mirrored" in error.what:
+                raise CannotTeach(f"{error.what}.", MIRRORED) from None
+            if "another board" in error.what or "arranged" in error.what:
+                day.save(day.notebook.without(*PRINTED))
+                raise CannotTeach(f"{error.what}.", OTHER_PRINT) from None
+            await day.say(f"The board is not seen yet: {error.what}", picture=picture, tone="warning")
+
+    async def _lens(self, day: Day, camera: OpenCvCamera) -> None:
+        """Fit the lens to photographs of the held board; nothing where the person skips the first ones."""
+        spec, folder = board_of(day.notebook), self._folder(day)
+        views = [
+            await asyncio.to_thread(find_board, read_gray(folder / name), spec, name)
+            for name in taken(day.notebook, folder)
+        ]
+        for index in range(MOST_VIEWS):
+            path = folder / f"{index:02d}.png"
+            if path.name in taken(day.notebook, folder):
+                continue
+            if len(views) >= GOOD_VIEWS and not still_missing(views):
+                break
+            where = HOLD[index] if index < len(HOLD) else "where it is still missing"
+            if not await self._held(day, camera, path, where, views) and not views:
+                await day.say("Without a lens file, straight lines must look straight in the picture.", tone="warning")
+                return
+            if views and (todo := still_missing(views)):
+                await day.say(*todo)
+        await day.working("computing the lens")
+        digests = {name: digest(folder / name) for name in taken(day.notebook, folder)}
+        file = await asyncio.to_thread(fit_lens, views, describe(spec), digests, {})
+        for warning in (*file.warnings, *file.guidance):
+            await day.say(warning, tone="warning")
+        await self._keep_lens(day, file)
+
+    def _folder(self, day: Day) -> Path:
+        """Where the photographs of the lens are, so that a resumed session does not take them again."""
+        if "aside.lens_folder" not in day.notebook.values:
+            names = (f"{day.rig_path.stem}.lens-{number}" for number in itertools.count(1))
+            name = next(name for name in names if not (day.rig_path.parent / name).exists())
+            day.keep("camera", "aside.lens_folder", name, "photographs of the board held in hand")
+        folder = day.rig_path.parent / str(day.notebook.get("aside.lens_folder"))
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    async def _held(self, day: Day, camera: OpenCvCamera, path: Path, where: str, views: list[BoardView]) -> bool:
+        """Take one photograph of the held board; False where the person skips it."""
+        how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
+        held_board = Target("hold-board", int(path.stem))
+        if await day.ask(Question("bring", how, target=held_board, may_skip=True)) is not Brought.DONE:
+            return False
+        await day.working("looking for the board in the picture")
+        picture = await still(camera, day.clock)
+        try:
+            view = await asyncio.to_thread(find_board, picture, board_of(day.notebook), path.name)
+        except CalibrationError as error:
+            if "mirrored" in error.what:
+                raise CannotTeach(f"{error.what}.", MIRRORED) from None
+            await day.say(f"not used: {error.what}", picture=picture, tone="warning")
+            return True
+        await asyncio.to_thread(cv2.imwrite, str(path), picture)
+        day.keep("camera", VIEW + path.stem, digest(path), "photograph of the board held in hand")
+        views.append(view)
+        return True
+
+    async def _keep_lens(self, day: Day, file: LensFile) -> None:
+        path, reach = file.save(day.rig_path.parent), file.focal_reach_px
+        how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
+        known = f"residual {file.rms_px:.2f} px"
+        known += "" if reach is None else f", focal length to +-{max(reach):.1f} px (95 %)"
+        day.keep("camera", "camera.lens_file", str(path.relative_to(day.rig_path.parent)), how, known=known)
+        await day.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
+
+    def summary(self, notebook: Notebook) -> str:
+        """Source and rate."""
+        return f"{notebook.get('camera.source')}, {notebook.number('aside.frame_rate_hz'):.0f} frames/s"
+
+
+def taken(notebook: Notebook, folder: Path) -> list[str]:
+    """Names of the photographs of the held board that are still as they were taken, and were not taken back."""
+    named = {f"{number}.png": seen for number, seen in notebook.table(VIEW).items()}
+    return sorted(name for name, seen in named.items() if (folder / name).is_file() and digest(folder / name) == seen)
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:
+    """Instructions for further photographs; empty where the views suffice. At least one view."""
+    distinct, _ = distinct_views(views)
+    normals = nominal_normals(distinct)
+    slants_deg = np.degrees(np.arccos(np.clip(normals[:, 2], -1.0, 1.0))).tolist()
+    return guidance(distinct, slants_deg, int(held(normals).max()) + 1)
+
+
+def board_of(notebook: Notebook) -> BoardSpec:
+    """The print as it was described, its lower left corner at the origin. Raises ValueError where there is none."""
+    across, along = notebook.numbers("board.squares")
+    return BoardSpec(
+        squares=(int(across), int(along)),
+        square_mm=notebook.number("board.square_mm"),
+        marker_mm=notebook.number("board.marker_mm"),
+        dictionary=str(notebook.get("board.dictionary")),
+        origin_mm=(0.0, 0.0),
+    )
+
+
+@contextlib.asynccontextmanager
+async def opened(source: str, clock: Clock, locked: Locked | None = None) -> AsyncGenerator[OpenCvCamera]:
+    """A connected camera, closed at the end. Raises `DeviceError`, also for a setting that the camera does not keep."""
+    camera = OpenCvCamera(CameraOptions(source, LATE_MS, 10.0, locked=locked or Locked()), clock)
+    await camera.connect()
+    try:
+        yield camera
+    finally:
+        await camera.close()
+
+
+@contextlib.asynccontextmanager
+async def taught_camera(notebook: Notebook, clock: Clock) -> AsyncGenerator[OpenCvCamera]:
+    """The camera that was taught, with its settings locked."""
+    locked = Locked.model_validate(notebook.table("camera.locked."))
+    async with opened(str(notebook.get("camera.source")), clock, locked) as camera:
+        yield camera
+
+
+async def still(camera: OpenCvCamera, clock: Clock) -> Gray:
+    """A gray picture that was taken after now, however late the camera is."""
+    return gray((await camera.fresh(Stamp(clock.now_ns()))).image)
+
+
+async def frame_rate_hz(camera: OpenCvCamera) -> float:
+    """Frames per second, counted."""
+    after, count, began_s = Stamp(0), 0, time.monotonic()
+    while time.monotonic() - began_s < RATE_S:
+        frame = await camera.fresh(after)
+        after = Stamp(frame.exposed_after_ns + 1)
+        count += 1
+    return (count - 1) / (time.monotonic() - began_s)
+
+
+def side_by_side(pictures: Sequence[Gray]) -> Gray:
+    """Pictures of any sizes in one, two in a row, numbered from 1 in their upper left corners."""
+    width_px, height_px = TILE_PX
+    tiles = np.zeros(((len(pictures) + 1) // 2 * height_px, min(len(pictures), 2) * width_px), np.uint8)
+    for number, picture in enumerate(pictures):
+        top, left = number // 2 * height_px, number % 2 * width_px
+        scale = min(width_px / picture.shape[1], height_px / picture.shape[0])
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[:height_px, :width_px]
+        tiles[top : top + small.shape[0], left : left + small.shape[1]] = small
+        tiles[top : top + NUMBER_PX, left : left + NUMBER_PX] = 0
+        at = (left + 10, top + NUMBER_PX - 12)
+        cv2.putText(tiles, str(number + 1), at, cv2.FONT_HERSHEY_SIMPLEX, 1.8, (255,), 5, cv2.LINE_AA)
+    return tiles

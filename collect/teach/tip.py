@@ -1,0 +1,361 @@
+"""Step 3: the tip of the brush. The same pin is touched from many sides; the program only reads.
+
+The tip in the flange's frame follows from flange poses at which it touched one and the same point, and the direction of
+the brush from poses in which a person held it upright.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from brushloop.calibrate.stats import student_95
+from brushloop.collect.errors import CannotTeach
+from brushloop.collect.rig.check import brush_square
+from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.day import Day, Step
+from brushloop.collect.teach.guide import Target
+from brushloop.collect.teach.jog import touch
+from brushloop.collect.teach.store import Notebook, Taught, taught
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import distance
+
+Floats = NDArray[np.float64]
+LEAST_TOUCHES = 4
+WORST_CONDITION = 60.0
+"""Above this the directions are so similar that errors of the touches appear many times larger in the length. If the
+wrist turns along with the lean, all directions are the same: one side of the flange is always up."""
+OUTLIER_SHARE = 4.0
+"""A touch whose residual exceeds the others' standard deviation by this factor is named as a slip."""
+LEAST_OUTLIER_MM = 1.0
+ELSEWHERE_MM = 10.0
+"""A touch that lies farther than this from where the others agree was not made at the pin."""
+HAND_MM = 0.15
+"""Smallest plausible error of a touch by hand, in one axis: a few touches may agree by chance."""
+LEAST_OFF_DEG, LEAST_AGREEING = 1.0, 5
+"""A hold that is less than this from the others is no stray, and fewer holds than this do not outvote a stray."""
+MEDIAN_STEPS = 100
+
+
+@dataclass(frozen=True, slots=True)
+class TipFit:
+    """Where the tip is, and how well that is known."""
+
+    offset_mm: tuple[float, float, float]
+    """Flange to tip, along the flange's axes."""
+    pin_mm: tuple[float, float, float]
+    """The point that was touched, in the base frame."""
+    residuals_mm: tuple[float, ...]
+    """Distance of the tip from the point in each touch."""
+    sigma_mm: tuple[float, float, float]
+    """Standard error of each component of the offset."""
+    freedom: int
+    """Degrees of freedom of the noise's estimate."""
+    condition: float
+    """Ratio of the largest to the smallest singular value of the equations."""
+
+    @property
+    def error_mm(self) -> float:
+        """Root mean square of the distance by which the offset may be wrong."""
+        return math.hypot(*self.sigma_mm)
+
+    @property
+    def reach_mm(self) -> float:
+        """Half width of the 95 % interval of the worst component, by Student's t."""
+        return student_95(self.freedom) * max(self.sigma_mm)
+
+    def slip(self) -> tuple[int, float] | None:
+        """Number of the touch that does not fit the others, and its residual in mm; None if all do."""
+        worst = int(np.argmax(self.residuals_mm))
+        others = [r for k, r in enumerate(self.residuals_mm) if k != worst]
+        typical_mm = math.sqrt(sum(r * r for r in others) / len(others))
+        limit_mm = max(LEAST_OUTLIER_MM, OUTLIER_SHARE * typical_mm)
+        off_mm = self.residuals_mm[worst]
+        return (worst, off_mm) if off_mm > limit_mm and len(others) >= LEAST_TOUCHES else None
+
+
+def find_tip(flanges: Sequence[Pose]) -> TipFit:
+    """Solve R_i t + p_i = c for the offset t and the point c by least squares (pivot calibration, e.g. Yaniv 2015).
+
+    R_i and p_i are the poses of the flange. Raises `CannotTeach` for fewer than four touches, and for directions that
+    are too alike.
+    """
+    if len(flanges) < LEAST_TOUCHES:
+        raise CannotTeach(f"{len(flanges)} touches of the pin", f"do not give the tip: {LEAST_TOUCHES} are needed.")
+    turns = np.array([Rotation.from_quat(pose.quaternion).as_matrix() for pose in flanges])
+    places = np.array([pose.position_mm for pose in flanges])
+    equations = np.concatenate([np.concatenate([turn, -np.eye(3)], axis=1) for turn in turns])
+    _, sizes, _ = np.linalg.svd(equations, full_matrices=False)
+    condition = float(sizes[0] / max(sizes[-1], 1e-12))
+    if condition > WORST_CONDITION:
+        raise CannotTeach(
+            f"the touches of the pin are too alike (condition {condition:.0f}, limit {WORST_CONDITION:g}):",
+            "lean the brush by 30 deg or more to all four sides, and do not turn the wrist along with it.",
+        )
+    found = np.asarray(np.linalg.lstsq(equations, -places.ravel(), rcond=None)[0], np.float64)
+    off = (equations @ found + places.ravel()).reshape(-1, 3)
+    freedom = 3 * len(flanges) - 6
+    noise_mm = max(math.sqrt(float((off**2).sum()) / freedom), HAND_MM)
+    spread = noise_mm * np.sqrt(np.diag(np.linalg.inv(equations.T @ equations)))
+    return TipFit(
+        _triple(found[:3]),
+        _triple(found[3:]),
+        tuple(float(r) for r in np.linalg.norm(off, axis=1)),
+        _triple(spread[:3]),
+        freedom,
+        condition,
+    )
+
+
+def elsewhere(flanges: Sequence[Pose]) -> tuple[int, float] | None:
+    """Number of the one touch that was made elsewhere, and its distance in mm from the point of the others.
+
+    Such a touch spoils the residuals of all, so each touch is compared with a fit of the others alone. None if there
+    is none, or for fewer than five touches.
+    """
+    worst, farthest_mm = None, ELSEWHERE_MM
+    for k in range(len(flanges)):
+        others = [pose for n, pose in enumerate(flanges) if n != k]
+        try:
+            fit = find_tip(others)
+        except CannotTeach:
+            continue
+        off_mm = math.dist(tip_of(flanges[k], fit.offset_mm), fit.pin_mm)
+        if off_mm > max(farthest_mm, 2.0 * OUTLIER_SHARE * max(fit.residuals_mm)):
+            worst, farthest_mm = (k, off_mm), off_mm
+    return worst
+
+
+@dataclass(frozen=True, slots=True)
+class AxisFit:
+    """How the brush leans against the flange, from poses in which a person held it upright."""
+
+    rotation_deg: tuple[float, float, float]
+    """As `robot.tcp_rotation_deg`: about x, then y, then z of the flange."""
+    lean_deg: float
+    sigma_deg: float
+    """Standard error of the lean in each direction; infinite for a single hold."""
+    off_deg: tuple[float, ...]
+    """Angle of each hold from the direction in which most of them agree."""
+    strays: tuple[int, ...]
+    """Numbers of the holds that do not agree with the others, and are not part of the fit."""
+
+    @property
+    def holds(self) -> int:
+        """Number of holds that agree."""
+        return len(self.off_deg) - len(self.strays)
+
+    @property
+    def clear(self) -> bool:
+        """Whether so many holds agree that it is the strays which were not upright, and not the others."""
+        return self.holds >= max(LEAST_AGREEING, 2 * len(self.strays))
+
+
+def find_axis(flanges: Sequence[Pose]) -> AxisFit:
+    """The brush's direction in the flange's frame: the mean of where "down" was, without the holds that stray.
+
+    A hold strays if it is far from the geometric median of all, which a minority of bad holds hardly moves (Weiszfeld's
+    iteration; Vardi and Zhang 2000). At least one pose.
+    """
+    down = np.array([Rotation.from_quat(p.quaternion).inv().apply([0.0, 0.0, -1.0]) for p in flanges])
+    middle = down.mean(axis=0)
+    for _ in range(MEDIAN_STEPS):
+        weights = 1.0 / np.maximum(np.linalg.norm(down - middle, axis=1), 1e-6)
+        middle = weights @ down / weights.sum()
+    typical_deg = float(np.sort(_angles_deg(down, middle))[(len(down) - 1) // 2])
+    agree = _angles_deg(down, middle) <= max(LEAST_OFF_DEG, OUTLIER_SHARE * typical_deg)
+    mean = np.asarray(down[agree].mean(axis=0) / np.linalg.norm(down[agree].mean(axis=0)), np.float64)
+    count, off_deg = int(agree.sum()), _angles_deg(down, mean)
+    squares = float((off_deg[agree] ** 2).sum())
+    sigma_deg = math.sqrt(squares / (2.0 * (count - 1)) / count) if count > 1 else math.inf
+    across = np.cross([0.0, 0.0, 1.0], mean)
+    lean = math.atan2(float(np.linalg.norm(across)), float(mean[2]))
+    axis = across / max(float(np.linalg.norm(across)), 1e-12)
+    rz, ry, rx = Rotation.from_rotvec(lean * axis).as_euler("ZYX", degrees=True)
+    return AxisFit(
+        (float(rx), float(ry), float(rz)),
+        math.degrees(lean),
+        sigma_deg,
+        tuple(off_deg.tolist()),
+        tuple(np.flatnonzero(~agree).tolist()),
+    )
+
+
+def _angles_deg(directions: Floats, toward: Floats) -> Floats:
+    """(n,) angles between (n, 3) directions and one, of any lengths."""
+    across = np.linalg.norm(np.cross(directions, toward), axis=1)
+    return np.degrees(np.arctan2(across, directions @ toward))
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+MOST_TOUCHES = 24
+GOOD_MM = 0.18
+"""Root mean square error of the tip at which touching ends."""
+WORST_MM = 0.35
+"""Above this after the last touch, the tip is not accepted."""
+UNKNOWN_MM = 20.0
+"""Error above which no place of the tip is shown."""
+LEAST_UPRIGHTS, UPRIGHTS, MOST_UPRIGHTS = 3, 12, 24
+"""Times that the brush is held against a set square, each with another turn of the wrist. Twelve times, each accurate
+to 0.15 deg, leave a standard error of 0.04 deg."""
+WORST_DEG = 0.12
+"""Standard error above which the direction counts as not measured. An upright brush bends along the heading only by the
+few degrees of its set, so an error of 0.12 deg across the heading turns every mark by 5 deg, and it is judged bent."""
+LEAST_TURN_DEG = 10.0
+"""By less than this from hold to hold the wrist was not turned, and perhaps the arm was not even moved."""
+SIDES = ("away from you", "to the right", "toward you", "to the left")
+
+
+class TipStep(Step):
+    """The offset from the flange to the tip of the brush, and its direction."""
+
+    name = "tip"
+    title = "Tip of the brush"
+    minutes = 9
+    needs = ("arm",)
+    observes = ("pin", "upright")
+
+    async def teach(self, day: Day) -> None:
+        """Have the pin touched until the tip is known well enough. Raises `CannotTeach`."""
+        await day.say(
+            "Fix a pin upright where all sides of it can be reached; put the pendant into hand guiding.",
+            "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
+        )
+        async with day.arm() as reader:
+            await self._pin(day, reader)
+            await day.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
+            await self._uprights(day, reader)
+
+    async def _pin(self, day: Day, reader: ArmReader) -> None:
+        for index in range(MOST_TOUCHES):
+            if f"pin {index}" in day.notebook.touches:
+                continue
+            if await self._known(day):
+                return
+            how = (
+                f"Touch {index + 1}: bring the tip to the pin, the brush leaning by 30 deg or more "
+                f"{SIDES[index % 4]}; lean it without turning the wrist with it."
+            )
+            await touch(day, reader, Target("pin", index), how, f"pin {index}", may_skip=True)
+        if await self._known(day):
+            return
+        with day.touched_again_if_refused("pin"):
+            fit = find_tip(list(day.notebook.touched("pin").values()))
+            if fit.error_mm > WORST_MM:
+                raise CannotTeach(
+                    f"after {MOST_TOUCHES} touches the tip is known to {fit.error_mm:.2f} mm only.",
+                    "Fix pin and brush firmly, hold still while you press Enter, and touch the pin again.",
+                )
+
+    async def _known(self, day: Day) -> bool:
+        touches = day.notebook.touched("pin")
+        if len(touches) < LEAST_TOUCHES:
+            return False
+        try:
+            fit = find_tip(list(touches.values()))
+        except CannotTeach as error:
+            await day.say(str(error), tone="warning")
+            return False
+        slip, off_mm = elsewhere(list(touches.values())) or fit.slip() or (None, 0.0)
+        if slip is not None:
+            name = list(touches)[slip]
+            await day.say(f"Touch {int(name) + 1} lies {off_mm:.1f} mm off: it is left out.", tone="warning")
+            day.save(day.notebook.without(f"pin {name}"))
+            return False
+        x, y, z = fit.offset_mm
+        if fit.error_mm > UNKNOWN_MM:
+            more = f"{len(touches)} touches do not give the tip yet; if Enter was pressed too early, the next"
+            await day.say(f"{more} touches will show which one lies off.", tone="warning")
+            return False
+        await day.say(
+            f"{len(touches)} touches: the tip is at ({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange, with a standard "
+            f"error of {fit.error_mm:.3f} mm (goal: {GOOD_MM:g} mm); "
+            f"no touch is more than {max(fit.residuals_mm):.2f} mm off."
+        )
+        return fit.error_mm <= GOOD_MM
+
+    async def _uprights(self, day: Day, reader: ArmReader) -> None:
+        """Have the brush held upright until its direction is known well enough. Raises `CannotTeach`."""
+        while not await self._direction_known(day):
+            free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in day.notebook.touches)
+            if (index := next(free, None)) is None:
+                with day.touched_again_if_refused("upright"):
+                    raise CannotTeach(
+                        f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
+                        "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
+                    )
+            how = (
+                f"Upright {index + 1} of {UPRIGHTS}: the brush upright along the set square"
+                f"{', the wrist turned differently than before' if index else ''}, anywhere over the table."
+            )
+            if await touch(day, reader, Target("upright", index), how, f"upright {index}", may_skip=True) is None:
+                if measured_axis(day.notebook) is None:
+                    await day.say("The direction of the brush is not measured.", tone="warning")
+                return
+
+    async def _direction_known(self, day: Day) -> bool:
+        """Judge each hold by itself and by the others, name those that were not upright, and forget them."""
+        holds = day.notebook.touched("upright")
+        if not holds:
+            return False
+        *before, newest = holds
+        flanges, axis = list(holds.values()), find_axis(list(holds.values()))
+        names = [f"Hold {int(name) + 1}" for name in holds]
+        square = brush_square(find_axis(flanges[-1:]).rotation_deg)
+        if square.verdict == "contradicts":
+            said = f"{names[-1]}: the brush would lean by {square.value} against the flange ({square.allowed})"
+            wrong = {newest: f"{said}: it was not upright"}
+        elif before and distance(flanges[-2], flanges[-1])[1] < LEAST_TURN_DEG:
+            wrong = {newest: f"{names[-1]} is {names[-2].lower()} again: turn the wrist in between"}
+        else:
+            wrong = {list(holds)[k]: f"{names[k]} is {axis.off_deg[k]:.1f} deg from the others" for k in axis.strays}
+            if wrong and not axis.clear:
+                await day.say(*wrong.values(), "The next holds will show which were not upright.", tone="warning")
+                return False
+        if wrong:
+            await day.say(*wrong.values(), "Left out, and asked for again.", tone="warning")
+            day.save(day.notebook.without(*(f"upright {name}" for name in wrong)))
+            return False
+        if len(holds) >= LEAST_UPRIGHTS:
+            known = f"known to {axis.sigma_deg:.2f} deg (limit {WORST_DEG:g})"
+            await day.say(f"{axis.holds} holds: the direction of the brush is {known}.")
+        return axis.holds >= UPRIGHTS and axis.sigma_deg <= WORST_DEG
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """The offset, and how the brush leans against the flange."""
+        touches = list(notebook.touched("pin").values())
+        fit = find_tip(touches)
+        known = (
+            f"95 % interval of the worst component +-{fit.reach_mm:.2f} mm, condition {fit.condition:.0f}, "
+            f"residuals up to {max(fit.residuals_mm):.2f} mm"
+        )
+        how = f"the same pin touched from {len(touches)} sides by hand"
+        offset = taught("tip", list(fit.offset_mm), how, "mm", sigma=fit.error_mm, known=known)
+        if (axis := measured_axis(notebook)) is None:
+            turn = taught("tip", [0.0, 0.0, 0.0], "taken as square to the flange", "deg", known="not measured")
+        else:
+            how = f"held upright along a set square {axis.holds} times"
+            known = f"leans by {axis.lean_deg:.2f} deg against the flange"
+            turn = taught("tip", list(axis.rotation_deg), how, "deg", sigma=axis.sigma_deg, known=known)
+        return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": turn}
+
+    def summary(self, notebook: Notebook) -> str:
+        """The length."""
+        x, y, z = notebook.numbers("robot.tcp_offset_mm")
+        return f"({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange"
+
+
+def measured_axis(notebook: Notebook) -> AxisFit | None:
+    """The direction of the brush; None where it was not held upright often or well enough to know it."""
+    holds = list(notebook.touched("upright").values())
+    axis = find_axis(holds) if holds else None
+    return axis if axis is not None and axis.holds >= LEAST_UPRIGHTS and axis.sigma_deg <= WORST_DEG else None
