@@ -103,7 +103,9 @@ def test_the_picture_shows_the_box_and_every_place(rig: Path, tmp_path: Path) ->
 
 def test_a_picture_has_the_format_of_its_ending(rig: Path, tmp_path: Path) -> None:
     assert brushloop("rig", "show", rig, "--picture", tmp_path / "rig.png").returncode == 0
-    assert cv2.imread(str(tmp_path / "rig.png")).shape[:2] == (704, 792)
+    drawn = cv2.imread(str(tmp_path / "rig.png"))
+    assert drawn is not None
+    assert drawn.shape[:2] == (704, 792)
     refused = brushloop("rig", "show", rig, "--picture", tmp_path / "rig.gif")
     assert refused.returncode == 2
     assert "must end in" in refused.stderr

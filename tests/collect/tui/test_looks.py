@@ -51,7 +51,7 @@ def pressing(*keys: str) -> Press:
 
 async def settled(pilot: Pilot[None]) -> None:
     """As many polls as all parts of the screen take turns in, once it is laid out, and every worker's work."""
-    engine = pilot.app.engine
+    engine = pilot.app.engine  # pyright: ignore[reportAttributeAccessIssue]
     enough = engine.looks + 5 if engine is not None else 0
     while engine is not None and engine.looks < enough:
         await pilot.pause(0.02)

@@ -219,7 +219,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
         await operator.reads("closed")
         await pilot.press("q")
     assert app.engine is not None
-    wait_for_end(app.engine)
+    wait_for_end(app.engine)  # pyright: ignore[reportArgumentType]
 
     [folder] = day.sessions.iterdir()
     assert verify_session(folder).sound
