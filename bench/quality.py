@@ -25,7 +25,7 @@ from brushloop.calibrate.board.view import see_board
 from brushloop.collect.quality.checks import check_capture, patch_is_blank
 from brushloop.collect.quality.verdict import Failure
 from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.brush.brush import BrushSpec, Flaw

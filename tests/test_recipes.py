@@ -20,7 +20,7 @@ from brushloop.collect.planning.walk import walk
 from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.quality.measure import Mark
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Ink, Stamp
 from brushloop.drivers.errors import LimitExceeded

@@ -224,7 +224,7 @@ def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], 
 
     `given` and `texts` are paths and contents of this run's `rig.toml` and `protocol.toml`.
     """
-    environment = overrides(RigConfig)
+    environment = overrides()
     lines: list[str] = []
     variables: list[str] = []
     for one in found:

@@ -18,7 +18,7 @@ from brushloop.collect.quality import measure
 from brushloop.collect.quality.ink import Ink, Point, Rect, around, mm2, on_sheet, take, tell_apart
 from brushloop.collect.quality.measure import Mark, measure_mark
 from brushloop.collect.quality.verdict import Check, Failure, Verdict
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
 
 MARGIN_MM = 4.0

@@ -5,73 +5,21 @@ The environment overrides any value: `BRUSHLOOP_ROBOT__HOST=192.0.2.7` sets `[ro
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 from pydantic import Field, ValidationError, model_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    SettingsError,
-)
 
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
-from brushloop.collect.rig.config_file import (
-    Config,
-    Finite,
-    PaperSide,
-    models_at,
-    nearest,
-    paths,
-    place,
-    read_toml,
-    refusal,
-)
-from brushloop.collect.rig.config_quality import QualityConfig
-from brushloop.collect.rig.config_touch import SelfCheckConfig, TouchConfig
+from brushloop.collect.rig.config_file import Config, Finite, PaperSide, place, read_toml, refusal
+from brushloop.collect.rig.config_touch import QualityConfig, SelfCheckConfig, TouchConfig
 from brushloop.collect.rig.optics import with_optics
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
-
-
-def overrides(settings: type[BaseSettings]) -> dict[tuple[str, ...], str]:
-    """Map each path to the variable that sets it: `("robot", "port")` -> `BRUSHLOOP_ROBOT__PORT`.
-
-    Raises `ConfigError` for a variable whose table or top field does not exist: pydantic would ignore it silently.
-    """
-    found: dict[tuple[str, ...], str] = {}
-    for name in sorted(os.environ):
-        if not name.upper().startswith(PREFIX):
-            continue
-        path = tuple(name[len(PREFIX) :].lower().split(DELIMITER))
-        if path[0] not in settings.model_fields or (len(path) > 1 and not models_at(settings, path[:1])):
-            # Compared without the prefix, which would make all of them similar.
-            meant = nearest(DELIMITER.join(path), [DELIMITER.join(known) for known in paths([settings])])
-            hint = f"; did you mean {PREFIX}{meant.upper()}?" if meant else f": {PREFIX}TABLE{DELIMITER}FIELD would"
-            raise ConfigError(place(name), "", f"sets nothing in rig.toml{hint}")
-        found[path] = name
-    return found
-
-
-def unreadable(settings: type[BaseSettings], error: Exception) -> ConfigError:
-    """The error for a variable that must hold a list or a table and is not JSON."""
-    for path, name in overrides(settings).items():
-        source = EnvSettingsSource(settings)
-        source.env_vars = {name.lower(): os.environ[name]}
-        try:
-            source()
-        except (SettingsError, RecursionError):
-            shown = os.environ[name]
-            shown = shown if len(shown) <= 80 else shown[:77] + "..."
-            return ConfigError(place(name), ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})")
-    return ConfigError("environment", "", f"{error}".splitlines()[0])
-
-
 MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0
 """Minimum travel height above the paper: more than the length of a drop hanging from the tip."""
@@ -154,10 +102,8 @@ class MotionConfig(Config):
     """Minimum time at depth, even if a shorter dwell is configured: the depth must be observed."""
 
 
-class RigConfig(BaseSettings):
+class RigConfig(Config):
     """`rig.toml`, with the overrides of the environment."""
-
-    model_config = SettingsConfigDict(frozen=True, extra="forbid", env_prefix=PREFIX, env_nested_delimiter=DELIMITER)
 
     name: str
     robot: RobotConfig
@@ -211,30 +157,36 @@ class RigConfig(BaseSettings):
             raise ValueError(f"paper.touch_point_mm = [{x:g}, {y:g}] does not lie on the sheet")
         return self
 
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """The environment overrides the file; nothing else is read."""
-        return env_settings, init_settings
+
+def overrides() -> dict[tuple[str, ...], str]:
+    """Map each path to the variable that sets it: `("robot", "port")` -> `BRUSHLOOP_ROBOT__PORT`."""
+    names = (name for name in sorted(os.environ) if name.upper().startswith(PREFIX))
+    return {tuple(name[len(PREFIX) :].lower().split(DELIMITER)): name for name in names}
+
+
+def _override(values: dict[str, Any], path: tuple[str, ...], name: str) -> None:
+    """Set the field at this path to what the variable holds: lists and tables as JSON, all else as it is."""
+    table = values
+    for part in path[:-1]:
+        inner: Any = table.setdefault(part, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(place(name), ".".join(path), "lies in no table of rig.toml")
+        table = cast("dict[str, Any]", inner)
+    text = os.environ[name]
+    try:
+        table[path[-1]] = json.loads(text) if text.startswith(("[", "{")) else text
+    except (ValueError, RecursionError):
+        shown = text if len(text) <= 80 else f"{text[:77]}..."
+        raise ConfigError(place(name), ".".join(path), f"is not JSON, as [40.0, 24.0] is (given: {shown!r})") from None
 
 
 def load_rig(path: Path) -> RigConfig:
     """Read `rig.toml` and its lens file, with overrides from the environment. Raises `ConfigError`."""
-    values = read_toml(path, MAX_CONFIG_BYTES)
-    for name in values:
-        if name.startswith("_"):
-            raise ConfigError(path, name, "is not a table of this file")
-    environment = overrides(RigConfig)
+    values, environment = read_toml(path, MAX_CONFIG_BYTES), overrides()
+    for field, name in environment.items():
+        _override(values, field, name)
     try:
-        rig = RigConfig(**values)
-    except (SettingsError, RecursionError) as error:
-        raise unreadable(RigConfig, error) from None
+        rig = RigConfig.model_validate(values)
     except ValidationError as error:
         raise refusal(path, error, RigConfig, environment=environment) from None
     return rig.model_copy(update={"camera": with_optics(path, rig.camera)})

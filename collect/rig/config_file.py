@@ -158,14 +158,6 @@ def nearest(name: str, known: Sequence[str]) -> str | None:
     return next(iter(difflib.get_close_matches(name, known, n=1)), None)
 
 
-def paths(models: Sequence[type[BaseModel]], above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The path of every field in these tables and the tables in them."""
-    for model in models:
-        for name, field in model.model_fields.items():
-            yield (*above, name)
-            yield from paths(list(_models(field.annotation)), (*above, name))
-
-
 def _models(annotation: object) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(cast("type[Any]", annotation), BaseModel):
         yield annotation

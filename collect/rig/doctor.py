@@ -18,7 +18,6 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig
 from brushloop.collect.rig.devices import make_camera, make_force, make_ink, make_robot
-from brushloop.collect.rig.optics import lens_of
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.devices import Identity, Stamp
 from brushloop.drivers.errors import DeviceError
@@ -111,7 +110,7 @@ async def _camera(config: RigConfig, clock: Clock) -> Finding:
 
 def _board(config: RigConfig, image: Any) -> tuple[str, str, str]:
     try:
-        plane = see_board(image, config.board, lens=lens_of(config.camera))
+        plane = see_board(image, config.board, lens=config.camera.optics)
     except CalibrationError as error:
         return "", f"board: {error.what}", "Put the configured board into view, in focus and evenly lit."
     return f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px", "", ""

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.intrinsics import read_lens
-from brushloop.calibrate.board.lens import Lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config_devices import CameraConfig
@@ -28,11 +27,6 @@ def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:
     return camera.model_copy(update={"optics": optics})
 
 
-def lens_of(camera: CameraConfig) -> Lens | None:
-    """The calibrated lens; None for a camera without one, whose pictures are taken to be undistorted."""
-    return camera.optics
-
-
 def gray(image: NDArray[np.uint8]) -> Gray:
     """(h, w) of an (h, w) or (h, w, 3) BGR image."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
@@ -44,7 +38,7 @@ def undistorted(camera: CameraConfig, photograph: NDArray[np.uint8]) -> Gray:
     Raises `StepError` if photographs no longer have the size at which the lens was calibrated.
     """
     image = gray(photograph)
-    lens = lens_of(camera)
+    lens = camera.optics
     if lens is None:
         return image
     height, width = image.shape[:2]

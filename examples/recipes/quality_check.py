@@ -2,14 +2,14 @@
 
 Put such a function into `collect/quality/checks.py` and its name into `MARK_CHECKS` there. A finding of its own needs a
 name in `Failure` (`collect/quality/verdict.py`), with the family that says what is done about it, and its limit belongs
-in `QualityConfig` (`collect/rig/config_quality.py`), so that a rig can set it. `docs/quality.md` says what it measures.
+in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig can set it. `docs/quality.md` says what it measures.
 """
 
 from __future__ import annotations
 
 from brushloop.collect.quality.measure import Mark
 from brushloop.collect.quality.verdict import Check, Failure
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 
 DARKEST_TONE = 0.97
 

@@ -9,7 +9,7 @@ import pytest
 from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.collect.quality.ink import Ink, Window
 from brushloop.collect.quality.measure import measure_mark
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 
 
 @pytest.mark.parametrize("photo_px_per_mm", [6.25, 3.3, 2.5])

@@ -16,7 +16,7 @@ from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.collect.quality.checks import check_capture
 from brushloop.collect.quality.verdict import Failure, Verdict
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
 
 DATA = SHARED / "frida_bigbrush_tilt_16x20"

@@ -17,7 +17,7 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.collect.quality.checks import check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.quality.measure import blur_px, glare, paper_level
 from brushloop.collect.quality.verdict import Failure, Family
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
 
 LIMITS = QualityConfig()

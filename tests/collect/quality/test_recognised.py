@@ -10,7 +10,7 @@ import pytest
 from bench.quality import SPOTLESS_MM2, Bench, Blank, Sample, Score, score
 from brushloop.collect.quality.checks import check_capture, patch_is_blank
 from brushloop.collect.quality.verdict import Failure
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 
 pytestmark = pytest.mark.xdist_group("quality")  # drawn once
 EACH, SOUND = 2, 10

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import brushloop.__main__
 from bench.brushes import FROZEN
-from brushloop.collect.rig.config_quality import QualityConfig
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.spec import PAPER, SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig
