@@ -3,41 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Answer, Brought, JogStep, JogView, Question, Shown, Target
+from brushloop.collect.teach.guide import Answer, Brought, JogStep, JogView, Question, Target
 from brushloop.collect.teach.jog import BELOW_MM, touch
 from brushloop.collect.teach.store import touch_of
-from brushloop.collect.tui.teach_app import TeachApp
-from brushloop.collect.tui.teach_guide import ScreenGuide
 from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
+from tests.collect.teach.conftest import Person, day_of
 
 HOME_MM = (250.0, -230.0, 260.0)
-TIP = [0.0, 0.0, 180.0]
 
 
-@dataclass
-class Jogger:
-    """A person who jogs by a list of steps, then says that the tip is there."""
+class Jogger(Person):
+    """Jogs by a list of steps, then says that the tip is there."""
 
-    steps: list[JogStep]
-    allows: bool = True
-    said: list[str] = field(default_factory=list)
-    views: list[JogView] = field(default_factory=list)
-    asked: int = 0
-
-    async def show(self, what: Shown) -> None:
-        self.said += what.lines
+    def __init__(self, *steps: JogStep, allows: bool = True) -> None:
+        super().__init__()
+        self.steps, self.allows = list(steps), allows
+        self.views: list[JogView] = []
 
     async def ask(self, question: Question) -> Answer:
         if question.jog is not None:
@@ -45,25 +35,8 @@ class Jogger:
             return self.steps.pop(0) if self.steps else Brought.DONE
         if question.target is None:
             return "a" if self.allows else question.default
-        self.asked += 1
-        return Brought.JOG if self.asked == 1 else Brought.SKIP
-
-
-@pytest.fixture
-async def server() -> AsyncIterator[ArcsServer]:
-    server = ArcsServer(World(SimConfig(rate=10.0)))
-    await server.start("127.0.0.1", 0)
-    yield server
-    await server.stop()
-
-
-def day_of(port: int, person: object, folder: Path, *, armed: bool) -> Day:
-    day = Day(person, folder / "rig.toml", HostClock(), armed=armed)  # type: ignore[arg-type]
-    for name, value in (("host", "127.0.0.1"), ("port", port), ("framing", "sof")):
-        day.keep("arm", f"robot.{name}", value, "typed")
-    day.keep("tip", "robot.tcp_offset_mm", TIP, "typed", unit="mm")
-    day.keep("tip", "robot.tcp_rotation_deg", [0.0, 0.0, 0.0], "typed", unit="deg")
-    return day
+        self.asked.append(question.text)
+        return Brought.JOG if len(self.asked) == 1 else Brought.SKIP
 
 
 async def touched(day: Day) -> None:
@@ -77,8 +50,8 @@ def sent(server: ArcsServer) -> int:
 
 
 async def test_steps_move_the_tip_along_the_base_and_the_place_is_kept(server: ArcsServer, tmp_path: Path) -> None:
-    person = Jogger([JogStep("x", 5.0), JogStep("y", -0.5), JogStep("z", -2.0)])
-    day = day_of(server.port, person, tmp_path, armed=True)
+    person = Jogger(JogStep("x", 5.0), JogStep("y", -0.5), JogStep("z", -2.0))
+    day = day_of(person, tmp_path, server.port, armed=True)
     await touched(day)
     assert person.views[-1].moved_mm == pytest.approx((5.0, -0.5, -2.0), abs=0.05)
     x, y, z = HOME_MM
@@ -86,27 +59,20 @@ async def test_steps_move_the_tip_along_the_base_and_the_place_is_kept(server: A
     assert sent(server) == 3
 
 
-async def test_without_arm_nothing_moves_even_if_a_jog_is_asked_for(server: ArcsServer, tmp_path: Path) -> None:
-    person = Jogger([JogStep("x", 5.0)])
-    await touched(day_of(server.port, person, tmp_path, armed=False))
+@pytest.mark.parametrize(("armed", "allows"), [(False, True), (True, False)], ids=["no --arm", "no key"])
+async def test_without_arm_or_key_nothing_moves(armed: bool, allows: bool, server: ArcsServer, tmp_path: Path) -> None:
+    person = Jogger(JogStep("x", 5.0), allows=allows)
+    await touched(day_of(person, tmp_path, server.port, armed=armed))
     assert person.views == []
-    assert any("Nothing is moved without --arm" in line for line in person.said)
-    assert sent(server) == 0
-    assert server.cabinet.power.mode == RobotMode.POWER_OFF
-
-
-async def test_without_the_key_nothing_moves(server: ArcsServer, tmp_path: Path) -> None:
-    person = Jogger([JogStep("x", 5.0)], allows=False)
-    await touched(day_of(server.port, person, tmp_path, armed=True))
-    assert person.views == []
+    assert armed or "Nothing is moved without --arm" in person.said[0]
     assert sent(server) == 0
     assert server.cabinet.power.mode == RobotMode.POWER_OFF
 
 
 async def test_a_step_out_of_the_box_is_refused_and_said(server: ArcsServer, tmp_path: Path) -> None:
     down = [JogStep("z", -5.0)] * (int(BELOW_MM / 5.0) + 1)
-    person = Jogger([*down, JogStep("x", -5.0), JogStep("x", 100.0)])
-    day = day_of(server.port, person, tmp_path, armed=True)
+    person = Jogger(*down, JogStep("x", -5.0), JogStep("x", 100.0))
+    day = day_of(person, tmp_path, server.port, armed=True)
     x, y, z = HOME_MM
     day.save(day.notebook.with_touch("pin 0", touch_of(brush_pose(x + 40.0, y, z + 190.0))))
     await touched(day)
@@ -121,7 +87,7 @@ async def test_a_stop_in_the_middle_of_a_step_stops_the_arm(tmp_path: Path) -> N
     server = ArcsServer(World(SimConfig(rate=0.5)))
     await server.start("127.0.0.1", 0)
     motion = server.cabinet.world.motion
-    task = asyncio.create_task(touched(day_of(server.port, Jogger([JogStep("x", 5.0)]), tmp_path, armed=True)))
+    task = asyncio.create_task(touched(day_of(Jogger(JogStep("x", 5.0)), tmp_path, server.port, armed=True)))
     async with asyncio.timeout(20.0):
         while motion.target(server.cabinet.now_s()) is None:
             await asyncio.sleep(0.005)
@@ -131,25 +97,3 @@ async def test_a_stop_in_the_middle_of_a_step_stops_the_arm(tmp_path: Path) -> N
     assert motion.target(server.cabinet.now_s()) is None
     assert server.cabinet.world.tool().x_mm < HOME_MM[0] + 4.0
     await server.stop()
-
-
-async def test_on_the_screen_the_tip_is_jogged_by_keys(server: ArcsServer, tmp_path: Path) -> None:
-    port = server.port
-    made: list[Day] = []
-
-    async def work(guide: ScreenGuide) -> None:
-        made.append(day_of(port, guide, tmp_path, armed=True))
-        await touched(made[0])
-
-    app, number = TeachApp(work, "rig.toml"), 0
-    async with app.run_test(size=(80, 24)) as pilot, asyncio.timeout(60.0):
-        for keys in (["j"], ["a"], ["4", "right"], ["3", "pagedown"], ["enter"]):
-            while app._screen._question is None or app._screen._question.number <= number:
-                await pilot.pause(0.02)
-            number = app._screen._question.number
-            await pilot.press(*keys)
-        while not app.teaching.finished:
-            await pilot.pause(0.02)
-    app.teaching.join()
-    x, y, z = HOME_MM
-    assert made[0].notebook.touches["well 0"].position_mm == pytest.approx((x + 5.0, y, z + 178.0), abs=0.05)

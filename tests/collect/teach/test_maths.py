@@ -70,9 +70,7 @@ def test_a_touch_that_slipped_is_named() -> None:
     places = [PIN_MM + rng.normal(0.0, 0.1, 3) for _ in range(9)]
     places[6] = places[6] + [0.0, 4.0, 0.0]
     fit = find_tip([flange_at(p, turn, offset) for p, turn in zip(places, around(9), strict=True)])
-    slipped = fit.slip()
-    assert slipped is not None
-    assert slipped == (6, pytest.approx(3.3, abs=1.0))
+    assert fit.slip() == (6, pytest.approx(3.3, abs=1.0))
 
 
 def test_a_touch_that_was_never_made_at_the_pin_is_named_though_it_spoils_the_residuals_of_all() -> None:
@@ -81,9 +79,7 @@ def test_a_touch_that_was_never_made_at_the_pin_is_named_though_it_spoils_the_re
     places[0] = places[0] + [250.0, 0.0, 90.0]  # Enter was pressed before the arm was guided there
     flanges = [flange_at(p, turn, offset) for p, turn in zip(places, around(5), strict=True)]
     assert find_tip(flanges).slip() is None
-    named = elsewhere(flanges)
-    assert named is not None
-    assert named == (0, pytest.approx(math.hypot(250.0, 90.0), abs=20.0))
+    assert elsewhere(flanges) == (0, pytest.approx(math.hypot(250.0, 90.0), abs=20.0))
     assert elsewhere(flanges[1:]) is None, "four touches, all of which agree"
 
 

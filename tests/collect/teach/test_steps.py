@@ -19,17 +19,16 @@ from brushloop.collect.errors import CannotTeach, ConfigError
 from brushloop.collect.rig.check import brush_square
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.teach import proof
-from brushloop.collect.teach.arm import Address, Cabinet, reading
+from brushloop.collect.teach.arm import Address, reading
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.find_arm import ArmStep
-from brushloop.collect.teach.guide import Brought, Question, Shown, Target
-from brushloop.collect.teach.proof import ProofStep, folder_beside, slowly
+from brushloop.collect.teach.guide import Answer, Brought, Question, Target
+from brushloop.collect.teach.proof import ProofStep, slowly
 from brushloop.collect.teach.sheet import BOARD, all_corners
 from brushloop.collect.teach.sheet_fit import Margins, check_seen, seen_margins
-from brushloop.collect.teach.store import Notebook, Taught, Value, now_utc, touch_of
+from brushloop.collect.teach.store import Notebook, Value, taught, touch_of
 from brushloop.collect.teach.tip import TipStep
 from brushloop.collect.teach.watch import watched
-from brushloop.collect.tui.teach_guide import ScreenGuide
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
@@ -38,19 +37,8 @@ from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.lab.lab import truth
 from brushloop.drivers.sim.rig import Addresses, rig_toml
-from brushloop.drivers.sim.world import World
+from tests.collect.teach.conftest import Person, day_of
 from tests.collect.teach.unknown import InLab, in_lab
-
-
-async def cabinet_that_answers(getter: str, answer: object) -> Cabinet:
-    server = ArcsServer(World(SimConfig()))
-    server._methods[f"rob1.RobotConfig.{getter}"] = lambda _: answer
-    await server.start("127.0.0.1", 0)
-    try:
-        async with reading(Address("127.0.0.1", server.port), "sof") as reader:
-            return await reader.cabinet("sof")
-    finally:
-        await server.stop()
 
 
 @pytest.mark.parametrize("port", ["x", "0", "65536", "-1", "9" * 5000])
@@ -68,9 +56,13 @@ def test_a_port_is_a_number_in_the_range_of_ports(port: str) -> None:
         ("getTcpOffset", [0.0, 0.0, math.inf, 0.0, 0.0, 0.0]),
     ],
 )
-async def test_an_answer_that_is_no_number_is_refused_by_its_getter(getter: str, answer: object) -> None:
-    with pytest.raises(ProtocolViolation, match=getter):
-        await cabinet_that_answers(getter, answer)
+async def test_an_answer_that_is_no_number_is_refused_by_its_getter(
+    server: ArcsServer, getter: str, answer: object
+) -> None:
+    server._methods[f"rob1.RobotConfig.{getter}"] = lambda _: answer
+    async with reading(Address("127.0.0.1", server.port), "sof") as reader:
+        with pytest.raises(ProtocolViolation, match=getter):
+            await reader.cabinet("sof")
 
 
 def leaning(x_mm: float, y_mm: float, z_mm: float, toward_deg: float, tilt_deg: float, wrist_deg: float) -> Pose:
@@ -108,14 +100,14 @@ async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_pat
     warned = [line.removeprefix("warning: ")[:6] for line in person.lines if line.startswith("warning: Hold ")]
     assert warned == ["Hold 1", "Hold 1", "Hold 1", "Hold 7"]
     assert len(day.notebook.touched("upright")) == 12
-    taught = TipStep().derived(day.notebook)["robot.tcp_rotation_deg"]
-    assert "12 times" in taught.how
-    axis = Rotation.from_euler("ZYX", np.array(taught.value)[::-1], degrees=True).apply([0.0, 0.0, 1.0])
+    turn = TipStep().derived(day.notebook)["robot.tcp_rotation_deg"]
+    assert "12 times" in turn.how
+    axis = Rotation.from_euler("ZYX", np.array(turn.value)[::-1], degrees=True).apply([0.0, 0.0, 1.0])
     true = np.array(truth(person.lab.facts, None)["tool"]["brush_axis"])
     assert math.degrees(math.acos(float(axis @ true))) < 0.2
 
 
-@pytest.mark.parametrize(("count", "tilt_deg"), [(0, 0.0), (2, 0.0), (8, 10.0)])
+@pytest.mark.parametrize(("count", "tilt_deg"), [(2, 0.0), (8, 10.0)])
 def test_a_direction_that_too_few_or_scattered_holds_give_is_not_measured_and_not_plausible(
     count: int, tilt_deg: float
 ) -> None:
@@ -127,8 +119,8 @@ def test_a_direction_that_too_few_or_scattered_holds_give_is_not_measured_and_no
     for number in range(count):
         hold = leaning(320.0, 150.0, 90.0, 45.0 * number, tilt_deg, wrist_deg=90.0 * number)
         notebook = notebook.with_touch(f"upright {number}", touch_of(hold))
-    taught = TipStep().derived(notebook)["robot.tcp_rotation_deg"]
-    assert (taught.value, taught.known) == ([0.0, 0.0, 0.0], "not measured")
+    turn = TipStep().derived(notebook)["robot.tcp_rotation_deg"]
+    assert (turn.value, turn.known) == ([0.0, 0.0, 0.0], "not measured")
     assert brush_square((0.0, 0.0, 0.0)).verdict == "not measured"
 
 
@@ -136,21 +128,16 @@ BOARD_MM = {"lower left": (0.0, 0.0), "lower right": (0.0, -312.0), "upper left"
 """From its lower left corner along the base axes: the board is turned by -90 deg."""
 
 
-def taught(value: Value) -> Taught:
-    return Taught(value=value, how="typed", at=now_utc(), step="tip")
-
-
 def touched_from(x_mm: float, y_mm: float) -> Notebook:
     """All corners but the upper right one, the lower left one at (x, y)."""
-    notebook = Notebook().with_values(
-        {
-            "robot.tcp_offset_mm": taught([0.0, 0.0, 180.0]),
-            "board.squares": taught([26, 20]),
-            "board.square_mm": taught(12.0),
-            "board.marker_mm": taught(9.0),
-            "board.dictionary": taught("DICT_5X5_1000"),
-        }
-    )
+    values: dict[str, Value] = {
+        "robot.tcp_offset_mm": [0.0, 0.0, 180.0],
+        "board.squares": [26.0, 20.0],
+        "board.square_mm": 12.0,
+        "board.marker_mm": 9.0,
+        "board.dictionary": "DICT_5X5_1000",
+    }
+    notebook = Notebook().with_values({field: taught("tip", value, "typed") for field, value in values.items()})
     for corner, (x, y) in BOARD_MM.items():
         notebook = notebook.with_touch(f"{BOARD} 0 {corner}", touch_of(brush_pose(x_mm + x, y_mm + y, 300.0)))
     return notebook
@@ -223,24 +210,10 @@ def test_a_board_without_a_sheet_has_no_edges_to_be_seen() -> None:
     assert seen_margins(bare, find_board(bare, SPEC, "camera"), SPEC, LAID) is None
 
 
-def test_each_proof_is_recorded_in_a_new_folder_beside_the_rig(tmp_path: Path) -> None:
-    rig = tmp_path / "lab.toml"
-    first, second = folder_beside(rig), folder_beside(rig)
-    assert [first.name, second.name] == ["lab.proof-1", "lab.proof-2"]
-    assert first.is_dir()
-    assert second.is_dir()
+class Refusing(Person):
+    """Leaves the arm where it is."""
 
-
-class Refusing:
-    """A person who leaves the arm where it is."""
-
-    def __init__(self) -> None:
-        self.asked: list[str] = []
-
-    async def show(self, what: Shown) -> None:
-        pass
-
-    async def ask(self, question: Question) -> str:
+    async def ask(self, question: Question) -> Answer:
         self.asked.append(question.text)
         return question.default
 
@@ -260,7 +233,7 @@ async def test_the_proof_runs_nothing_without_the_command_line_and_the_operators
     monkeypatch.setattr(proof, "rig_of", lambda *_: SimpleNamespace(brush=SimpleNamespace(max_depth_mm=22.0)))
     person = Refusing()
     with pytest.raises(CannotTeach, match=said):
-        await ProofStep().teach(Day(person, tmp_path / "rig.toml", HostClock(), armed=armed))  # type: ignore[arg-type]
+        await ProofStep().teach(Day(person, tmp_path / "rig.toml", HostClock(), armed=armed))
     assert len(person.asked) == armed
     assert all("The arm moves by itself, slower than 50 mm/s" in question for question in person.asked)
 
@@ -276,7 +249,7 @@ async def test_every_pose_of_the_proof_is_checked_before_the_arm_is_connected(
     low = re.sub(r"(?m)^z_mm = \[.*", "z_mm = [98.0, 170.0]", text, count=1)  # travel height is 180
     monkeypatch.setattr(proof, "_with_lens_at", lambda _: low)
     monkeypatch.setattr(proof, "DryRunEngine" if dry else "Engine", no_engine)
-    day = Day(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)  # type: ignore[arg-type]
+    day = Day(Refusing(), tmp_path / "rig.toml", HostClock(), armed=True)
     protocol = 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
     with pytest.raises(ConfigError, match=r"robot\.limits: a planned pose is outside the limits: z = "):
         await ProofStep()._run(day, tmp_path, protocol, dry=dry)
@@ -292,21 +265,21 @@ def test_every_move_of_the_proof_is_slower_than_50_mm_s(tmp_path: Path) -> None:
     assert slow.robot.limits.speed_mm_s <= 50.0, "the driver refuses more"
 
 
-async def test_the_flange_is_shown_and_the_tip_once_it_is_taught(tmp_path: Path) -> None:
-    server = ArcsServer(World(SimConfig()))
-    await server.start("127.0.0.1", 0)
-    guide = ScreenGuide()
-    day = Day(guide, tmp_path / "rig.toml", HostClock(), armed=False)
-    for field, value in (("host", "127.0.0.1"), ("port", server.port), ("framing", "sof")):
-        day.keep("arm", f"robot.{field}", value, "typed")
-    async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking), asyncio.timeout(20.0):
-        while guide.view.tip is None:
+async def test_the_flange_is_shown_and_the_tip_once_it_is_taught(server: ArcsServer, tmp_path: Path) -> None:
+    seen = list[tuple[Pose | None, bool]]()
+    day = day_of(Person(), tmp_path, server.port)
+    tip = day.notebook.values["robot.tcp_offset_mm"]
+    day.save(day.notebook.without("robot.tcp_offset_mm"))
+    watching = watched(day, lambda pose, known: seen.append((pose, known)), lambda _: None, lambda: False)
+    async with watching, asyncio.timeout(20.0):
+        while not seen:
             await asyncio.sleep(0.01)
-        assert not guide.view.tip_known
-        assert guide.view.tip.position_mm == pytest.approx((250.0, -230.0, 440.0), abs=0.01)
-        day.keep("tip", "robot.tcp_offset_mm", [0.0, 0.0, 180.0], "typed", unit="mm")
-        while not guide.view.tip_known:
+        day.save(day.notebook.with_values({"robot.tcp_offset_mm": tip}))
+        while not seen[-1][1]:
             await asyncio.sleep(0.01)
-        assert guide.view.tip.position_mm == pytest.approx((250.0, -230.0, 260.0), abs=0.01)
-    assert guide.view.tip is None
-    await server.stop()
+    (flange, _), *_, (at_tip, _), (last, _) = seen
+    assert flange is not None
+    assert at_tip is not None
+    assert flange.position_mm == pytest.approx((250.0, -230.0, 440.0), abs=0.01)
+    assert at_tip.position_mm == pytest.approx((250.0, -230.0, 260.0), abs=0.01)
+    assert last is None
