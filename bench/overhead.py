@@ -153,9 +153,9 @@ def _watching(spans: Spans) -> Iterator[None]:
     from brushloop.collect.engine.perform import Performer
     from brushloop.collect.engine.recorder import Recorder
     from brushloop.collect.engine.steps import capture as capturing
-    from brushloop.collect.engine.steps import dip as dipping
     from brushloop.drivers.arcs.robot import AuboArcs
     from brushloop.drivers.camera import OpenCvCamera
+    from brushloop.drivers.ink.station import InkStation
     from brushloop.sessions.store import SessionStore
 
     def noted(function: Callable[..., Any], part: str | None) -> Callable[..., Any]:
@@ -180,7 +180,7 @@ def _watching(spans: Spans) -> Iterator[None]:
         (Performer, "perform", None),  # by the kind of its step
         (AuboArcs, "move", "move"),
         (OpenCvCamera, "fresh", FRAME),
-        (dipping, "fill_well", INK),
+        (InkStation, "replenish", INK),
         (Recorder, "still", ENCODE),
         (capturing, "_judge", JUDGE),
         (capturing, "_inked_patches", BLANK),

@@ -212,9 +212,19 @@ class ForceSensor(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Well:
+    """The well before a dip."""
+
+    level: float | None
+    """0 to 1; None where the device has no gauge."""
+    dosed_ml: float = 0.0
+    """What was added just now."""
+
+
 @runtime_checkable
 class Ink(Protocol):
-    """An ink station; optional in a rig."""
+    """A device that keeps the well filled as its table of `rig.toml` says; optional in a rig."""
 
     async def connect(self) -> Identity:
         """Open the line and make sure that the right device answers; gives no ink."""
@@ -224,8 +234,15 @@ class Ink(Protocol):
         """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
         ...
 
-    async def light(self, level: float) -> bool:
-        """Set the light over the sheet, 0 to 1; False where the device has none."""
+    async def replenish(self, dips: int) -> Well:
+        """Before a dip, after so many of this run: add ink if the table asks for it.
+
+        Raises `InkRefused` or `DoseLost` where only a person can help, else `DeviceError`.
+        """
+        ...
+
+    async def light(self) -> float | None:
+        """Set the light over the sheet as the table says and return it, 0 to 1; None if it says nothing."""
         ...
 
     async def level(self) -> float | None:

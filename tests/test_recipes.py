@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import sys
+import threading
 import time
 import tomllib
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -16,15 +18,17 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import Opening, open_store
 from brushloop.collect.planning.walk import walk
 from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.quality.measure import Mark
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config import InkConfig, RigConfig
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Ink, Stamp
-from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.host import HostClock
+from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim import mjpeg_server
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
@@ -33,6 +37,9 @@ from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import stroke_models
+from tests.collect.conftest import SHARP_VIEW, SMALL_TABLE, serving
+from tests.collect.until import wait_for_end
+from tests.waiting import PATIENCE_S
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"
 
@@ -96,31 +103,57 @@ def test_a_quality_check_is_a_function_of_the_mark() -> None:
     assert "Wipe the brush" in flooded(replace(mark, tone=0.99), QualityConfig()).reason
 
 
-@asynccontextmanager
-async def syringe(heard: list[str]) -> AsyncIterator[int]:
+@contextmanager
+def syringe(well: Well) -> Iterator[int]:
+    """The port of a simulated syringe pump that fills this well."""
+
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while line := (await reader.readline()).decode().strip():
-            heard.append(line)
+            if line != "WHO":
+                well.add(float(line.removeprefix("DOSE ")))
             writer.write(b"syringe 3\n" if line == "WHO" else b"OK\n")
         writer.close()
         await writer.wait_closed()
 
-    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
-        yield server.sockets[0].getsockname()[1]
+    async def listen() -> None:
+        async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+            over = asyncio.Event()
+            ready.set_result((server.sockets[0].getsockname()[1], asyncio.get_running_loop(), over))
+            await over.wait()
+
+    ready: Future[tuple[int, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+    thread = threading.Thread(target=asyncio.run, args=(listen(),))
+    thread.start()
+    port, loop, over = ready.result(PATIENCE_S)
+    yield port
+    loop.call_soon_threadsafe(over.set)
+    thread.join(PATIENCE_S)
 
 
-async def test_a_driver_has_the_methods_of_its_protocol() -> None:
-    heard: list[str] = []
-    async with syringe(heard) as port:
-        pump = recipe("driver").SyringePump("127.0.0.1", port, HostClock())
-        assert isinstance(pump, Ink)
-        assert (await pump.connect()).model == "syringe 3"
-        await pump.dose(0.5)
-        with pytest.raises(LimitExceeded):
-            await pump.dose(50.0)
-        await pump.close()
-        await asyncio.sleep(0)
-    assert heard == ["WHO", "DOSE 0.500"]
+def test_an_ink_device_is_a_table_and_a_driver_and_the_engine_inks_a_brush_with_it(tmp_path: Path) -> None:
+    table = recipe("driver").SyringeTable
+
+    class InkWithSyringe(InkConfig):
+        device: table  # type: ignore[valid-type]  # as it would be in `AnyInkTable`
+
+    class RigWithSyringe(RigConfig):
+        ink: InkWithSyringe  # type: ignore[assignment]
+
+    config = SimConfig(rate=60.0, table=SMALL_TABLE, view=SHARP_VIEW, force_sensor=False, ink_device="none")
+    with serving(config) as lab, syringe(lab.world.well) as port:
+        lab.world.well.ml = 0.0
+        rig_path, protocol_path = tmp_path / "rig.toml", tmp_path / "protocol.toml"
+        rig_path.write_text(lab.toml().replace("latency_ms = 250.0", "latency_ms = 100.0"), encoding="utf-8")
+        protocol_path.write_text('kind = "grid"\ndepths_mm = [15.0]\ntilts_deg = [0.0]\nrepeats = 1\n', "utf-8")
+        opening, clock = Opening.load(tmp_path / "sessions", rig_path, protocol_path), HostClock()
+        fields = tomllib.loads(lab.toml())
+        fields["ink"]["device"] = {"kind": "syringe", "port": f"127.0.0.1:{port}", "dose_ml": 2.0}
+        rig = RigWithSyringe(**fields)
+        engine = Engine(rig, opening.protocol, lambda r: open_store(opening, None, r, clock), clock)
+        engine.start()
+        wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 1, "its ink was judged"
+    assert isinstance(rig.ink.device.device(clock), Ink)
 
 
 async def test_a_fault_is_a_kind_and_what_it_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from brushloop.drivers.errors import (
     SettingsChanged,
     Stuck,
 )
-from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.sessions.events import StepKind
 
 MAX_FAILURES = 3
@@ -53,7 +53,7 @@ def decide(step: Step, error: StepError | DeviceError, failures: int) -> Action:
     """Return the action for the `failures`-th failure of `step`. Motion is never blindly repeated."""
     match step.kind, error:
         # Only a person can change paper or ink, mend a sensor, release the arm, or see what lies under the brush.
-        case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | RobotNotSafe() | Stuck():
+        case _, SheetFull() | NeedsOperator() | ForceTooHigh() | InkRefused() | DoseLost() | RobotNotSafe() | Stuck():
             return Action.ASK
         # Somebody else had the arm.
         case _, ArmMoved() | SettingsChanged() | NotPowered() | PathDisturbed():

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from brushloop.collect.motion.moves import Move, Room, Way
 from brushloop.collect.planning.walk import StepMoves
 from brushloop.collect.rig.config import BrushConfig, RigConfig
-from brushloop.collect.rig.config_devices import ModbusPumpConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.limits import Limits
@@ -97,12 +96,8 @@ def bundle_ml(brush: BrushConfig) -> float:
 def ink_need(config: RigConfig, dips: int) -> InkNeed:
     """Count a full load per dip, as if each mark emptied the brush; for a pump that doses by count, its doses."""
     device = config.ink.device
-    if isinstance(device, ModbusPumpConfig):
-        doses = dips // device.every_dips
-        return InkNeed(
-            doses * device.dose_ml,
-            f"the pump's doses: {device.dose_ml:g} ml before every {device.every_dips}. dip",
-        )
+    if device is not None and (doses_ml := device.doses_ml(dips)) is not None:
+        return InkNeed(doses_ml, f"what the {device.kind} doses in {dips} dips")
     load_ml = HELD_SHARE * bundle_ml(config.brush)
     return InkNeed(
         dips * load_ml,

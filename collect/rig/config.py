@@ -14,10 +14,11 @@ from pydantic import Field, ValidationError, model_validator
 
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.config_devices import CameraConfig, ForceConfig, InkDeviceConfig, RobotConfig
+from brushloop.collect.rig.config_devices import CameraConfig, ForceConfig, RobotConfig
 from brushloop.collect.rig.config_file import Config, Finite, PaperSide, place, read_toml, refusal
 from brushloop.collect.rig.config_touch import QualityConfig, SelfCheckConfig, TouchConfig
 from brushloop.collect.rig.optics import with_optics
+from brushloop.drivers.ink import AnyInkTable
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
 MAX_CONFIG_BYTES = 1024 * 1024
@@ -84,7 +85,7 @@ class InkConfig(Config):
     """Height of the tip at the bottom of a dip, in the base frame."""
     wipe: WipeConfig | None = None
     wash: WashConfig | None = None
-    device: InkDeviceConfig | None = None
+    device: AnyInkTable | None = None
     """The device that keeps the well filled; if left out, the operator does."""
 
 

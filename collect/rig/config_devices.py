@@ -11,8 +11,6 @@ from brushloop.calibrate.board.lens import Lens
 from brushloop.collect.rig.config_file import Config, Finite, Positive, Range
 from brushloop.drivers.camera import Locked
 from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
-from brushloop.drivers.ink.pump import ModbusPumpConfig
-from brushloop.drivers.ink.station import InkStationConfig
 
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
 MOST_STALE_MS = 100.0
@@ -103,9 +101,6 @@ class CameraConfig(Config):
     optics: Lens | None = None
     """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
     locked: Locked = Locked()
-
-
-InkDeviceConfig = Annotated[InkStationConfig | ModbusPumpConfig, Field(discriminator="kind")]
 
 
 class ForceConfig(Config):

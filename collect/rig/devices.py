@@ -10,15 +10,13 @@ from dataclasses import dataclass
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig, InkStationConfig
+from brushloop.collect.rig.config_devices import ForceConfig
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Camera, ForceSensor, Identity, Ink, Robot
 from brushloop.drivers.errors import noting_lateness
 from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
 from brushloop.drivers.host import Claimed, Clock, claimed
-from brushloop.drivers.ink.pump import ModbusPump
-from brushloop.drivers.ink.station import InkStation
 from brushloop.drivers.limits import Limits
 
 FORCE_CONNECT_S = 10.0
@@ -94,11 +92,6 @@ def make_force(config: ForceConfig, clock: Clock) -> SriM8123:
     return SriM8123(options, clock)
 
 
-def make_ink(config: InkDeviceConfig, clock: Clock) -> InkStation | ModbusPump:
-    """The ink device's driver, not yet connected."""
-    return InkStation(config, clock) if isinstance(config, InkStationConfig) else ModbusPump(config, clock)
-
-
 def _resolved(host: str) -> str:
     """The address of a host, so that two names of one arm count as one arm."""
     try:
@@ -139,7 +132,7 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
             stack.push_async_callback(force.close)
             force_identity = await force.connect()
         if config.ink.device is not None:
-            ink = make_ink(config.ink.device, clock)
+            ink = config.ink.device.device(clock)
             stack.push_async_callback(ink.close)
             ink_identity = await ink.connect()
         robot = make_robot(config, clock, on_notice)

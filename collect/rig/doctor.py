@@ -16,12 +16,13 @@ from rich.text import Text
 from brushloop.calibrate.board.view import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_devices import ForceConfig, InkDeviceConfig
-from brushloop.collect.rig.devices import make_camera, make_force, make_ink, make_robot
+from brushloop.collect.rig.config_devices import ForceConfig
+from brushloop.collect.rig.devices import make_camera, make_force, make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.devices import Identity, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import Clock
+from brushloop.drivers.ink.port import InkTable
 
 T = TypeVar("T")
 CALLS = 20
@@ -150,8 +151,8 @@ async def _force(config: ForceConfig, clock: Clock) -> Finding:
     )
 
 
-async def _ink(config: InkDeviceConfig, clock: Clock) -> Finding:
-    device = make_ink(config, clock)
+async def _ink(config: InkTable, clock: Clock) -> Finding:
+    device = config.device(clock)
     try:
         identity = await device.connect()
         level, latency_ms = await _timed(CALLS, device.level)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
-from brushloop.collect.rig.config_devices import InkDeviceConfig, InkStationConfig, ModbusPumpConfig
-from brushloop.collect.rig.devices import make_ink
 from brushloop.collect.teach.day import Asked, Day, Step
 from brushloop.collect.teach.store import Notebook
+from brushloop.drivers.ink.port import InkTable
+from brushloop.drivers.ink.pump import ModbusPumpConfig
+from brushloop.drivers.ink.station import InkStationConfig
 
 DEEPEST_SHARE = 0.45
 """A bundle that is pressed deeper than this share of its length comes near to its ferrule."""
@@ -85,7 +86,7 @@ class BrushStep(Step):
                 day.save(day.notebook.without(PORT.field))
                 remedy = "Type its path; `ls -l /dev/serial/by-id /dev/tty*` lists what there is."
                 raise CannotTeach("no serial line was named.", remedy)
-            device: InkDeviceConfig = InkStationConfig(kind="ink-station", port=port)
+            device: InkTable = InkStationConfig(kind="ink-station", port=port)
             if kind == PUMP.key:
                 await day.values("brush", DELIVERY)
                 ml = day.notebook.number(DELIVERY.field)
@@ -94,9 +95,9 @@ class BrushStep(Step):
             day.keep("brush", "ink.device.kind", device.kind, "answered on its line")
         await day.values("brush", Asked("ink.name", "Name of the ink, for the record", default="ink"))
 
-    async def _primed(self, day: Day, config: InkDeviceConfig) -> None:
+    async def _primed(self, day: Day, config: InkTable) -> None:
         await day.working(f"asking {config.port} who it is")
-        device = make_ink(config, day.clock)
+        device = config.device(day.clock)
         try:
             identity = await device.connect()
             level = await device.level()

@@ -1,4 +1,16 @@
-"""Ink stations on a serial line: one with a documented line protocol, and a peristaltic pump on Modbus RTU.
+"""Ink devices on a serial line: a station with a documented line protocol, and a peristaltic pump on Modbus RTU.
 
-Used by `collect.rig.devices` and `collect.teach`; `simulator` by the loopback rig and tests alone.
+The engine, the plan and the first day use what `InkTable` and `Ink` say of any of them; a new device is one more file
+here and its table in `AnyInkTable`. `simulator` is used by the loopback rig and tests alone.
 """
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from brushloop.drivers.ink.pump import ModbusPumpConfig
+from brushloop.drivers.ink.station import InkStationConfig
+
+AnyInkTable = Annotated[InkStationConfig | ModbusPumpConfig, Field(discriminator="kind")]

@@ -1,4 +1,4 @@
-"""What both ink devices share: the serial line, its checksum, limits on doses, and the error for a refused request.
+"""What ink devices share: their table in `rig.toml`, the serial line, its checksum, limits on doses, and errors.
 
 One worker thread owns the port from open to close, so that an exchange whose caller was cancelled still ends before
 the next begins: two requests at once on a half-duplex line would destroy each other.
@@ -14,8 +14,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, TypeVar, cast
+from typing import Annotated, Protocol, TypeVar, cast
 
+from pydantic import BaseModel, Field
+
+from brushloop.drivers.devices import Ink
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -24,6 +27,7 @@ from brushloop.drivers.errors import (
     NotConnected,
     ProtocolViolation,
 )
+from brushloop.drivers.host import Clock
 
 
 class InkRefused(DeviceError):
@@ -32,6 +36,28 @@ class InkRefused(DeviceError):
     def __init__(self, device: str, op: str, code: int, text: str, *, condition: str = "", remedy: str = "") -> None:
         self.code = code
         super().__init__(device, op, f"refused with {code} ({text})", condition=condition, remedy=remedy)
+
+
+class DoseLost(DeviceError):
+    """A dose was given, and the well does not show it."""
+
+
+class InkTable(BaseModel, frozen=True, extra="forbid"):
+    """The table `[ink.device]` of `rig.toml` for one kind of ink device: the engine asks it for everything."""
+
+    kind: str
+    port: str = Field(min_length=1)
+    """Device file or COM port, or what else the device is reached by."""
+    dose_ml: Annotated[float, Field(gt=0.0, le=2.0)]
+    """Size of one dose."""
+
+    def device(self, clock: Clock) -> Ink:
+        """The driver, not yet connected."""
+        raise NotImplementedError
+
+    def doses_ml(self, dips: int) -> float | None:
+        """Ink that so many dips cost where the device counts dips; None where a gauge or a person decides."""
+        return None
 
 
 _POLYNOMIAL = 0xA001  # 0x8005, reflected

@@ -18,12 +18,12 @@ import struct
 import time
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from brushloop.drivers.devices import Identity
+from brushloop.drivers.devices import Identity, Well
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.host import Clock, finished
-from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, crc16
+from brushloop.drivers.ink.port import DoseBudget, InkRefused, InkTable, SerialPort, crc16
 
 DEVICE = "pump"
 WRITE_REGISTER = 0x06
@@ -103,12 +103,10 @@ MAX_RPM = 600.0
 """The speed register could hold up to 655.35."""
 
 
-class ModbusPumpConfig(BaseModel, frozen=True, extra="forbid"):
+class ModbusPumpConfig(InkTable, frozen=True):
     """A peristaltic pump without a gauge: replaces the ink that dips take without measuring it."""
 
     kind: Literal["modbus-pump"]
-    port: str = Field(min_length=1)
-    """Device file or COM port."""
     ml_per_revolution: Annotated[float, Field(gt=0.0, lt=100.0)]
     """Calibrated: weigh what 100 revolutions deliver. A tube wears, so it is worth repeating."""
     rpm: Annotated[float, Field(gt=0.0, le=MAX_RPM)] = 50.0
@@ -118,6 +116,14 @@ class ModbusPumpConfig(BaseModel, frozen=True, extra="forbid"):
     """Dose before every `every_dips`-th dip."""
     every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
+
+    def device(self, clock: Clock) -> ModbusPump:
+        """The driver, not yet connected."""
+        return ModbusPump(self, clock)
+
+    def doses_ml(self, dips: int) -> float:
+        """Ink that the pump doses in so many dips."""
+        return dips // self.every_dips * self.dose_ml
 
 
 class ModbusPump:
@@ -137,7 +143,7 @@ class ModbusPump:
         A stop that is more than `max_overrun_s` late is reported: the well got more than was asked for.
         """
         self._unit, self._rpm = config.unit, config.rpm
-        self._clock = clock
+        self._config, self._clock = config, clock
         self._timeout_s, self._echo_s, self._max_overrun_s = timeout_s, echo_s, max_overrun_s
         # 3.5 characters of 11 bits, at least 1.75 ms: the silence that ends a frame.
         self._port = SerialPort(DEVICE, config.port, config.baud, max(0.00175, 3.5 * 11 / config.baud))
@@ -197,9 +203,16 @@ class ModbusPump:
                     remedy="Something held the host up.",
                 )
 
-    async def light(self, level: float) -> bool:
-        """False: a pump has no light."""
-        return False
+    async def replenish(self, dips: int) -> Well:
+        """Dose before every `every_dips`-th dip. Raises as `dose` does."""
+        if dips % self._config.every_dips != self._config.every_dips - 1:
+            return Well(None)
+        await self.dose(self._config.dose_ml)
+        return Well(None, self._config.dose_ml)
+
+    async def light(self) -> float | None:
+        """None: a pump has no light."""
+        return None
 
     async def level(self) -> float | None:
         """None, because the pump has no gauge: how much is in the well is unknown."""

@@ -11,12 +11,12 @@ import re
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from brushloop.drivers.devices import Identity
-from brushloop.drivers.errors import DeviceError, DeviceTimeout, LimitExceeded, ProtocolViolation
+from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.errors import DeviceError, DeviceTimeout, ProtocolViolation
 from brushloop.drivers.host import Clock
-from brushloop.drivers.ink.port import DoseBudget, InkRefused, SerialPort, crc16
+from brushloop.drivers.ink.port import DoseBudget, DoseLost, InkRefused, InkTable, SerialPort, crc16
 
 DEVICE = "ink"
 MAX_LINE_BYTES = 96
@@ -99,6 +99,8 @@ def number_of(word: str) -> float:
 MODEL = "ink-station"
 PROTOCOL = "1"
 SMALLEST_ML = 0.001
+LEVEL_RISES = 0.005
+"""A dose that raises the level of the well by less than this has not arrived."""
 FAILED = 6
 """The only refusal after which something may have been done."""
 REMEDIES = {
@@ -110,12 +112,10 @@ REMEDIES = {
 }
 
 
-class InkStationConfig(BaseModel, frozen=True, extra="forbid"):
+class InkStationConfig(InkTable, frozen=True):
     """A station that doses ink, lights the sheet and measures the level (docs/ink-station.md)."""
 
     kind: Literal["ink-station"]
-    port: str = Field(min_length=1)
-    """Device file or COM port."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
     keep_level: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """Before a dip the well is filled up to this share of its capacity."""
@@ -124,6 +124,10 @@ class InkStationConfig(BaseModel, frozen=True, extra="forbid"):
     max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
     light: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     """Set at the start of a run; if left out, the light stays as it is."""
+
+    def device(self, clock: Clock) -> InkStation:
+        """The driver, not yet connected."""
+        return InkStation(self, clock)
 
 
 class InkStation:
@@ -141,7 +145,7 @@ class InkStation:
     ) -> None:
         """`s_per_ml`: longest time for 1 ml; the reply comes when the ink is in the well. `connect_attempts`: many
         boards restart when their port is opened, and are deaf for two seconds."""
-        self._clock = clock
+        self._config, self._clock = config, clock
         self._timeout_s = timeout_s
         self._s_per_ml = s_per_ml
         self._attempts, self._connect_attempts = attempts, connect_attempts
@@ -174,17 +178,26 @@ class InkStation:
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
 
-    async def light(self, level: float) -> bool:
-        """Set the light, 0 to 1; returns True, as the station has one.
+    async def replenish(self, dips: int) -> Well:
+        """Dose until the gauge shows `keep_level`. Raises `DoseLost` if a dose does not arrive, and as `dose` does."""
+        level, dosed_ml, dose_ml = await self.level(), 0.0, self._config.dose_ml
+        while level < self._config.keep_level:
+            await self.dose(dose_ml)
+            dosed_ml += dose_ml
+            before, level = level, await self.level()
+            if level < before + LEVEL_RISES:
+                what = f"a dose of {dose_ml:g} ml left the well at {level:.0%} of its capacity"
+                remedy = "Look at the tube, the reservoir and the gauge."
+                raise DoseLost(DEVICE, "dose", what, condition="Nothing was dipped.", remedy=remedy)
+        return Well(level, dosed_ml)
 
-        Raises `LimitExceeded`, `InkRefused`, `DeviceTimeout`, `ConnectionLost`.
-        """
-        if not 0.0 <= level <= 1.0:
-            raise LimitExceeded(DEVICE, "light", level, 0.0, 1.0, "of full")
-        await self._ask("light", f"{level:.3f}")
-        return True
+    async def light(self) -> float | None:
+        """Set the light as the table says; return it, None if the table says nothing. Raises as `level` does."""
+        if self._config.light is not None:
+            await self._ask("light", f"{self._config.light:.3f}")
+        return self._config.light
 
-    async def level(self) -> float | None:
+    async def level(self) -> float:
         """Fill level of the well, 0 to 1. Raises `InkRefused`, `DeviceError`."""
         level = self._number_in(await self._ask("level"), "level")
         if level > 1.0:

@@ -1,60 +1,60 @@
 """A driver: a syringe pump that takes `DOSE 0.500` as a line of text over TCP and answers `OK`.
 
-A driver is a class that has the methods of its protocol in `drivers/devices.py` (here `Ink`). It goes into
-`drivers/ink/`, its options into the union of ink devices in `collect/rig/config_devices.py`, and its construction into
-`make_ink` in `collect/rig/devices.py`. Write its simulator beside it in the same go: real wire
-bytes from both sides are what the tests of the driver, of the faults and of the whole rig run on.
+An ink device is a table of `rig.toml` and a class with the methods of `Ink` in `drivers/devices.py`. Both go into a
+file of `drivers/ink/`, the table also into `AnyInkTable` there. Write its simulator beside it, for real wire bytes.
 """
+# ruff: noqa: D101, D102 - `Ink` says what each method does
 
 from __future__ import annotations
 
 import asyncio
+from typing import Literal
 
-from brushloop.drivers.devices import Identity
-from brushloop.drivers.errors import DeviceTimeout, NotConnected, ProtocolViolation
+from brushloop.drivers.devices import Identity, Well
+from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.host import Clock
-from brushloop.drivers.ink.port import DoseBudget
+from brushloop.drivers.ink.port import DoseBudget, InkTable
+
+
+class SyringeTable(InkTable, frozen=True):  # `port` is HOST:PORT
+    kind: Literal["syringe"] = "syringe"
+    dose_ml: float = 0.2
+
+    def device(self, clock: Clock) -> SyringePump:
+        return SyringePump(self, clock)
 
 
 class SyringePump:
-    """Doses ink; has neither a light nor a gauge."""
-
-    def __init__(self, host: str, port: int, clock: Clock, *, timeout_s: float = 2.0) -> None:
-        self._host, self._port, self._clock, self._timeout_s = host, port, clock, timeout_s
-        self._budget = DoseBudget("ink", smallest_ml=0.01, max_dose_ml=2.0, max_per_minute_ml=5.0)
+    def __init__(self, table: SyringeTable, clock: Clock) -> None:
+        self._table, self._clock = table, clock
+        self._budget = DoseBudget("ink", smallest_ml=0.01, max_dose_ml=2.0, max_per_minute_ml=50.0)
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def connect(self) -> Identity:
-        """Open the connection and make sure that the right device answers; gives no ink."""
-        self._streams = await asyncio.wait_for(asyncio.open_connection(self._host, self._port), self._timeout_s)
+        self._streams = await asyncio.open_connection(*self._table.port.split(":"))
         return Identity("ink", await self._ask("WHO"), "", simulated=False)
 
     async def dose(self, volume_ml: float) -> None:
-        """Add ink to the well. Raises `LimitExceeded` before anything is sent."""
         self._budget.take(volume_ml, self._clock.now_ns())
         if (answer := await self._ask(f"DOSE {volume_ml:.3f}")) != "OK":
             raise ProtocolViolation("ink", "dose", f"answered {answer!r}, expected 'OK'")
 
-    async def light(self, level: float) -> bool:
-        """Report that there is no light."""
-        return False
+    async def replenish(self, dips: int) -> Well:
+        await self.dose(self._table.dose_ml)
+        return Well(level=None, dosed_ml=self._table.dose_ml)
 
-    async def level(self) -> float | None:
-        """Report that there is no gauge."""
-        return None
+    async def light(self) -> None:
+        pass
+
+    async def level(self) -> None:
+        pass
 
     async def close(self) -> None:
-        """Close the connection."""
         if self._streams is not None:
             self._streams[1].close()
-            await self._streams[1].wait_closed()
 
     async def _ask(self, line: str) -> str:
-        if self._streams is None:
-            raise NotConnected("ink", line, "not connected")
+        assert self._streams is not None
         reader, writer = self._streams
         writer.write(line.encode() + b"\n")
-        try:
-            return (await asyncio.wait_for(reader.readline(), self._timeout_s)).decode("ascii").strip()
-        except TimeoutError:
-            raise DeviceTimeout("ink", line, f"no reply in {self._timeout_s:g} s") from None
+        return (await asyncio.wait_for(reader.readline(), 2.0)).decode("ascii").strip()

@@ -55,7 +55,7 @@ class RunContext:
     looked_at_sheet: int | None = None
     """Sheet whose free patches were seen to be blank."""
     dips: int = 0
-    """Dips since the run began, where doses are counted by dips."""
+    """Dips since the run began."""
     dosed_ml: float = 0.0
     """Ink dosed since the run began."""
     light: float | None = None

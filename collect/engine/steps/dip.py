@@ -11,15 +11,11 @@ from contextlib import contextmanager
 
 from brushloop.collect.engine.steps.capture import look_at_sheet
 from brushloop.collect.engine.steps.context import RunContext, StepContext
-from brushloop.collect.errors import NeedsOperator
 from brushloop.collect.motion.moves import Move
 from brushloop.collect.motion.procedures import TOUCH_TOLERANCE_MM
-from brushloop.collect.rig.config_devices import InkStationConfig, ModbusPumpConfig
 from brushloop.drivers.devices import PoseSample
 from brushloop.sessions.events import DipResult
 
-LEVEL_RISES = 0.005
-"""A dose that raises the level of the well by less than this has not arrived."""
 STALE_INK_S = 5.0
 """After a longer wait (a pause, a question, a photograph) the brush dips again before it presses."""
 
@@ -35,8 +31,10 @@ async def fill_brush(context: StepContext) -> float | None:
     """Fill up the well if needed, then dip. Return the level of the well, 0 to 1; None if nothing measures it."""
     run = context.run
     with run.progress.meanwhile("dip"):
-        level = await fill_well(run)
+        level = None
         if run.rig.ink is not None:
+            well = await run.rig.ink.replenish(run.dips)
+            level, run.dips, run.dosed_ml = well.level, run.dips + 1, run.dosed_ml + well.dosed_ml
             context.recorder.ink(level, run.dosed_ml, run.light)
         await context.guard.guarded(run.procedures.dip())
         run.left_ink_ns = run.rig.clock.now_ns()
@@ -44,45 +42,9 @@ async def fill_brush(context: StepContext) -> float | None:
 
 
 async def set_light(run: RunContext) -> None:
-    """Set the light of the ink station, once per run. Raises `DeviceError`."""
-    config = run.rig.config.ink.device
-    light = config.light if isinstance(config, InkStationConfig) else None
-    if run.rig.ink is not None and light is not None and await run.rig.ink.light(light):
-        run.light = light
-
-
-async def fill_well(run: RunContext) -> float | None:
-    """Dose ink when the gauge or the number of dips calls for it; return the level, None without a gauge.
-
-    Raises `NeedsOperator` if a dose does not arrive, and `DeviceError`.
-    """
-    ink, config = run.rig.ink, run.rig.config.ink.device
-    match config:
-        case InkStationConfig():
-            assert ink is not None
-            level = await ink.level()
-            while level is not None and level < config.keep_level:
-                await _dose(run, config.dose_ml)
-                before, level = level, await ink.level()
-                if level is not None and level < before + LEVEL_RISES:
-                    raise NeedsOperator(
-                        f"a dose of {config.dose_ml:g} ml left the well at {level:.0%} of its capacity: "
-                        "look at the tube, the reservoir and the gauge"
-                    )
-            return level
-        case ModbusPumpConfig():
-            if run.dips % config.every_dips == config.every_dips - 1:
-                await _dose(run, config.dose_ml)
-            run.dips += 1
-        case None:
-            pass
-    return None
-
-
-async def _dose(run: RunContext, dose_ml: float) -> None:
-    assert run.rig.ink is not None
-    await run.rig.ink.dose(dose_ml)
-    run.dosed_ml += dose_ml
+    """Set the light of the ink device, once per run. Raises `DeviceError`."""
+    if run.rig.ink is not None:
+        run.light = await run.rig.ink.light()
 
 
 def must_dip(context: StepContext) -> bool:

@@ -9,10 +9,10 @@ import pytest
 from mcap.reader import make_reader
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.errors import ForceTooHigh, NeedsOperator, PosesLate
+from brushloop.collect.errors import ForceTooHigh, PosesLate
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.errors import ConnectionLost, Stuck
-from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.journal import RunState, replay
@@ -172,7 +172,7 @@ def test_an_empty_reservoir_ends_the_run_before_a_dry_press(lab: Lab) -> None:
 def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.rig.world.well.ml = 1.0
     monkeypatch.setattr(lab.rig.world.well, "add", lambda _volume_ml: None)  # the tube has come off
-    with pytest.raises(NeedsOperator, match="look at the tube"):
+    with pytest.raises(DoseLost, match="Look at the tube"):
         run(lab.engine())
     assert not [press for press in lab.rig.world.presses if press.depth_mm > 1.0]
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.teach import brush
 from brushloop.collect.teach.brush import BrushStep
 from brushloop.collect.teach.camera import CameraStep
 from brushloop.collect.teach.day import Day
@@ -17,6 +16,7 @@ from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.host import HostClock
+from brushloop.drivers.ink.station import InkStationConfig
 from tests.collect.teach.conftest import Person, day_of
 
 BACK, HOW, GIVE, PORT = "<", "How do you want to go on?", "Give 0.5 ml", "Its serial line"
@@ -94,7 +94,7 @@ class Station:
 async def test_back_asks_the_question_before_and_no_other(
     answers: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(brush, "make_ink", lambda *_: Station())
+    monkeypatch.setattr(InkStationConfig, "device", lambda *_: Station())
     monkeypatch.setattr(Station, "doses", 0)
     person = Typing(*answers)
     day = await led(person, tmp_path)

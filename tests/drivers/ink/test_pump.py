@@ -78,6 +78,15 @@ async def test_a_dose_sets_the_speed_starts_and_stops(expected_protocol):
         await pump.close()
 
 
+async def test_it_doses_before_every_nth_dip(firmware: PumpFirmware, line: PtyLine):
+    wanted = table(line.path, dose_ml=0.02, every_dips=3)
+    pump = ModbusPump(wanted, HostClock(), timeout_s=TIMEOUT_S, echo_s=0.02)
+    await pump.connect()
+    assert [(await pump.replenish(dips)).dosed_ml for dips in range(7)] == [0.0, 0.0, 0.02, 0.0, 0.0, 0.02, 0.0]
+    await pump.close()
+    assert wanted.doses_ml(7) == pytest.approx(0.04)
+
+
 async def test_a_line_that_echoes_is_refused(expected_protocol):
     with expected_protocol([(PROBE, PROBE)]) as path:
         pump = pump_at(path, echo_s=0.5)

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
+from brushloop.drivers.devices import Well
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -17,7 +18,7 @@ from brushloop.drivers.errors import (
     ProtocolViolation,
 )
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.ink.port import InkRefused
+from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.ink.simulator import PtyLine, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
 from tests.drivers.failing import fail_requests
@@ -41,7 +42,7 @@ def station_at(path: str, **options: float) -> InkStation:
 
 
 def table(path: str) -> InkStationConfig:
-    return InkStationConfig(kind="ink-station", port=path, dose_ml=2.0)
+    return InkStationConfig(kind="ink-station", port=path, dose_ml=2.0, light=0.5)
 
 
 @pytest.fixture
@@ -75,7 +76,7 @@ async def test_a_session_reads_like_the_documented_one(expected_protocol):
         station = station_at(path)
         identity = await station.connect()
         assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
-        await station.light(0.5)
+        await station.light()
         await station.dose(1.25)
         assert await station.level() == 0.73
         with pytest.raises(InkRefused, match=r"reservoir is empty.*Nothing was done.*Refill") as refusal:
@@ -214,14 +215,14 @@ async def test_where_there_is_no_port_nothing_is_connected(tmp_path):
     with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
         await station.connect()
     with pytest.raises(NotConnected):
-        await station.light(1.0)
+        await station.light()
     await station.close()
 
 
 async def test_a_port_that_somebody_else_holds_is_not_shared(line: PtyLine, station: InkStation):
     with pytest.raises(ConnectionLost, match="lock"):
         await station_at(line.path).connect()
-    await station.light(1.0)
+    await station.light()
 
 
 async def test_closing_ends_an_exchange_that_waits(line: PtyLine, station: InkStation):
@@ -240,7 +241,7 @@ async def test_a_cancelled_request_does_not_disturb_the_next(line: PtyLine, stat
     fail_requests(line, "late")
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.03):
-            await station.light(1.0)
+            await station.light()
     assert await station.level() == 0.5
 
 
@@ -273,12 +274,19 @@ async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(lin
     await station.close()
 
 
-async def test_a_light_out_of_range_is_refused(firmware: StationFirmware, station: InkStation):
-    for level in (-0.1, 1.1, math.nan):
-        with pytest.raises(LimitExceeded, match="light"):
-            await station.light(level)
-    await station.light(0.25)
-    assert firmware.light == 0.25
+async def test_a_well_is_filled_up_to_its_level_and_a_dose_that_does_not_arrive_is_told(
+    firmware: StationFirmware, station: InkStation, monkeypatch: pytest.MonkeyPatch
+):
+    firmware.well.ml = 0.4 * firmware.well.capacity_ml
+    well = await station.replenish(dips=0)
+    assert well.level is not None
+    assert well.level >= 0.5
+    assert well.dosed_ml == pytest.approx(firmware.well.ml - 0.4 * firmware.well.capacity_ml)
+    assert await station.replenish(dips=1) == Well(well.level), "it is full"
+    firmware.well.ml = 1.0
+    monkeypatch.setattr(firmware.well, "add", lambda _volume_ml: None)  # the tube has come off
+    with pytest.raises(DoseLost, match="Look at the tube"):
+        await station.replenish(dips=2)
 
 
 async def test_a_station_refuses_what_it_cannot_do(firmware: StationFirmware, station: InkStation):
