@@ -61,7 +61,9 @@ def fit(
     if (prior is not None and not drags) or (strokes is not None and prior is None):
         raise typer.BadParameter("--prior needs --drags, and --strokes needs --prior")
     if drags:
-        _fit_drags(session, mm_per_px, calibration, prior, strokes)
+        if calibration is not None:
+            raise typer.BadParameter("--calibration is for presses, not for --drags")
+        _fit_drags(session, mm_per_px, prior, strokes)
         return
 
     from brushloop.calibrate.fit.brush import FitRequest, fit_presses
@@ -73,12 +75,10 @@ def fit(
     say(*fitted.lines())
 
 
-def _fit_drags(
-    session: Path, mm_per_px: float | None, calibration: Path | None, prior: Path | None, strokes: int | None
-) -> None:
+def _fit_drags(session: Path, mm_per_px: float | None, prior: Path | None, strokes: int | None) -> None:
     from brushloop.calibrate.artefact import load_artefact, put_to_use
-    from brushloop.calibrate.drags.brush import FOLDER, DragArtefact, fit_drawn, refit_drawn
     from brushloop.calibrate.drags.captures import read_drags
+    from brushloop.calibrate.drags.fit import FOLDER, DragArtefact, fit_drawn, refit_drawn
     from brushloop.calibrate.drags.report import fit_lines
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
@@ -86,7 +86,7 @@ def _fit_drags(
     before = load_artefact(prior, DragArtefact) if prior is not None else None
     scale = mm_per_px or (before.mm_per_px if before is not None else DRAG_MM_PER_PX)
     with shown() as progress:
-        drawn = read_drags(session, scale, calibration, progress)
+        drawn = read_drags(session, scale, progress).drawn()
         if before is not None:
             artefact = refit_drawn(drawn, before, str(prior), strokes or len(drawn.stroke_ids))
         else:

@@ -6,8 +6,8 @@ the tip q over the length s of the path as a first-order lag,
 
     dp/ds = (q - p) / leash,    leash = leash_mm + leash_per_mm * depth,
 
-and whose half width follows the depth with a separate lag, `settle_mm`. Drift describes how the brush is mounted: it
-turns with the brush if the path gives a heading. The mark is the union of the discs between neighbouring nodes.
+and whose half width follows the depth with a separate lag, `settle_mm`. Drift describes how the brush is mounted. The
+mark is the union of the discs between neighbouring nodes.
 
 A character consists of ends and corners, where the footprint's length shows: it lands behind the tip, swings round
 behind a corner, and is drawn towards the tip when the brush lifts. There the footprint is the hull of neighbouring
@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.damped import Damping, Equations, Lowest, descend
+from brushloop.model.damped import Damping, Equations, descend
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -90,7 +90,7 @@ class DragModel:
     settle_mm: float = 3.0
     """Path length over which the footprint's width follows the depth."""
     drift_x_mm: float = 0.0
-    """Offset of the footprint from its lagged position, along the heading; along the x axis if a path has none."""
+    """Offset of the footprint from its lagged position."""
     drift_y_mm: float = 0.0
     drift_x_per_mm: float = 0.0
     """Growth of the drift per mm of depth."""
@@ -124,33 +124,21 @@ class Drawings:
     """Images of ink on one grid of pixel centres, mm, y upward, and the strokes that were commanded for each."""
 
     paths: Sequence[Floats]
-    """The strokes of all images in order, (n, 3) each: x, y, depth in mm; or (n, 4) with the heading in deg."""
+    """The strokes of all images in order: (n, 3) of x, y, depth in mm for the lag, (n, 4) with the heading in deg for
+    the footprint."""
     groups: Indices
     """(B + 1,): paths `groups[i]` to `groups[i + 1]` are the strokes of image i."""
     ink: NDArray[np.float32]
     """(B, len(y_mm), len(x_mm)) from 0 to 1."""
     x_mm: Floats
     y_mm: Floats
-    weights: Floats
-    """(B,) how often each image counts in a fit."""
-
-    def __post_init__(self) -> None:
-        shape = (len(self.weights), len(self.y_mm), len(self.x_mm))
-        if self.ink.shape != shape or len(self.groups) != shape[0] + 1 or self.groups[-1] != len(self.paths):
-            raise ValueError(
-                f"{len(self.groups) - 1} images of {len(self.paths)} strokes, ink {self.ink.shape}: not alike"
-            )
 
     def only(self, images: Indices) -> Drawings:
         """These images and their strokes."""
         each = [self.paths[int(self.groups[i]) : int(self.groups[i + 1])] for i in images]
         groups = np.cumsum([0, *(len(strokes) for strokes in each)])
         paths = [path for strokes in each for path in strokes]
-        return replace(self, paths=paths, groups=groups, ink=self.ink[images], weights=self.weights[images])
-
-    def weighted(self, share: float) -> Drawings:
-        """The same with every weight multiplied."""
-        return replace(self, weights=share * self.weights)
+        return replace(self, paths=paths, groups=groups, ink=self.ink[images])
 
     def every(self, step: int) -> Drawings:
         """The same with only each `step`-th row and column."""
@@ -162,106 +150,74 @@ def ink(distance_mm: Floats, spread_mm: float) -> Floats:
     return 1.0 / (1.0 + np.exp(-np.clip(distance_mm / spread_mm, -40.0, 40.0)))
 
 
-def trails(paths: Sequence[Floats], vector: Floats) -> tuple[Floats, Indices]:
-    """All paths' trails concatenated, (sum(n + 2), 3), and the rows where each begins and the last ends, (B + 1,).
+@dataclass(frozen=True, slots=True)
+class Trails:
+    """Chains of discs whose hulls are the ink, and which of them each image shows."""
 
-    A path is (n, 3) nodes x, y, depth of the tip, or (n, 4) with the heading in degrees, counter-clockwise from x. Its
-    trail, that of the footprint, is (n + 2, 3) x, y, half width, mm; the first and the last row are the mark's ends
-    behind the landing and ahead of the lift-off. Raises ValueError for another shape, or fewer than 2 nodes.
+    discs: Floats
+    """(rows, 3) of x, y, half width in mm, all chains after each other."""
+    starts: Indices
+    """(trails + 1,): the row where each chain begins, and where the last one ends."""
+    groups: Indices
+    """(B + 1,): image i shows the trails `groups[i]` to `groups[i + 1]`."""
+
+    def distances(self, x_mm: Floats, y_mm: Floats) -> Floats:
+        """Signed distances in mm to the edge of the ink, positive in ink, (B, len(y_mm), len(x_mm))."""
+        from brushloop.model.drag_kernel import signed
+
+        out = np.empty((len(self.groups) - 1, len(y_mm), len(x_mm)))
+        signed(self.discs, self.starts, self.groups, np.ascontiguousarray(x_mm), np.ascontiguousarray(y_mm), out)
+        return out
+
+    def equations(
+        self, slopes: Floats, drawings: Drawings, spread_mm: float, added_mm: Floats | None = None
+    ) -> Equations:
+        """Normal equations of the modelled less the given ink; `slopes` (rows, 3, P) are the derivatives of the discs.
+
+        `added_mm` (B, len(y_mm), len(x_mm)) is added to the signed distances: what the model is known to miss.
+        """
+        from brushloop.model import drag_kernel
+
+        kernel: Any = drag_kernel
+        count = slopes.shape[2]
+        square, gradient = np.zeros((count, count)), np.zeros(count)
+        added = np.zeros((1, *drawings.ink.shape[1:])) if added_mm is None else added_mm
+        seen, x_mm, y_mm = (np.ascontiguousarray(part) for part in (drawings.ink, drawings.x_mm, drawings.y_mm))
+        chains = self.discs, self.starts, self.groups
+        cost = kernel.normal_equations(*chains, slopes, x_mm, y_mm, seen, added, spread_mm, square, gradient)
+        return Equations(float(cost), np.tril(square) + np.tril(square, -1).T, gradient)
+
+
+def lagging(paths: Sequence[Floats], vector: Floats) -> Trails:
+    """The trails of a lagging disc, one for each path of (n, 3) nodes x, y, depth of the tip, n >= 2.
+
+    A trail has n + 2 discs; the first and the last are the mark's ends behind the landing and ahead of the lift-off.
     """
-    for path in paths:
-        if path.ndim != 2 or path.shape[1] not in (3, 4) or len(path) < 2:
-            raise ValueError(f"a path is (n, 3) or (n, 4) with n >= 2, got {path.shape}")
     from brushloop.model.drag_kernel import follow  # numba takes a fifth of a second to import
 
     ends = np.cumsum([0, *(len(path) for path in paths)])
     starts = ends + 2 * np.arange(len(ends))
-    out, nodes = np.empty((int(starts[-1]), 3)), np.zeros((int(ends[-1]), 4))
-    for path, end in zip(paths, ends[1:], strict=True):
-        nodes[end - len(path) : end, : path.shape[1]] = path
-    nodes[:, 3] = np.radians(nodes[:, 3])
-    follow(nodes, ends, np.asarray(vector, np.float64), out, starts)
-    return out, starts
+    out = np.empty((int(starts[-1]), 3))
+    follow(np.ascontiguousarray(np.concatenate(paths)), ends, vector, out, starts)
+    return Trails(out, starts, np.arange(len(ends)))
 
 
-def distances(nodes: Floats, starts: Indices, x_mm: Floats, y_mm: Floats, groups: Indices | None = None) -> Floats:
-    """Signed distance of every trail on one grid, (B, len(y_mm), len(x_mm)) mm, positive in ink.
-
-    For images of several strokes, image i shows trails `groups[i]` to `groups[i + 1]`, (B + 1,).
-    """
-    from brushloop.model.drag_kernel import signed
-
-    each = np.arange(len(starts)) if groups is None else groups
-    out = np.empty((len(each) - 1, len(y_mm), len(x_mm)))
-    signed(nodes, starts, each, np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64), out)
-    return out
-
-
-def ink_equations(
-    nodes: Floats,
-    starts: Indices,
-    groups: Indices,
-    slopes: Floats,
-    drawings: Drawings,
-    spread_mm: float,
-    added_mm: Floats | None = None,
-) -> Equations:
-    """Normal equations of the modelled less the given ink.
-
-    Trails `groups[i]` to `groups[i + 1]` make image i, and `slopes` (rows, 3, P) are the derivatives of their nodes.
-    `added_mm` (B, len(y_mm), len(x_mm)) is added to the signed distances: what the model is known to miss.
-    """
-    from brushloop.model import drag_kernel
-
-    kernel: Any = drag_kernel
-    count = slopes.shape[2]
-    square, gradient = np.zeros((count, count)), np.zeros(count)
-    added = np.zeros((1, *drawings.ink.shape[1:])) if added_mm is None else np.ascontiguousarray(added_mm, np.float64)
-    ink, weights = np.ascontiguousarray(drawings.ink, np.float32), np.ascontiguousarray(drawings.weights, np.float64)
-    x_mm, y_mm = np.ascontiguousarray(drawings.x_mm), np.ascontiguousarray(drawings.y_mm)
-    cost = kernel.normal_equations(
-        nodes, starts, groups, slopes, x_mm, y_mm, ink, added, weights, spread_mm, square, gradient
-    )
-    return Equations(float(cost), np.tril(square) + np.tril(square, -1).T, gradient)
-
-
-def derivatives(nodes_at: Callable[[Floats], Floats], scaled: Floats) -> Floats:
-    """The derivatives (rows, 3, P) of nodes by scaled values (P,)."""
-    nodes = nodes_at(scaled)
-    each = [(nodes_at(scaled + STEP * unit) - nodes) / STEP for unit in np.eye(len(scaled))]
+def derivatives(trails_at: Callable[[Floats], Trails], scaled: Floats) -> Floats:
+    """The derivatives (rows, 3, P) of discs by scaled values (P,)."""
+    discs = trails_at(scaled).discs
+    each = [(trails_at(scaled + STEP * unit).discs - discs) / STEP for unit in np.eye(len(scaled))]
     return np.stack(each, axis=-1)
 
 
-def fit_to_ink(
-    trails_at: Callable[[Floats], tuple[Floats, Indices, Indices]],
-    start: Floats,
-    drawings: Drawings,
-    spread_mm: float,
-    added_mm: Floats | None = None,
-) -> Lowest:
-    """Fit scaled values (P,) to drawings by least squares, each with a prior of unit variance around 0.
-
-    `trails_at` gives nodes, the rows where trails begin, and the trails where images begin, as in `ink_equations`.
-    """
+def fit_to_ink(trails_at: Callable[[Floats], Trails], start: Floats, drawings: Drawings, spread_mm: float) -> Floats:
+    """Fit scaled values (P,) to drawings by least squares, each with a prior of unit variance around 0."""
 
     def equations(scaled: Floats) -> Equations:
-        nodes, starts, groups = trails_at(scaled)
-        slopes = derivatives(lambda values: trails_at(values)[0], scaled)
-        at = ink_equations(nodes, starts, groups, slopes, drawings, spread_mm, added_mm)
+        at = trails_at(scaled).equations(derivatives(trails_at, scaled), drawings, spread_mm)
         cost = at.cost + 0.5 * float(scaled @ scaled)
         return Equations(cost, at.square + np.eye(len(scaled)), at.gradient + scaled)
 
-    return descend(equations, start, rounds=ROUNDS, most=2.0, gain=GAIN, damping=DAMPING)
-
-
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """Footprints of several strokes: rows x, y, half width of the discs, and the row at which each footprint begins."""
-
-    discs: Floats
-    starts: Indices
-    strokes: Indices
-    """(strokes + 1,): footprints `strokes[i]` to `strokes[i + 1]` belong to stroke i."""
+    return descend(equations, start, rounds=ROUNDS, most=2.0, gain=GAIN, damping=DAMPING).vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,18 +239,14 @@ class Footprint:
         """Distance of the footprint's middle behind the tip in a straight stroke, (N,) -> (N,) mm."""
         return np.maximum(_quadratic(np.array(self.values[:3]), depth_mm), 0.0)
 
-    def distance(self, paths: Sequence[Floats], x_mm: Floats, y_mm: Floats) -> Floats:
-        """Signed distance in mm to the edge of the ink of all paths, positive in ink, (len(y_mm), len(x_mm)).
-
-        A path is (N, 4): x, y, depth, heading in deg.
-        """
-        return inked([self] * len(paths), paths, x_mm, y_mm)
-
 
 def inked(footprints: Sequence[Footprint], paths: Sequence[Floats], x_mm: Floats, y_mm: Floats) -> Floats:
-    """The same as `Footprint.distance`, with a footprint for each path."""
+    """Signed distance in mm to the edge of the ink of all paths, positive in ink, (len(y_mm), len(x_mm)).
+
+    A path is (N, 4): x, y, depth, heading in deg. Each is drawn by a footprint of its own.
+    """
     at = marks([sampled(path) for path in paths], np.array([footprint.values for footprint in footprints]))
-    return distances(at.discs, at.starts, x_mm, y_mm, np.array([0, len(at.starts) - 1]))[0]
+    return replace(at, groups=at.groups[[0, -1]]).distances(x_mm, y_mm)[0]
 
 
 def _quadratic(of: Floats, depth_mm: Floats) -> Floats:
@@ -327,8 +279,8 @@ def sampled(path: Floats) -> Floats:
     return nodes
 
 
-def marks(paths: Sequence[Floats], values: Floats) -> Marks:
-    """The footprints along sampled paths, each (M, 4) of x, y, depth, heading in deg.
+def marks(paths: Sequence[Floats], values: Floats) -> Trails:
+    """The footprints along sampled paths, each (M, 4) of x, y, depth, heading in deg; each path is an image.
 
     `values` are those of one footprint, (28,), or of one for each path, (paths, 28).
     """
@@ -339,7 +291,7 @@ def marks(paths: Sequence[Floats], values: Floats) -> Marks:
     discs = np.empty((int(ends[-1]) * DISCS, 3))
     each = np.ascontiguousarray(np.broadcast_to(values, (len(paths), len(NAMES))))
     kernel.pull(np.ascontiguousarray(np.concatenate(paths)), ends, each, discs)
-    return Marks(discs, DISCS * np.arange(int(ends[-1]) + 1), ends)
+    return Trails(discs, DISCS * np.arange(int(ends[-1]) + 1), ends)
 
 
 def fit_footprint(drawings: Drawings, start: Footprint | None = None) -> Footprint:
@@ -367,10 +319,10 @@ def _fitted(
     def values(vector: Floats) -> Floats:
         return first + scale * vector.reshape(-1, len(NAMES))
 
-    def trails_at(vector: Floats) -> tuple[Floats, Indices, Indices]:
+    def trails_at(vector: Floats) -> Trails:
         at = marks(nodes, values(vector)[of])
-        return at.discs, at.starts, at.strokes[drawings.groups]
+        return replace(at, groups=at.groups[drawings.groups])
 
     for spread_mm in spreads_mm:
-        scaled = fit_to_ink(trails_at, scaled, drawings, spread_mm).vector
+        scaled = fit_to_ink(trails_at, scaled, drawings, spread_mm)
     return [Footprint(tuple(each)) for each in values(scaled).tolist()]

@@ -1,4 +1,4 @@
-"""Compiled loops of `model.drag` and `model.drag`: how a brush is pulled along its path, signed distances of its
+"""Compiled loops of `model.drag`: how a brush is pulled along its path, signed distances of its
 mark, and the normal equations of a fit."""
 
 import math
@@ -14,7 +14,7 @@ _STICK = 10  # values of a footprint that belong to its stick, before those of t
 
 @_compile
 def follow(path, ends, p, out, starts):
-    """Fill `out` with the trails of paths (x, y, depth, heading in rad) between `ends`; `p` is `DragModel.vector()`."""
+    """Fill `out` with the trails of paths (x, y, depth) between `ends`; `p` is `DragModel.vector()`."""
     for i in range(len(ends) - 1):
         first, last, at = ends[i], ends[i + 1] - 1, starts[i]
         x, y, depth = path[first, 0], path[first, 1], path[first, 2]
@@ -39,9 +39,8 @@ def follow(path, ends, p, out, starts):
                     x = path[k, 0] - lag_x - (path[k - 1, 0] - x - lag_x) * keep
                     y = path[k, 1] - lag_y - (path[k - 1, 1] - y - lag_y) * keep
             n = at + 1 + k - first
-            along, across = p[6] + p[8] * depth, p[7] + p[9] * depth
-            out[n, 0] = x + math.cos(path[k, 3]) * along - math.sin(path[k, 3]) * across
-            out[n, 1] = y + math.sin(path[k, 3]) * along + math.cos(path[k, 3]) * across
+            out[n, 0] = x + p[6] + p[8] * depth
+            out[n, 1] = y + p[7] + p[9] * depth
             out[n, 2] = p[0] + p[1] * depth + p[2] * depth * depth
         out[at, 0] = out[at + 1, 0] - p[11] * ux
         out[at, 1] = out[at + 1, 1] - p[11] * uy
@@ -163,9 +162,8 @@ def signed(nodes, starts, groups, x, y, out):
 
 
 @_compile
-def normal_equations(nodes, starts, groups, slopes, x, y, target, added, weights, spread, square, gradient):
-    """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares. Image i counts
-    `weights[i]` times.
+def normal_equations(nodes, starts, groups, slopes, x, y, target, added, spread, square, gradient):
+    """Add J'J and J'r of ink minus target over every pixel; returns half the sum of squares.
 
     `slopes` (nodes, 3, P) are the nodes' derivatives. The position t of the nearest disc is held constant, and so is
     what is `added` to the signed distances, one array for each image or a single one for all of them.
@@ -183,7 +181,7 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, added, weights
                 u = (value + added[min(i, len(added) - 1), r, c]) / spread
                 seen = 1.0 / (1.0 + math.exp(-min(max(u, -40.0), 40.0)))
                 miss = seen - target[i, r, c]
-                cost += 0.5 * weights[i] * miss * miss
+                cost += 0.5 * miss * miss
                 if abs(u) > _FAR:
                     continue
                 slope = seen * (1.0 - seen) / spread
@@ -196,8 +194,7 @@ def normal_equations(nodes, starts, groups, slopes, x, y, target, added, weights
                         j[used], which[used] = change, m
                         used += 1
                 for m in range(used):
-                    weighted = weights[i] * j[m]
-                    gradient[which[m]] += weighted * miss
+                    gradient[which[m]] += j[m] * miss
                     for n in range(m + 1):
-                        square[which[m], which[n]] += weighted * j[n]
+                        square[which[m], which[n]] += j[m] * j[n]
     return cost

@@ -1,55 +1,52 @@
-"""Fit bristle lag and width of `model.drag` to dragged strokes, and learn what the lag misses.
+"""The dragged brush of a session: learned from its strokes, kept in a file, and adapted to another session.
 
-The fit minimises the squared difference between captured ink and the model's probability of ink, with an edge that
-varies by `SPREAD_MM` from stroke to stroke. This gives the best image on average, and so the best cosine similarity.
-What the lag misses is learned from the training strokes by kernel ridge regression on clipped signed distances. The
-probability above which a pixel counts as ink is half of the attainable Dice score, which maximises that score's
-expectation: it is estimated from how strokes of other commands predict each stroke.
+The fit of `model.drag`'s lag and width minimises the squared difference between captured ink and the model's
+probability of ink, with an edge that varies by `SPREAD_MM` from stroke to stroke. This gives the best image on average,
+and so the best cosine similarity. What the lag misses is learned from the training strokes by kernel ridge regression
+on clipped signed distances.
+
+A brush known from another session is adapted in its place and its width, which change whenever a brush is mounted and
+its zero touch is found. Its leash and the terms that grow with depth are adapted within narrow bounds. What its lag
+missed in the other session is left behind.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from brushloop.calibrate.artefact import FittedValue, Frozen
-from brushloop.calibrate.drags.captures import COMMANDS, commanded_path
-from brushloop.model.drag import (
-    DragModel,
-    Drawings,
-    Floats,
-    Indices,
-    derivatives,
-    distances,
-    fit_to_ink,
-    ink,
-    ink_equations,
-    trails,
-)
+from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
+from brushloop.calibrate.drags.captures import COMMANDS, Drawn, commanded_path
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.spread import farthest_first
+from brushloop.model.drag import DragModel, Drawings, Floats, Indices, Trails, derivatives, fit_to_ink, lagging
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray
+from brushloop.sessions.terminal import Progress, counted, unseen
 
+FOLDER = "dragfit"
+PREDICTED, LAG = "predicted", "bristle lag alone"
 SPREAD_MM = 0.9
-"""Default scale of the logistic: an edge that varies by 1.6 mm (standard deviation)."""
-INK_ABOVE = 0.42
-"""A pixel counts as ink above this probability: half of the attainable Dice score maximises its expectation."""
+"""Scale of the logistic: an edge that varies by 1.6 mm (standard deviation)."""
+INK_ABOVE = 0.4
+"""A pixel counts as ink above this probability. Half of the attainable Dice score maximises its expectation; on real
+strokes that half is .39 to .43, and scores change by .003 at most between these."""
+EDGE_MM = SPREAD_MM * float(np.log(INK_ABOVE / (1.0 - INK_ABOVE)))
+"""Signed distance at which the probability of ink is `INK_ABOVE`."""
 FREEDOM = dict(
     zip(DragModel.names(), (2.0, 0.2, 0.01, 3.0, 1.0, 4.0, 1.5, 1.5, 0.2, 0.2, 3.0, 3.0, 0.5, 0.5), strict=True)
 )
 """Standard deviations of the prior: a parameter this far from its start costs as much as a pixel of wrong ink."""
-LAGGING = ("leash_mm", "leash_per_mm", "land_mm", "back_mm", "front", "front_width")
-CIRCLES = DragModel(leash_mm=0.0, leash_per_mm=0.0, front=0.0)
-"""Circle stamps: the disc stays at the tip, except for drift; its width still settles along the path."""
-CIRCLES_FREEDOM = {name: sd for name, sd in FREEDOM.items() if name not in LAGGING}
+FIT_MM = 0.8
+"""Scale of the images that the parameters are fitted to: finer ones do not change the fit."""
 DRAWS = 500
 UNDETERMINED = 0.5
 """A parameter keeps no interval if the strokes reduce the variance of its weak prior by less than this share."""
@@ -59,12 +56,19 @@ SPREADS = (2.2, 2.2, 2.2, 2.2, 5.0)
 """Width of the kernel in standard deviations of each of `COMMANDS` of the training strokes; the tilt matters little on
 real ink within 5 deg."""
 RIDGE = 1.0
-LEAST_ABOVE, MOST_ABOVE = 0.3, 0.46
-LEAST = 8
-"""With fewer training strokes the threshold is not estimated."""
-MOST_STROKES = 200
-MOST_BYTES = 400_000
-"""Largest size of the images of all training strokes in base64."""
+SESSION_MM = {"drift_x_mm": 1.0, "drift_y_mm": 1.0, "half_mm": 0.4}
+"""How far place and half width change from one session to another of the same brush (standard deviation)."""
+LEASH_MM = 2.0
+GROWTH_MM = {"half_per_mm": 0.5, "leash_per_mm": 2.0, "drift_x_per_mm": 0.5, "drift_y_per_mm": 0.5}
+"""The same for the leash, and for the terms that grow with depth at the deepest stroke."""
+STROKE_MM2 = 0.14
+"""Weight of a square millimetre of wrong ink in such a fit. One stroke then determines the place to about 1 mm, as far
+as strokes of one session scatter."""
+FOLDS, LEAST = 5, 3
+"""Parts of a cross-validation; least number of strokes: fewer do not distinguish lag from drift."""
+MOST_STROKES, MOST_BYTES = 200, 700_000
+"""Of the training strokes that an artefact keeps: number, and size of their images in base64."""
+Masks = NDArray[np.bool_]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
@@ -83,7 +87,7 @@ class DragFit:
     """(images, P)."""
 
     def values(self) -> dict[str, FittedValue]:
-        """All parameters, with intervals from a bootstrap over images; a draw is one Gauss-Newton step from the fit.
+        """The free parameters, with intervals from a bootstrap over images; a draw is one Gauss-Newton step.
 
         Those that the strokes do not determine have no interval; with one image, none has. With fewer than about 8
         images the intervals are too short.
@@ -95,34 +99,16 @@ class DragFit:
         drawn = np.quantile(steps, [0.025, 0.975], axis=0)
         variance = np.diag(np.asarray(np.linalg.inv(self.squares.sum(axis=0) + unit), np.float64))
         found: dict[str, FittedValue] = {}
-        for name, value in zip(DragModel.names(), self.model.vector().tolist(), strict=True):
-            found[name] = FittedValue(value=value, low=None, high=None)
-            if name in self.freedom:
-                at = list(self.freedom).index(name)
-                low, high = (value + self.freedom[name] * float(end) for end in drawn[:, at])
-                if variance[at] < 1.0 - UNDETERMINED and low < high:
-                    found[name] = FittedValue(value=value, low=low, high=high)
+        for at, (name, sd) in enumerate(self.freedom.items()):
+            value = float(getattr(self.model, name))
+            low, high = (value + sd * float(end) for end in drawn[:, at])
+            known = variance[at] < 1.0 - UNDETERMINED and low < high
+            found[name] = FittedValue(value=value, low=low if known else None, high=high if known else None)
         return found
 
 
-def marks_mm(model: DragModel, drawings: Drawings) -> Floats:
-    """Signed distances of a model's marks, (B, len(y_mm), len(x_mm)) mm, positive in ink."""
-    nodes, starts = trails(drawings.paths, model.vector())
-    return distances(nodes, starts, drawings.x_mm, drawings.y_mm, drawings.groups)
-
-
-def fit_drags(
-    drawings: Drawings,
-    *,
-    start: DragModel | None = None,
-    freedom: Mapping[str, float] = FREEDOM,
-    spread_mm: float = SPREAD_MM,
-    added_mm: Floats | None = None,
-) -> DragFit:
-    """Fit by Levenberg-Marquardt the parameters that `freedom` names, with the standard deviations of their prior.
-
-    `added_mm` (B, len(y_mm), len(x_mm)) is added to the signed distances: what the model is known to miss.
-    """
+def fit_drags(drawings: Drawings, start: DragModel | None = None, freedom: Mapping[str, float] = FREEDOM) -> DragFit:
+    """Fit the parameters that `freedom` names, with the standard deviations of their prior around `start`."""
     begin = (start or DragModel()).vector()
     at = [DragModel.names().index(name) for name in freedom]
     sd = np.array(list(freedom.values()))
@@ -132,58 +118,22 @@ def fit_drags(
         values[at] += sd * scaled
         return values
 
-    def trails_at(scaled: Floats) -> tuple[Floats, Indices, Indices]:
-        return *trails(drawings.paths, vector(scaled)), drawings.groups
+    def trails_at(scaled: Floats) -> Trails:
+        return lagging(drawings.paths, vector(scaled))
 
-    scaled = fit_to_ink(trails_at, np.zeros(len(at)), drawings, spread_mm, added_mm).vector
-    nodes, starts, groups = trails_at(scaled)
-    slopes = derivatives(lambda values: trails_at(values)[0], scaled)
-    squares, gradients = list[Floats](), list[Floats]()
+    scaled = fit_to_ink(trails_at, np.zeros(len(at)), drawings, SPREAD_MM)
+    trails, slopes = trails_at(scaled), derivatives(trails_at, scaled)
+    each: list[tuple[Floats, Floats]] = []
     for k in range(len(drawings.ink)):
-        image, added = drawings.only(np.array([k])), None if added_mm is None else added_mm[k : k + 1]
-        equations = ink_equations(nodes, starts, groups[k : k + 2], slopes, image, spread_mm, added)
-        squares.append(equations.square)
-        gradients.append(equations.gradient)
-    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, np.array(squares), np.array(gradients))
-
-
-@dataclass(frozen=True, slots=True)
-class Correction:
-    """What a drag model misses: a kernel ridge over commands, on the grid of the strokes that it was learned from."""
-
-    commands: Floats
-    """(B, 5) of the strokes that it was learned from."""
-    weights: NDArray[np.float32]
-    """(B, len(y_mm) * len(x_mm))."""
-    x_mm: Floats
-    y_mm: Floats
-
-    @staticmethod
-    def fit(commands: Floats, drawings: Drawings, model: DragModel) -> Correction:
-        """Learn what the model misses of these strokes."""
-        missed = _flat(captured_distance(drawings.ink > 0.5, _mm_per_px(drawings.x_mm)))
-        missed -= _flat(marks_mm(model, drawings))
-        weights = np.linalg.solve(_gram(commands), missed).astype(np.float32)
-        return Correction(commands, weights, drawings.x_mm, drawings.y_mm)
-
-    def added_mm(self, commands: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
-        """What it adds to clipped signed distances of (B, 5) commands on a grid of the same scale; 0 outside its own.
-
-        Returns (B, len(y_mm), len(x_mm)).
-        """
-        change = _kernel(commands, self.commands, self.commands) @ self.weights
-        change = change.reshape(len(change), len(self.y_mm), len(self.x_mm))
-        left = round((float(x_mm[0]) - float(self.x_mm[0])) / _mm_per_px(self.x_mm))
-        top = round((float(self.y_mm[0]) - float(y_mm[0])) / _mm_per_px(self.x_mm))
-        out = np.zeros((len(change), len(y_mm), len(x_mm)))
-        rows = np.arange(max(0, -top), min(len(y_mm), len(self.y_mm) - top))
-        columns = np.arange(max(0, -left), min(len(x_mm), len(self.x_mm) - left))
-        out[:, rows[:, None], columns] = change[:, rows[:, None] + top, columns + left]
-        return out
+        one = Trails(trails.discs, trails.starts, trails.groups[k : k + 2])
+        equations = one.equations(slopes, drawings.only(np.array([k])), SPREAD_MM)
+        each.append((equations.square, equations.gradient))
+    squares, gradients = (np.array(part) for part in zip(*each, strict=True))
+    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, squares, gradients)
 
 
 class Kept(Frozen):
-    """Commands and ink of the training strokes as an artefact holds them, and the model that they correct.
+    """Commands and ink of training strokes: a kernel ridge over them says what the lag misses.
 
     The images have square pixels, rows from the top. Files come from elsewhere: sizes are checked.
     """
@@ -193,7 +143,6 @@ class Kept(Frozen):
         Field(min_length=1, max_length=MOST_STROKES),
     ]
     """`COMMANDS` of each stroke."""
-    parameters: Annotated[list[Number], Field(min_length=14, max_length=14)]
     mm_per_px: Annotated[float, Field(ge=0.05, le=5.0)]
     left_mm: Number
     """Centre of the first column; the stroke starts at x = 0."""
@@ -203,59 +152,69 @@ class Kept(Frozen):
     """All images below each other, as a PNG in base64."""
 
     @staticmethod
-    def of(commands: Floats, drawings: Drawings, model: DragModel) -> Kept | None:
-        """The strokes as they go into an artefact; None if they do not fit into one, however few are kept."""
-        step = max(1, -(-len(commands) // MOST_STROKES))
-        while len(commands[::step]) > 1:
-            picture = 255 * (drawings.ink[::step] > 0.5).astype(np.uint8).reshape(-1, len(drawings.x_mm))
-            data = base64.b64encode(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes())
-            if len(data) <= MOST_BYTES:
-                return Kept(
-                    commands=np.round(commands[::step], 6).tolist(),
-                    parameters=model.vector().tolist(),
-                    mm_per_px=round(_mm_per_px(drawings.x_mm), 9),
-                    left_mm=round(float(drawings.x_mm[0]), 6),
-                    top_mm=round(float(drawings.y_mm[0]), 6),
-                    ink=data.decode(),
-                )
-            step *= 2
-        return None
+    def of(drawn: Drawn, images: Indices) -> Kept:
+        """These strokes, evenly chosen if there are too many. Raises `CalibrationError` for too fine images."""
+        used = images[:: -(-len(images) // MOST_STROKES)]
+        picture = 255 * (drawn.drawings.ink[used] > 0.5).astype(np.uint8).reshape(-1, len(drawn.drawings.x_mm))
+        data = base64.b64encode(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()).decode()
+        if len(data) > MOST_BYTES:
+            what = f"{drawn.mm_per_px:g} is too fine for the artefact of {len(used)} strokes"
+            raise CalibrationError("--mm-per-px", what)
+        return Kept(
+            commands=np.round(drawn.commands[used], 6).tolist(),
+            mm_per_px=round(drawn.mm_per_px, 9),
+            left_mm=round(float(drawn.drawings.x_mm[0]), 6),
+            top_mm=round(float(drawn.drawings.y_mm[0]), 6),
+            ink=data,
+        )
 
-    def correction(self) -> Correction:
-        """The ridge, fitted again. Raises ValueError for ink that cannot be read."""
+    @model_validator(mode="after")
+    def _readable(self) -> Self:
         try:
-            picture = decode_gray(base64.b64decode(self.ink, validate=True), "ink")
-        except (binascii.Error, SessionDamaged) as error:
+            rows = len(self._picture())
+        except (ValueError, SessionDamaged) as error:
             raise ValueError(f"ink cannot be read ({error})") from None
-        count = len(self.commands)
-        if picture.shape[0] % count:
-            raise ValueError(f"ink of {picture.shape[0]} rows, expected those of {count} strokes")
-        seen = (picture > 127).reshape(count, -1, picture.shape[1])
-        x_mm = np.asarray(self.left_mm + np.arange(seen.shape[2]) * self.mm_per_px, np.float64)
-        y_mm = np.asarray(self.top_mm - np.arange(seen.shape[1]) * self.mm_per_px, np.float64)
-        paths = [commanded_path(*row[:4]) for row in self.commands]
-        drawings = Drawings(paths, np.arange(count + 1), seen.astype(np.float32), x_mm, y_mm, np.ones(count))
-        return Correction.fit(np.array(self.commands), drawings, DragModel.of(np.array(self.parameters)))
+        if rows % len(self.commands):
+            raise ValueError(f"ink of {rows} rows, expected those of {len(self.commands)} strokes")
+        return self
+
+    def _picture(self) -> NDArray[np.uint8]:
+        return decode_gray(base64.b64decode(self.ink, validate=True), "ink")
+
+    def missed_mm(self, model: DragModel, commands: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
+        """What `model` misses of strokes of (n, 5) commands, to be added to clipped signed distances; 0 outside.
+
+        Returns (n, len(y_mm), len(x_mm)) on a grid of the same scale.
+        """
+        known, picture = np.array(self.commands), self._picture()
+        seen = (picture > 127).reshape(len(known), -1, picture.shape[1])
+        own_x = np.asarray(self.left_mm + np.arange(seen.shape[2]) * self.mm_per_px, np.float64)
+        own_y = np.asarray(self.top_mm - np.arange(seen.shape[1]) * self.mm_per_px, np.float64)
+        drawn = lagging([commanded_path(*row[:4]) for row in self.commands], model.vector()).distances(own_x, own_y)
+        missed = clipped(captured_distance(seen, self.mm_per_px)) - clipped(drawn)
+        gram = _kernel(known, known, known) + RIDGE * np.eye(len(known))
+        weights = np.linalg.solve(gram, missed.reshape(len(known), -1)).astype(np.float32)
+        change = (_kernel(commands, known, known) @ weights).reshape(len(commands), *seen.shape[1:])
+        left = round((float(x_mm[0]) - self.left_mm) / self.mm_per_px)
+        top = round((self.top_mm - float(y_mm[0])) / self.mm_per_px)
+        out = np.zeros((len(change), len(y_mm), len(x_mm)))
+        rows = np.arange(max(0, -top), min(len(y_mm), seen.shape[1] - top))
+        columns = np.arange(max(0, -left), min(len(x_mm), seen.shape[2] - left))
+        out[:, rows[:, None], columns] = change[:, rows[:, None] + top, columns + left]
+        return out
 
 
-def threshold(commands: Floats, base_mm: Floats, captured_mm: Floats, stride: int = 2) -> float:
-    """The probability above which a pixel is ink: half the mean CSIM of training strokes, each predicted from the
-    strokes of other commands.
+def predicted(model: DragModel, kept: Kept | None, drawn: Drawn, images: Indices) -> dict[str, Masks]:
+    """The ink that these strokes should show, by row of a report, (n, len(y_mm), len(x_mm)) each.
 
-    `INK_ABOVE` for fewer than `LEAST` strokes.
+    `PREDICTED` is the best prediction, and `LAG`, where strokes correct it, that without them.
     """
-    if len(commands) < LEAST:
-        return INK_ABOVE
-    base, captured = (_flat(each[:, ::stride, ::stride]) for each in (base_mm, captured_mm))
-    # The error of each row of a ridge that is fitted to the rows of other commands, in closed form.
-    inverse = np.asarray(np.linalg.inv(_gram(commands)), np.float64)
-    errors = np.asarray(inverse @ (captured - base), np.float32)
-    command_of = np.unique(commands, axis=0, return_inverse=True)[1].ravel()
-    for rows in (np.flatnonzero(command_of == k) for k in range(command_of.max() + 1)):
-        errors[rows] = np.linalg.solve(inverse[np.ix_(rows, rows)], errors[rows])
-    predicted = ink((captured - errors).astype(np.float64), SPREAD_MM) > INK_ABOVE
-    half = 0.5 * float(binary_scores(predicted, captured > 0.0)[:, 0].mean())
-    return min(max(round(half, 3), LEAST_ABOVE), MOST_ABOVE)
+    drawings = drawn.drawings.only(images)
+    away = lagging(drawings.paths, model.vector()).distances(drawings.x_mm, drawings.y_mm)
+    if kept is None:
+        return {PREDICTED: away > EDGE_MM}
+    missed = kept.missed_mm(model, drawn.commands[images], drawings.x_mm, drawings.y_mm)
+    return {PREDICTED: clipped(away) + missed > EDGE_MM, LAG: away > EDGE_MM}
 
 
 def clipped(distance_mm: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -272,20 +231,121 @@ def captured_distance(masks: NDArray[np.bool_], mm_per_px: float) -> Floats:
     return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * mm_per_px
 
 
-def _flat(distance_mm: Floats) -> NDArray[np.float32]:
-    return clipped(distance_mm).reshape(len(distance_mm), -1)
-
-
-def _mm_per_px(x_mm: Floats) -> float:
-    return float(x_mm[1] - x_mm[0])
-
-
-def _gram(commands: Floats) -> Floats:
-    return _kernel(commands, commands, commands) + RIDGE * np.eye(len(commands))
-
-
 def _kernel(a: Floats, b: Floats, training: Floats) -> Floats:
     """The Gaussian kernel of (n, 5) and (m, 5) commands; one that never changes in training has no influence."""
     spread = training.std(axis=0)
     scales = np.where(spread > 1e-9, np.array(SPREADS) * spread, 1e9)
     return np.exp(-0.5 * (((a[:, None] - b[None]) / scales) ** 2).sum(axis=-1))
+
+
+class DragArtefact(SessionFit):
+    """The fitted drag model on disk. Equal inputs give an equal file."""
+
+    mm_per_px: float
+    parameters: dict[str, FittedValue]
+    held_out: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    """CSIM and IoU by model of strokes that it was not fitted to, percent; empty with too few to leave any out."""
+    kept: Kept | None = None
+    """Training strokes that correct the lag; None for a brush that was adapted."""
+    fitted_strokes: tuple[str, ...] = ()
+    """The strokes that were fitted, which must not be scored as held out."""
+    prior: str = ""
+    """Digest of the fit whose brush was adapted to this session; empty for a fit of its own."""
+    prior_session: str = ""
+    refitted: tuple[str, ...] = ()
+    """The parameters that were adapted."""
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if set(self.parameters) != set(DragModel.names()):
+            raise ValueError(f"parameters: expected {', '.join(DragModel.names())}")
+        return self
+
+    def model(self) -> DragModel:
+        """The fitted drag model."""
+        return DragModel(**{name: value.value for name, value in self.parameters.items()})
+
+
+def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> DragArtefact:
+    """Fit all strokes, leave out each fifth of their commands in turn, and make the artefact.
+
+    Raises `CalibrationError` for fewer than three strokes without a defect.
+    """
+    images = drawn.sound
+    if len(images) < LEAST:
+        what = f"{len(images)} dragged strokes without a defect, at least {LEAST} are needed"
+        raise CalibrationError(drawn.header.session_id, what)
+    update = {"held_out": _held_out(drawn, progress), "kept": Kept.of(drawn, images)}
+    return _artefact(drawn, images, fit_drags(_coarse(drawn, images)).values()).model_copy(update=update)
+
+
+def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> DragArtefact:
+    """Adapt a known brush to `strokes` strokes of a session, as different as possible (`session_change`).
+
+    Raises `CalibrationError` if the session has fewer, or if its scale is not that of `prior`.
+    """
+    count = len(drawn.sound)
+    if not 1 <= strokes <= count:
+        raise CalibrationError("--strokes", f"{strokes}: allowed 1 to {count}, the usable strokes")
+    if abs(drawn.mm_per_px - prior.mm_per_px) > 1e-6:
+        raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drawn.mm_per_px:g}")
+    images = np.sort(drawn.sound[different(drawn.commands[drawn.sound], strokes)])
+    drawings = _coarse(drawn, images)
+    # A prior that is narrower by the root of a weight counts as much as ink of that weight.
+    weight = STROKE_MM2 * float(drawings.x_mm[1] - drawings.x_mm[0]) ** 2
+    known = drawn.commands if prior.kept is None else np.array(prior.kept.commands)
+    freedom = {name: sd * weight**0.5 for name, sd in session_change(known).items()}
+    values = fit_drags(drawings, prior.model(), freedom).values()
+    update = {"prior": prior.digest, "prior_session": f"{prior.session_id}, {prior.source}", "refitted": tuple(values)}
+    return _artefact(drawn, images, prior.parameters | values).model_copy(update=update)
+
+
+def different(commands: Floats, count: int) -> Indices:
+    """`count` rows of (B, 5) commands that are as different as possible, the most ordinary one first.
+
+    With strokes of one kind, the model's error for that kind would look like a change of the brush's place.
+    """
+    spread = commands.std(axis=0)
+    places = (commands - commands.mean(axis=0)) / np.where(spread > 1e-9, spread, np.inf)
+    return np.array(farthest_first(places, int(np.linalg.norm(places, axis=1).argmin()), count))
+
+
+def session_change(commands: Floats) -> dict[str, float]:
+    """How far each parameter of a brush fitted to these (B, 5) commands may change (standard deviation)."""
+    deepest = max(float(commands[:, COMMANDS.index("depth_mm")].max()), 1e-3)
+    changes = SESSION_MM | {"leash_mm": LEASH_MM} | {name: mm / deepest for name, mm in GROWTH_MM.items()}
+    return {name: changes[name] for name in DragModel.names() if name in changes}
+
+
+def _coarse(drawn: Drawn, images: Indices) -> Drawings:
+    """These strokes with pixels of about `FIT_MM`."""
+    return drawn.drawings.only(images).every(max(1, round(FIT_MM / drawn.mm_per_px)))
+
+
+def _artefact(drawn: Drawn, images: Indices, values: dict[str, FittedValue]) -> DragArtefact:
+    return DragArtefact(
+        session_id=drawn.header.session_id,
+        source=drawn.header.source,
+        recording_sha256=drawn.recording_sha256,
+        calibration="",
+        software=made_by(),
+        mm_per_px=round(drawn.mm_per_px, 9),
+        parameters=values,
+        fitted_strokes=tuple(drawn.stroke_ids[int(k)] for k in images),
+    )
+
+
+def _held_out(drawn: Drawn, progress: Progress) -> dict[str, tuple[float, float]]:
+    """Scores on commands that were left out; empty for fewer than `FOLDS` of them."""
+    conditions = drawn.conditions
+    order = np.random.default_rng(0).permutation(conditions.max() + 1)
+    scores: dict[str, list[Floats]] = {}
+    for k in counted(range(FOLDS if len(order) >= FOLDS else 0), "fifths left out in turn", FOLDS, progress):
+        is_left = np.isin(conditions, order[k::FOLDS])
+        left, others = np.flatnonzero(is_left), np.setdiff1d(drawn.sound, np.flatnonzero(is_left))
+        model = fit_drags(_coarse(drawn, others)).model
+        truth = drawn.drawings.ink[left] > 0.5
+        for name, seen in predicted(model, Kept.of(drawn, others), drawn, left).items():
+            scores.setdefault(name, []).append(binary_scores(seen, truth))
+    means = {name: 100.0 * np.concatenate(each).mean(axis=0) for name, each in scores.items()}
+    return {name: (float(csim), float(iou)) for name, (csim, iou) in means.items()}

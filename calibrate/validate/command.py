@@ -10,8 +10,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.drags.captures import measure_drags
-from brushloop.calibrate.drags.report import DragValidation, predict_session, write_drags
+from brushloop.calibrate.drags.report import DragValidation, validate_drags, write_drags
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
@@ -24,7 +23,6 @@ from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import framed, png_uri, source_note, write_files
 from brushloop.calibrate.scores import scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
-from brushloop.calibrate.stroke.params import Params
 from brushloop.calibrate.validate import findings, tables
 from brushloop.calibrate.validate.models import FittedSession
 from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
@@ -36,7 +34,7 @@ from brushloop.sessions.disk import check_writable, csv_text
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Source
-from brushloop.sessions.terminal import Progress, counted, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "validation"
 WORK = "work"
@@ -225,13 +223,7 @@ def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Besi
 def _drags(request: Request, sessions: Sequence[FittedSession], folder: Path, progress: Progress) -> ValidationOutput:
     validated: list[DragValidation] = []
     for session in sessions:
-        what = f"{session.header.session_id}: measured"
-        captures = counted(session.recording.captures(), what, len(session.strokes), progress)
-        results = measure_drags(captures, Params.of(session.calibration))
-        predictions = None
-        if request.fit is not None:
-            predictions = predict_session(session.recording.path, request.fit, request.calibration, progress)
-        validation = DragValidation(session.header, session.recording.path, session.sha256, results, predictions)
+        validation = validate_drags(session.recording.path, request.fit, progress)
         target = folder / session.header.session_id if len(sessions) > 1 else folder
         write_drags(validation, target, request.command)
         validated.append(validation)

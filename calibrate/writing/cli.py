@@ -9,29 +9,23 @@ import typer
 
 
 def plan(
-    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
+    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")],
     out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan"),
     data: Annotated[
         Path | None, typer.Option(help="Folder of hanzi-writer files, or makemeahanzi's graphics.txt.")
     ] = None,
-    model: Annotated[
-        str, typer.Option(help="Stroke model that plans and draws; without influence with --footprint.")
-    ] = "ccd-bsm",
     radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
     length_mm: Annotated[float, typer.Option(min=5, max=200, help="Length L of the brush.")] = 48.0,
     footprint: Annotated[
         Path | None,
         typer.Option(help="Result of `write fit`: the plan leads the brush by the footprint of its own drags."),
     ] = None,
-    lam: Annotated[float | None, typer.Option(min=0.1, max=10, help="Lambda of CCD-BSM; pi by default.")] = None,
-    cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
-    margin_mm: Annotated[float, typer.Option(min=0, max=200, help="Margin around the font's square.")] = 6.0,
+    cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of the character's patch of paper.")] = 70.0,
     depth_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
     tilt_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest tilt, deg; at most 30.")] = (
         0.0,
         10.0,
     ),
-    tilt: Annotated[float, typer.Option(min=0, max=30, help="Initial tilt, deg.")] = 5.0,
     speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
     wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
     steps: Annotated[int, typer.Option(min=0, max=1000, help="Steps of refinement; 0 keeps the first plan.")] = 60,
@@ -44,16 +38,14 @@ def plan(
     from brushloop.sessions.terminal import show_work
 
     by = PlannedBy(
-        model=model,
         radius_mm=radius_mm,
         length_mm=length_mm,
-        lam=lam,
         depth_range_mm=depth_range,
         tilt_range_deg=tilt_range,
         speed_mm_s=speed_mm_s,
         wrist_deg_s=wrist_deg_s,
     )
-    show_work(run, PlanRequest(what, out, by, data, footprint, cell_mm, margin_mm, tilt, steps, repeats))
+    show_work(run, PlanRequest(what, out, by, data, footprint, cell_mm, steps, repeats))
 
 
 def compare(
@@ -100,12 +92,7 @@ def practice(
     length_mm: Annotated[
         float, typer.Option(min=5, max=200, help="Length L of the brush; strokes go no deeper than 0.3 of it.")
     ] = 48.0,
-    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
-    cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of each paper cell.")] = 70.0,
-    depth_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
-    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
-    wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the strokes.")] = 1,
+    cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of each patch of paper.")] = 70.0,
 ) -> None:
     """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged."""
     from brushloop.calibrate.writing.learn import PracticeRequest
@@ -113,14 +100,7 @@ def practice(
     from brushloop.calibrate.writing.record import PlannedBy
     from brushloop.sessions.terminal import show_work
 
-    by = PlannedBy(
-        radius_mm=radius_mm,
-        length_mm=length_mm,
-        depth_range_mm=depth_range,
-        speed_mm_s=speed_mm_s,
-        wrist_deg_s=wrist_deg_s,
-    )
-    show_work(run, PracticeRequest(out, by, cell_mm, seed))
+    show_work(run, PracticeRequest(out, PlannedBy(length_mm=length_mm), cell_mm))
 
 
 def fit(

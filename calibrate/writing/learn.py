@@ -13,6 +13,7 @@ A character whose last round was no better than the best one goes back to the be
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,11 +26,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
-from brushloop.calibrate.compare.place import SIZE_PX, Image, Tone
-from brushloop.calibrate.drags.captures import read_drags
+from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.compare.place import SIZE_PX, Image, prepare_cell
 from brushloop.calibrate.drags.fit import captured_distance
-from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.report import Written
+from brushloop.calibrate.session import open_session
+from brushloop.calibrate.stroke.params import PX_PER_MM
 from brushloop.calibrate.writing.record import (
     FigureRecord,
     PlannedBy,
@@ -40,20 +43,26 @@ from brushloop.calibrate.writing.record import (
     load_plan,
     write_plan,
 )
-from brushloop.calibrate.writing.scores import (
-    HEADLINE,
-    Character,
-    WritingComparison,
-    as_ink,
-    compare_ink,
-    compare_written,
+from brushloop.calibrate.writing.scores import WritingComparison, compare_written, round_of
+from brushloop.model.characters.plan import (
+    LATER_SPREADS_MM,
+    Phase,
+    Reach,
+    covered,
+    directions,
+    drawn,
+    grid,
+    lead,
+    phase_map,
+    without_tilt,
 )
-from brushloop.model.characters.lead import LATER_SPREADS_MM, covered, drawn, lead
-from brushloop.model.characters.plan import Phase, Reach, StrokePath, directions, grid, phase_map, without_tilt
-from brushloop.model.drag import NAMES, Drawings, Footprint, fit_each, fit_footprint
+from brushloop.model.drag import NAMES, Drawings, Footprint, fit_each, fit_footprint, inked
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.disk import check_writable
-from brushloop.sessions.terminal import Progress, unseen
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.recording import Capture
+from brushloop.sessions.records import Header
+from brushloop.sessions.terminal import Progress, counted, unseen
 
 Floats = NDArray[np.float64]
 MOST_MM = 1.5
@@ -73,7 +82,7 @@ FOLDER = "footprint"
 MM_PER_PX = 0.5
 LEAST = 3
 """Least number of strokes: fewer do not distinguish the discs."""
-FIGURES, PER_FIGURE = 10, 2
+FIGURES, PER_FIGURE, SEED = 10, 2, 1
 MARGIN = 0.22
 """Share of the patch at each side that is kept free: ink lands behind its command, and must not reach the edge."""
 DEEPEST = 0.3
@@ -112,7 +121,6 @@ class PracticeRequest:
     out: Path
     by: PlannedBy = field(default_factory=PlannedBy)
     cell_mm: float = 70.0
-    seed: int = 1
 
 
 def reach_of(by: PlannedBy) -> Reach:
@@ -123,49 +131,89 @@ def reach_of(by: PlannedBy) -> Reach:
 def fit(session: Path, progress: Progress = unseen) -> Written:
     """Fit the footprint to the figures of a session and put it to use.
 
-    Raises `CalibrationError` if the session holds too few strokes that travel.
+    Raises `CalibrationError` if the session is an import, or holds too few strokes.
     """
-    drawn = read_drags(session, MM_PER_PX, progress=progress)
-    drawings = drawn.drawings
-    if drawn.calibration is None:
+    opened = open_session(session, None, "drag")
+    header = opened.header
+    if opened.calibration is None:
         raise CalibrationError(str(session), "is an import: a footprint is fitted to figures that the arm wrote")
-    if len(drawings.paths) < LEAST:
-        raise CalibrationError(str(session), f"holds {len(drawings.paths)} strokes, at least {LEAST} are needed")
-    found = fit_footprint(drawings)
-    each = [drawings.only(np.array([k])).paths for k in range(len(drawings.ink))]
-    predicted = np.array([found.distance(paths, drawings.x_mm, drawings.y_mm) > 0.0 for paths in each])
-    agreement = binary_scores(predicted, drawings.ink > 0.5)[:, 0]
+    figures, used, refused = figures_of(header), list[tuple[list[Floats], Image]](), list[str]()
+    for capture in counted(opened.recording.captures(), "figures read", len(opened.strokes), progress):
+        try:
+            used.append(_figure(capture, opened.calibration, figures))
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append(f"left out: {capture.stroke.stroke_id}: {error.what}")
+    paths = [path for strokes, _ in used for path in strokes]
+    if len(paths) < LEAST:
+        raise CalibrationError(str(session), f"holds {len(paths)} usable strokes, at least {LEAST} are needed")
+    groups = np.cumsum([0, *(len(strokes) for strokes, _ in used)])
+    cell_mm = opened.strokes[0].cell_mm
+    assert cell_mm is not None  # as every stroke that the arm wrote has
+    side_mm, ink = cell_mm[2], np.array([image for _, image in used])
+    footprint, csim_percent = fitted(Drawings(paths, groups, ink, *grid(side_mm, ink.shape[1])))
     artefact = FootprintArtefact(
-        session_id=drawn.header.session_id,
-        source=str(drawn.header.source),
-        recording_sha256=drawn.recording_sha256,
-        calibration=drawn.calibration.digest,
+        session_id=header.session_id,
+        source=str(header.source),
+        recording_sha256=opened.sha256,
+        calibration=opened.calibration.digest,
         software=made_by(),
-        values=dict(zip(NAMES, found.values, strict=True)),
-        images=len(drawings.ink),
-        strokes=len(drawings.paths),
-        csim_percent=round(100.0 * float(agreement.mean()), 3),
+        values=dict(zip(NAMES, footprint.values, strict=True)),
+        images=len(used),
+        strokes=len(paths),
+        csim_percent=csim_percent,
     )
     path = put_to_use(artefact, session, FOLDER)
     words = (
         f"footprint of {artefact.strokes} strokes on {artefact.images} cells ({artefact.source}): draws them with CSIM "
         f"{artefact.csim_percent:.1f} %, ink = 1"
     )
-    return Written(path, (words, str(path)))
+    return Written(path, (*refused, words, str(path)))
+
+
+def figures_of(header: Header) -> dict[str, list[Floats]]:
+    """The strokes (n, 4) of each figure of the recorded protocol, without tilt. Raises `CalibrationError`."""
+    try:
+        return {
+            str(figure["name"]): [without_tilt(np.array(stroke["points"], np.float64)) for stroke in figure["strokes"]]
+            for figure in json.loads(header.protocol)["figures"]
+        }
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        problem = f"its recorded protocol holds no trajectories ({error})"
+        raise CalibrationError(header.session_id, problem) from None
+
+
+def _figure(capture: Capture, calibration: Calibration, figures: dict[str, list[Floats]]) -> tuple[list[Floats], Image]:
+    """What was commanded, and the ink of its patch at `MM_PER_PX`. Raises `CaptureRefused`."""
+    stroke_id = capture.stroke.stroke_id
+    paths = figures.get(stroke_id.rpartition("-r")[0])
+    if paths is None:
+        raise CaptureRefused(stroke_id, "is not a figure of the recorded protocol")
+    prepared = prepare_cell(capture, calibration)
+    if prepared.cut:
+        raise CaptureRefused(stroke_id, "is cut by the edge of its photograph or patch")
+    size = round(len(prepared.mask) / PX_PER_MM / MM_PER_PX)
+    ink = cv2.resize(prepared.mask.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
+    return paths, np.asarray(ink, np.float32)
+
+
+def fitted(drawings: Drawings) -> tuple[Footprint, float]:
+    """The footprint that draws these best, and the mean CSIM in percent with which it does."""
+    footprint = fit_footprint(drawings)
+    each = [drawings.only(np.array([k])).paths for k in range(len(drawings.ink))]
+    predicted = [inked([footprint] * len(paths), paths, drawings.x_mm, drawings.y_mm) > 0.0 for paths in each]
+    agreement = binary_scores(np.array(predicted), drawings.ink > 0.5)[:, 0]
+    return footprint, round(100.0 * float(agreement.mean()), 3)
 
 
 def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     """Write the protocol of a practice sheet, each stroke on a patch of its own. Raises `CalibrationError`."""
     check_writable(request.out)
-    try:
-        strokes = practice_strokes(request.cell_mm, reach_of(request.by), request.by.length_mm, request.seed)
-    except ValueError as error:
-        raise CalibrationError("write practice", str(error)) from None
+    strokes = practice_strokes(request.cell_mm, reach_of(request.by), request.by.length_mm)
     blank = encoded(np.zeros((SIZE_PX, SIZE_PX), np.float32))
     figures = tuple(
         FigureRecord(
             name=f"{NAME}-{number + 1:02d}",
-            source=f"practice strokes, seed {request.seed}",
+            source=f"practice strokes, seed {SEED}",
             commanded=as_points(strokes[number * PER_FIGURE : (number + 1) * PER_FIGURE]),
             wanted_png=blank,
             simulated_png=blank,
@@ -179,12 +227,12 @@ def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     return Written(protocol, (str(protocol),))
 
 
-def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float, seed: int = 1) -> list[Floats]:
+def practice_strokes(side_mm: float, reach: Reach, brush_length_mm: float) -> list[Floats]:
     """`FIGURES` x `PER_FIGURE` trajectories (N, 5) on a patch of that side; every third has a sharp turn.
 
     None is deeper than `DEEPEST` of the brush's length.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     deepest_mm = min(reach.depth_mm[1], math.floor(DEEPEST * brush_length_mm))
     room_mm = (1.0 - 2.0 * MARGIN) * side_mm
     out: list[Floats] = []
@@ -229,8 +277,7 @@ def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     repeats = (request.settled_repeats if settled else None) or request.repeats
     protocol = write_plan(following, repeats, request.out)
     said = [
-        f"{figure.name}: CSIM {figure.rounds[-1].csim_percent:.2f}, ink = 1, mm; lost in "
-        + lost_in_words(figure.rounds[-1])
+        f"{figure.name}: CSIM {figure.rounds[-1].csim_percent:.2f}, ink = 1, mm"
         + ("; settled: the best round is kept" if figure.settled else "")
         for figure in following.figures
     ]
@@ -262,23 +309,16 @@ def _drawings(figures: Sequence[FigureRecord], ink: dict[str, Image], side_mm: f
     groups = np.cumsum([0, *(len(paths) for paths in strokes)])
     images = np.stack([ink[figure.name] for figure in figures])
     paths = [path for paths in strokes for path in paths]
-    return Drawings(paths, groups, images, *grid(side_mm, images.shape[1]), np.ones(len(images)))
+    return Drawings(paths, groups, images, *grid(side_mm, images.shape[1]))
 
 
-def _after(figure: FigureRecord, found: Round) -> FigureRecord:
+def _after(figure: FigureRecord, last: Round) -> FigureRecord:
     """The figure with its round added, back at its best; settled if the round has not helped."""
     before = max((one.csim_percent for one in figure.rounds), default=float("-inf"))
-    best = figure.commanded if found.csim_percent > before or not figure.best else figure.best
-    rounds = (*figure.rounds, found)
-    settled = figure.settled or not _helped(rounds)
-    update = {"rounds": rounds, "best": best, "settled": settled, "commanded": best}
+    best = figure.commanded if last.csim_percent > before or not figure.best else figure.best
+    settled = figure.settled or last.csim_percent < before + LEAST_GAIN_PERCENT
+    update = {"rounds": (*figure.rounds, last), "best": best, "settled": settled, "commanded": best}
     return figure.model_copy(update=update)
-
-
-def _helped(rounds: Sequence[Round]) -> bool:
-    """Whether the last round was better than all before."""
-    *before, last = (one.csim_percent for one in rounds)
-    return last >= max(before, default=float("-inf")) + LEAST_GAIN_PERCENT
 
 
 def _corrected(
@@ -319,48 +359,6 @@ def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
     """A factor on the correction of each pixel: less in phases that the last round made worse."""
     if len(figure.rounds) < 2 or not figure.medians:
         return np.ones((size_px, size_px))
-    factors = np.ones(len(Phase))
-    before, now = figure.rounds[-2].lost_percent, figure.rounds[-1].lost_percent
-    for k, phase in enumerate(Phase):
-        if now.get(phase, 0.0) > before.get(phase, 0.0):
-            factors[k] = WORSE
-    return factors[phase_map(paths_of(figure), side_mm, size_px)]
-
-
-def paths_of(figure: FigureRecord) -> list[StrokePath]:
-    """The medians of a figure."""
-    arrays = (np.array(median, np.float64) for median in figure.medians)
-    return [StrokePath(median[:, :2], median[:, 2]) for median in arrays]
-
-
-def round_of(figure: FigureRecord, character: Character, side_mm: float) -> Round:
-    """What the writings of a figure show on average."""
-    reference, writings = as_ink(figure.wanted()), character.captured.values()
-    scores = [compare_ink(reference, ink, HEADLINE)[0] for ink in writings]
-    lost = [lost_by_phase(figure, ink[Tone.BINARY], side_mm) for ink in writings]
-    mean = {phase: round(float(np.mean([share[phase] for share in lost])), 2) for phase in lost[0]}
-    return Round(csim_percent=round(100.0 * float(np.mean(scores)), 3), lost_percent=mean)
-
-
-def lost_by_phase(figure: FigureRecord, ink: Image, side_mm: float) -> dict[str, float]:
-    """Wrong pixels (missing or too much) of (128, 128) ink by phase, in percent of the wanted ink."""
-    if not figure.medians:
-        return {}
-    wanted = figure.wanted() > 0.5
-    where = phase_map(paths_of(figure), side_mm, len(ink))
-    wrong = np.bincount(where[wanted != (ink > 0.5)], minlength=len(Phase))
-    share = 100.0 * wrong / max(1, np.count_nonzero(wanted))
-    present = np.unique(where)
-    return {str(phase): float(share[k]) for k, phase in enumerate(Phase) if k in present}
-
-
-def phase_table(rounds: Sequence[Round]) -> list[tuple[str, list[float]]]:
-    """(phase, its loss in every round) for the phases that the character has."""
-    present = [str(phase) for phase in Phase if any(str(phase) in one.lost_percent for one in rounds)]
-    return [(phase, [one.lost_percent.get(phase, 0.0) for one in rounds]) for phase in present]
-
-
-def lost_in_words(found: Round) -> str:
-    """The phases in which most is lost, most first."""
-    lost = sorted(found.lost_percent.items(), key=lambda item: -item[1])
-    return ", ".join(f"{phase} {share:.1f} %" for phase, share in lost[:3])
+    before, now = (one.lost_percent for one in figure.rounds[-2:])
+    factors = [WORSE if now.get(phase, 0.0) > before.get(phase, 0.0) else 1.0 for phase in Phase]
+    return np.array(factors)[phase_map(figure.paths, side_mm, size_px)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -14,26 +13,15 @@ import numpy as np
 from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.report import Written, picture_grid, save_picture
+from brushloop.calibrate.report import BLUE, Written, picture_grid, save_picture
 from brushloop.calibrate.writing.learn import FootprintArtefact, reach_of
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, write_plan
 from brushloop.model.ccdbsm import Brush, DomainError
-from brushloop.model.characters.glyph import (
-    MAX_GLYPH_CHARS,
-    Glyph,
-    GlyphError,
-    parse_csv,
-    parse_glyph,
-    parse_json,
-    paths_of,
-    reference,
-    swept,
-)
-from brushloop.model.characters.lead import covered, drawn, first_lead, lead
-from brushloop.model.characters.plan import Floats, Image, Patch, Phase, Reach, StrokePath, phases_of, trajectory
+from brushloop.model.characters.glyph import parse_csv, parse_glyph, paths_of, reference, swept
+from brushloop.model.characters.plan import Floats, Image, Patch, Reach, StrokePath, covered, drawn, first_lead, lead
 from brushloop.model.drag import Footprint
 from brushloop.model.similarity import csim, ssim
-from brushloop.model.strokes import StrokeModel, UnknownModelError, stroke_model
+from brushloop.model.strokes import StrokeModel, stroke_model
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import Progress, unseen
 
@@ -41,21 +29,12 @@ PICTURE = "plan.png"
 SHIPPED_SOURCE = "hanzi-writer-data 2.0.1, from Make Me a Hanzi; outlines of Arphic PL fonts, ARPHIC PUBLIC LICENSE"
 STEP_MM = 2.0
 """Approximate distance of neighbouring points."""
-MAX_FILE_BYTES = 4 * 1024 * 1024
-MAX_GRAPHICS_BYTES = 64 * 1024 * 1024
+TILT_DEG = 5.0
+"""The initial tilt; refinement may change it within reach."""
+MAX_FILE_BYTES = 64 * 1024 * 1024
 """makemeahanzi's file has a size of 30 MB."""
 MAX_FIGURES = 20
 MOST_TILT_DEG = 30.0
-BLUE = "#2d72ff"
-COLOURS = {
-    Phase.INITIATION_HIDDEN: "#117733",
-    Phase.INITIATION_EXPOSED: "#44aa99",
-    Phase.EXECUTION: "#888888",
-    Phase.TURNING: "#e69f00",
-    Phase.FOLDING: "#d1341f",
-    Phase.TERMINATION_HIDDEN: "#332288",
-    Phase.TERMINATION_EXPOSED: "#cc79a7",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +42,7 @@ class PlanRequest:
     """Which characters are planned, and how."""
 
     what: str
-    """Characters, or a .csv or .json trajectory."""
+    """Characters, or a .csv trajectory."""
     out: Path
     by: PlannedBy = field(default_factory=PlannedBy)
     data: Path | None = None
@@ -71,9 +50,6 @@ class PlanRequest:
     footprint: Path | None = None
     """Result of `write fit`: the plan leads the brush by it; replaces the stroke model and `steps`."""
     cell_mm: float = 70.0
-    margin_mm: float = 6.0
-    tilt_deg: float = 5.0
-    """The initial tilt; refinement may change it within reach."""
     steps: int = 60
     """Steps of refinement; 0 keeps the first plan."""
     repeats: int = 1
@@ -129,25 +105,22 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     fitted = load_artefact(request.footprint, FootprintArtefact) if request.footprint is not None else None
     by = request.by if fitted is None else request.by.model_copy(update={"footprint": fitted.footprint().values})
     low, high = by.tilt_range_deg
+    tilt_deg = min(max(TILT_DEG, low), high)
     try:
         if high > MOST_TILT_DEG or by.depth_range_mm[0] <= 0:
             raise ValueError(f"tilts end at {MOST_TILT_DEG:g} deg, depths begin above 0 mm")
-        reach, patch = reach_of(by), Patch(request.cell_mm, request.margin_mm)
-        model = stroke_model(by.model, Brush(by.radius_mm, by.length_mm), math.pi if by.lam is None else by.lam)
+        reach, patch = reach_of(by), Patch(request.cell_mm)
+        model = stroke_model("ccd-bsm", Brush(by.radius_mm, by.length_mm))
         model.profile(by.depth_range_mm[1], high)
-    except (ValueError, UnknownModelError, DomainError) as error:
+    except (ValueError, DomainError) as error:
         raise CalibrationError("write plan", str(error)) from None
-    if not low <= request.tilt_deg <= high:
-        raise CalibrationError("--tilt", f"{request.tilt_deg:g} deg is outside {low:g} to {high:g}")
     each = read_wanted(request.what, request.data, patch)
     if fitted is None:
-        label = model.label
-        figures = [pressed(wanted, model, reach, patch, request.tilt_deg, request.steps) for wanted in each]
-        simulated = f"{by.model}, marks laid over each other along the way"
+        label, simulated = model.label, "CCD-BSM, marks laid over each other along the way"
+        figures = [pressed(wanted, model, reach, patch, tilt_deg, request.steps) for wanted in each]
     else:
-        label = "fitted footprint"
-        figures = [led(wanted, fitted.footprint(), reach, patch, request.tilt_deg) for wanted in each]
-        simulated = f"the footprint fitted to {fitted.session_id}, {fitted.source}"
+        label, simulated = "fitted footprint", f"the footprint fitted to {fitted.session_id}, {fitted.source}"
+        figures = [led(wanted, fitted.footprint(), reach, patch, tilt_deg) for wanted in each]
     request.out.mkdir(parents=True, exist_ok=True)
     draw(figures, patch.side_mm, request.out / PICTURE)
     records = tuple(figure.record() for figure in figures)
@@ -167,7 +140,7 @@ def pressed(
     wanted: Wanted, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int
 ) -> PlannedFigure:
     """Plan a figure as presses that are laid over each other along the way."""
-    from brushloop.model.characters.presses import refine, written  # loads torch
+    from brushloop.model.characters.presses import refine, trajectory, written  # loads torch
 
     side_mm = patch.side_mm
     first = [trajectory(path, model, reach, patch, tilt_deg) for path in wanted.paths]
@@ -188,16 +161,14 @@ def led(wanted: Wanted, footprint: Footprint, reach: Reach, patch: Patch, tilt_d
 
 def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Wanted]:
     """Read the figures to write. Raises `CalibrationError` that names file and field."""
-    if what.lower().endswith((".csv", ".json")) and len(what) > len(".csv"):
+    if what.lower().endswith(".csv") and len(what) > len(".csv"):
         each = [_drawn_by_hand(Path(what), patch)]
     elif not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
-        raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters, or a .csv or .json trajectory")
+        raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters, or a .csv trajectory")
     elif len(set(what)) != len(what):
         raise CalibrationError("character", "the same character twice: the protocol's `repeats` writes it again")
     else:
-        glyphs = [_shipped(name) if data is None else _from(data, name) for name in what]
-        source = SHIPPED_SOURCE if data is None else data.name
-        each = [Wanted(g.name, source, paths_of(g, patch, STEP_MM), reference(g, patch)) for g in glyphs]
+        each = [_character(name, data, patch) for name in what]
     for wanted in each:
         if not wanted.image.any():
             raise CalibrationError(wanted.name, "has no width anywhere: nothing would be written")
@@ -205,59 +176,59 @@ def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Wanted]:
 
 
 def _drawn_by_hand(path: Path, patch: Patch) -> Wanted:
-    text = _text(path, MAX_FILE_BYTES)
     try:
-        paths = (parse_csv if path.suffix.lower() == ".csv" else parse_json)(text, patch, STEP_MM)
-    except GlyphError as error:
+        paths = parse_csv(_text(path), patch, STEP_MM)
+    except ValueError as error:
         raise CalibrationError(str(path), str(error)) from None
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in path.stem)[:50].strip("-") or "figure"
     return Wanted(name, path.name, paths, swept(paths, patch.side_mm))
 
 
-def _shipped(name: str) -> Glyph:
+def _character(name: str, data: Path | None, patch: Patch) -> Wanted:
+    if data is None:
+        where, text = _shipped(name)
+    elif data.is_dir():
+        where, text = str(data / f"{name}.json"), _text(data / f"{name}.json")
+    else:
+        where, text = str(data), _line_of(data, name)
+    try:
+        strokes = parse_glyph(text)
+    except ValueError as error:
+        raise CalibrationError(where, str(error)) from None
+    source = SHIPPED_SOURCE if data is None else data.name
+    return Wanted(name, source, paths_of(strokes, patch, STEP_MM), reference(strokes, patch))
+
+
+def _shipped(name: str) -> tuple[str, str]:
     folder = files("brushloop.model.characters") / "data"
     known = sorted(entry.name.removesuffix(".json") for entry in folder.iterdir() if entry.name.endswith(".json"))
     if name not in known:
         raise CalibrationError(
             f"character {name!r}", f"is not shipped ({' '.join(known)}): name the full data set with --data"
         )
-    return _parsed(f"{name}.json", (folder / f"{name}.json").read_text("utf-8"), name)
+    return f"{name}.json", (folder / f"{name}.json").read_text("utf-8")
 
 
-def _from(data: Path, name: str) -> Glyph:
-    """Read from a folder of `字.json` files, one such file, or makemeahanzi's graphics.txt (a JSON object a line)."""
-    if data.is_dir():
-        path = data / f"{name}.json"
-        return _parsed(str(path), _text(path, MAX_GLYPH_CHARS), name)
-    if data.suffix == ".json":
-        return _parsed(str(data), _text(data, MAX_GLYPH_CHARS), name)
-    for line in _text(data, MAX_GRAPHICS_BYTES).splitlines():
-        if name in line or f"\\u{ord(name):04x}" in line.lower():
-            try:
-                entry = json.loads(line)
-            except (ValueError, RecursionError):
-                raise CalibrationError(str(data), "is neither a folder, a .json nor a graphics.txt") from None
-            if isinstance(entry, dict) and entry.get("character") == name:  # pyright: ignore[reportUnknownMemberType]
-                return _parsed(str(data), line, name)
+def _line_of(data: Path, name: str) -> str:
+    """The line of a character in makemeahanzi's graphics.txt, a JSON object a line."""
+    for line in _text(data).splitlines():
+        try:
+            if name in line and json.loads(line)["character"] == name:
+                return line
+        except (ValueError, KeyError, TypeError, RecursionError):
+            raise CalibrationError(str(data), "is neither a folder nor a graphics.txt") from None
     raise CalibrationError(str(data), f"holds no character {name!r}")
 
 
-def _parsed(where: str, text: str, name: str) -> Glyph:
+def _text(path: Path) -> str:
     try:
-        return parse_glyph(text, name)
-    except GlyphError as error:
-        raise CalibrationError(where, str(error)) from None
-
-
-def _text(path: Path, most_bytes: int) -> str:
-    try:
-        return read_bounded(path, most_bytes).decode("utf-8")
+        return read_bounded(path, MAX_FILE_BYTES).decode("utf-8")
     except UnicodeDecodeError:
         raise CalibrationError(str(path), "is no UTF-8 text") from None
 
 
 def draw(figures: list[PlannedFigure], side_mm: float, path: Path) -> None:
-    """Draw a row per figure: wanted, first plan, refined plan, and the tip's trajectory over the strokes' phases."""
+    """Draw a row per figure: wanted, first plan, refined plan, and the tip's trajectory over the wanted ink."""
     picture, rows = picture_grid(len(figures), 4, (12.0, 3.4 * len(figures)))
     extent = (0.0, side_mm, 0.0, side_mm)
     for figure, axes in zip(figures, rows, strict=True):
@@ -266,22 +237,17 @@ def draw(figures: list[PlannedFigure], side_mm: float, path: Path) -> None:
             f"wanted: {code_points(figure.wanted.name)}",
             f"first plan, simulated: CSIM {csim(image, figure.first):.4f}, SSIM {ssim(image, figure.first):.4f}",
             f"refined, simulated: CSIM {csim(image, figure.simulated):.4f}, SSIM {ssim(image, figure.simulated):.4f}",
-            "phases of the strokes; blue: trajectory",
+            "trajectory, with its depths",
         )
         images = (image, figure.first, figure.simulated, 0.25 * image)
         for axis, shown, title in zip(axes, images, titles, strict=True):
             axis.imshow(1 - shown, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest")
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
-        for stroke, median in zip(figure.strokes, figure.wanted.paths, strict=True):
+        for stroke in figure.strokes:
             axes[3].plot(stroke[:, 0], stroke[:, 1], "-", color=BLUE, lw=0.8)
-            colours = [COLOURS[phase] for phase in phases_of(median)]
-            axes[3].scatter(median.points[:, 0], median.points[:, 1], s=22, color=colours, marker="s", zorder=2)
             axes[3].scatter(stroke[:, 0], stroke[:, 1], s=0.4 * stroke[:, 2], color=BLUE, zorder=3)
         axes[0].set_ylabel("mm", fontsize=7)
-    for phase, colour in COLOURS.items():
-        rows[0][3].scatter([], [], s=14, color=colour, marker="s", label=str(phase))
-    rows[0][3].legend(fontsize=5, loc="lower right")
     save_picture(picture, path)
 
 

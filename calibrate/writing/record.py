@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import base64
 import binascii
-import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import write_files
+from brushloop.model.characters.plan import StrokePath
 from brushloop.model.drag import NAMES
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray, encode_png
@@ -37,14 +37,10 @@ Floats = NDArray[np.float64]
 
 
 class PlannedBy(Frozen):
-    """The model, and the limits of brush and arm, that a plan is made with."""
+    """The brush, and the limits of brush and arm, that a plan is made with."""
 
-    model: str = "ccd-bsm"
-    """Name of the stroke model."""
     radius_mm: Number = 6.0
     length_mm: Number = 48.0
-    lam: Number | None = None
-    """lambda of CCD-BSM; None means pi."""
     depth_range_mm: tuple[Number, Number] = (0.5, 20.0)
     tilt_range_deg: tuple[Number, Number] = (0.0, 10.0)
     speed_mm_s: Number = 15.0
@@ -89,9 +85,10 @@ class FigureRecord(Frozen):
         return [np.array(stroke, np.float64) for stroke in self.commanded]
 
     @property
-    def points_sha256(self) -> str:
-        """Digest of the commanded points: a session drawn from other points belongs to another plan."""
-        return points_digest(self.commanded)
+    def paths(self) -> list[StrokePath]:
+        """The medians with their half widths."""
+        arrays = (np.array(median, np.float64) for median in self.medians)
+        return [StrokePath(median[:, :2], median[:, 2]) for median in arrays]
 
     def wanted(self) -> Image:
         """(128, 128) ink from 0 to 1. Raises `CalibrationError`."""
@@ -152,12 +149,6 @@ def as_points(strokes: Sequence[Floats]) -> Points:
     """Convert trajectories (N, 5) to points, rounded like the protocol to 0.001."""
     rounded = (np.round(stroke, 3).tolist() for stroke in strokes)
     return tuple(tuple((x, y, depth, tilt, heading) for x, y, depth, tilt, heading in stroke) for stroke in rounded)
-
-
-def points_digest(strokes: Sequence[Any]) -> str:
-    """SHA-256 of trajectories [stroke][point][x, y, depth, tilt, heading], rounded like the protocol to 0.001."""
-    rounded = [[[round(float(value), 3) + 0.0 for value in point] for point in stroke] for stroke in strokes]
-    return hashlib.sha256(json.dumps(rounded, separators=(",", ":")).encode()).hexdigest()
 
 
 def encoded(ink: Image) -> str:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -22,9 +21,10 @@ from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.report import Sealed, load_sealed
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import Summary, others_of, summarise
-from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, points_digest
+from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, Round, as_points
+from brushloop.model.characters.plan import Phase, phase_map
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture, Recording
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Source, Topic
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -128,14 +128,19 @@ def read_written(path: Path) -> WrittenRecord:
 
 def score_character(one: Character) -> Iterator[WrittenScore]:
     """Score every writing in every alignment, tone and polarity; another writing is the mean over the others."""
+    inks = list(one.captured.values())
     for key in KEYS:
         yield _score(one, "", PLANNED, key, one.reference, [one.simulated])
-        inks = list(one.captured.values())
         for k, (stroke_id, ink) in enumerate(one.captured.items()):
             yield _score(one, stroke_id, SIMULATED, key, ink, [one.simulated])
             yield _score(one, stroke_id, REFERENCE, key, one.reference, [ink])
             if others := [inks[j] for j in others_of(k, len(inks))]:
                 yield _score(one, stroke_id, ANOTHER, key, ink, others)
+
+
+def _score(one: Character, stroke_id: str, pair: str, key: Key, fixed: Ink, others: Sequence[Ink]) -> WrittenScore:
+    csim, ssim = np.mean([compare_ink(fixed, other, key) for other in others], axis=0)
+    return WrittenScore(one.name, stroke_id, pair, *key, float(csim), float(ssim))
 
 
 def compare_ink(fixed: Ink, moving: Ink, key: Key) -> tuple[float, float]:
@@ -160,33 +165,19 @@ def aligned(ink: Image, alignment: Alignment) -> Image:
     return cast("Image", cv2.warpAffine(ink, move, (SIZE_PX, SIZE_PX), flags=cv2.INTER_LINEAR).clip(0.0, 1.0))
 
 
-def _score(one: Character, stroke_id: str, pair: str, key: Key, fixed: Ink, others: Sequence[Ink]) -> WrittenScore:
-    csim, ssim = np.mean([compare_ink(fixed, other, key) for other in others], axis=0)
-    return WrittenScore(one.name, stroke_id, pair, *key, float(csim), float(ssim))
-
-
 def table_3(scores: Iterable[WrittenScore], references: dict[str, str]) -> list[Table3Row]:
     """The rows, by character, then in the order of `KEYS` and `PAIRS`; `references` name each character's reference."""
-    grouped: dict[tuple[str, Alignment, Tone, Polarity, str], list[tuple[float, float]]] = {}
+    grouped: dict[tuple[str, Key, str], list[tuple[float, float]]] = {}
     for s in scores:
-        grouped.setdefault((s.character, s.alignment, s.tone, s.polarity, s.pair), []).append((s.csim, s.ssim))
+        grouped.setdefault((s.character, (s.alignment, s.tone, s.polarity), s.pair), []).append((s.csim, s.ssim))
     rows: list[Table3Row] = []
     for (character, reference), key, pair in itertools.product(references.items(), KEYS, PAIRS):
-        percent = 100.0 * np.array(grouped.get((character, *key, pair), [])).reshape(-1, 2)
+        percent = 100.0 * np.array(grouped.get((character, key, pair), [])).reshape(-1, 2)
         csim, ssim = summarise(percent[:, 0]), summarise(percent[:, 1])
         if csim is not None and ssim is not None:
-            alignment, tone, polarity = key
-            row = Table3Row(
-                character=character,
-                reference=reference,
-                pair=pair,
-                alignment=alignment,
-                tone=tone,
-                polarity=polarity,
-                csim=csim,
-                ssim=ssim,
-            )
-            rows.append(row)
+            how = dict(zip(("alignment", "tone", "polarity"), key, strict=True))
+            names = {"character": character, "reference": reference, "pair": pair}
+            rows.append(Table3Row.model_validate(names | how | {"csim": csim, "ssim": ssim}))
     return rows
 
 
@@ -201,13 +192,22 @@ class WritingComparison:
     plan: PlanRecord
     characters: list[Character]
     scores: list[WrittenScore]
-    refused: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    refused: tuple[tuple[str, str], ...] = ()
     """(stroke, why), never dropped in silence."""
 
     @property
     def table(self) -> list[Table3Row]:
         """Table 3."""
         return table_3(self.scores, {one.name: one.reference_name for one in self.characters})
+
+    def ranked(self, one: Character) -> list[str]:
+        """Stroke ids of a character by CSIM against the reference (`HEADLINE`), best first."""
+        csim = {
+            s.stroke_id: s.csim
+            for s in self.scores
+            if s.character == one.name and s.pair == REFERENCE and (s.alignment, s.tone, s.polarity) == HEADLINE
+        }
+        return sorted(csim, key=lambda stroke_id: -csim[stroke_id])
 
 
 def compare_written(
@@ -224,75 +224,49 @@ def compare_written(
     _check_points(recording, plan)
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
         raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
-    found, cut, refused = _writings(recording, plan, calibration, progress)
-    characters = [_character(figure, found, cut, references) for figure in plan.figures if figure.name in found]
+    writings: dict[str, dict[str, Ink]] = {}
+    cut, refused = set[str](), list[tuple[str, str]]()
+    what = f"{recording.header.session_id}: found"
+    for capture in counted(recording.captures(), what, recording.counts[Topic.STROKE], progress):
+        stroke_id = capture.stroke.stroke_id
+        try:
+            prepared = prepare_cell(capture, calibration)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((stroke_id, error.what))
+            continue
+        ink = {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}
+        writings.setdefault(stroke_id.rsplit("-r", 1)[0], {})[stroke_id] = ink
+        cut |= {stroke_id} if prepared.cut else set()
+    characters: list[Character] = []
+    for figure in plan.figures:
+        if captured := writings.get(figure.name):
+            name, image = references.get(figure.name) or (figure.source, figure.wanted())
+            images = as_ink(image), as_ink(figure.simulated())
+            at_the_edge = tuple(stroke_id for stroke_id in captured if stroke_id in cut)
+            characters.append(Character(figure.name, name, *images, captured, at_the_edge))
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(str(recording.path), f"no character can be compared{why}")
     counting = counted(characters, "characters compared", len(characters), progress)
     scores = [score for one in counting for score in score_character(one)]
-    return WritingComparison(
-        recording.header, recording.path, opened.sha256, calibration, plan, characters, scores, refused
-    )
-
-
-def _writings(
-    recording: Recording, plan: PlanRecord, calibration: Calibration, progress: Progress
-) -> tuple[dict[str, dict[str, Ink]], set[str], list[tuple[str, str]]]:
-    """(character -> stroke -> ink, strokes that are cut, refused)."""
-    found: dict[str, dict[str, Ink]] = {}
-    cut: set[str] = set()
-    refused: list[tuple[str, str]] = []
-    what = f"{recording.header.session_id}: found"
-    for capture in counted(recording.captures(), what, recording.counts[Topic.STROKE], progress):
-        stroke_id = capture.stroke.stroke_id
-        name = stroke_id.rsplit("-r", 1)[0]
-        if capture.stroke.kind != "drag" or plan.figure(name) is None:
-            refused.append((stroke_id, "is not a character of this plan"))
-            continue
-        try:
-            ink, is_cut = captured(capture, calibration)
-        except (CaptureRefused, SessionDamaged) as error:
-            refused.append((stroke_id, error.what))
-            continue
-        found.setdefault(name, {})[stroke_id] = ink
-        cut |= {stroke_id} if is_cut else set()
-    return found, cut, refused
-
-
-def _character(
-    figure: FigureRecord, found: dict[str, dict[str, Ink]], cut: set[str], references: dict[str, tuple[str, Image]]
-) -> Character:
-    name, image = references.get(figure.name) or (figure.source, figure.wanted())
-    writings = found[figure.name]
-    edge = tuple(stroke_id for stroke_id in writings if stroke_id in cut)
-    return Character(figure.name, name, as_ink(image), as_ink(figure.simulated()), writings, edge)
+    about_it = recording.header, recording.path, opened.sha256, calibration
+    return WritingComparison(*about_it, plan, characters, scores, tuple(refused))
 
 
 def _check_points(recording: Recording, plan: PlanRecord) -> None:
     """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
     try:
         protocol: Any = json.loads(recording.header.protocol)
-        points = {f["name"]: points_digest([s["points"] for s in f["strokes"]]) for f in protocol["figures"]}
+        points = {f["name"]: as_points([np.array(s["points"]) for s in f["strokes"]]) for f in protocol["figures"]}
         cell_mm = [float(side) for side in protocol["cell_mm"]]
     except (ValueError, KeyError, TypeError, RecursionError):
         raise CalibrationError(str(recording.path), "was not collected by a `write` protocol") from None
     if cell_mm != [plan.cell_mm, plan.cell_mm]:
         raise CalibrationError(str(recording.path), f"has cells of {cell_mm} mm, the plan {plan.cell_mm:g} mm")
-    for name, digest in points.items():
+    for name, commanded in points.items():
         figure = plan.figure(name)
-        if figure is None or figure.points_sha256 != digest:
+        if figure is None or figure.commanded != commanded:
             raise CalibrationError(str(recording.path), f"{name!r} was not drawn from this plan")
-
-
-def captured(capture: Capture, calibration: Calibration) -> tuple[Ink, bool]:
-    """Return the ink on the character's paper cell, and whether it reaches the edge. Raises `CaptureRefused`."""
-    _, _, size_x_mm, size_y_mm = capture.stroke.cell_mm or (0.0,) * 4
-    if not math.isclose(size_x_mm, size_y_mm):
-        what = f"its cell is {size_x_mm:g} x {size_y_mm:g} mm, but must be square"
-        raise CaptureRefused(capture.stroke.stroke_id, what)
-    prepared = prepare_cell(capture, calibration)
-    return {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}, prepared.cut
 
 
 def _small(image: Image) -> Image:
@@ -301,17 +275,29 @@ def _small(image: Image) -> Image:
 
 def read_reference(path: Path) -> Image:
     """Read (128, 128) ink from a picture of a dark character on light, padded to square. Raises `CalibrationError`."""
-    gray = read_gray(path)
-    ink = 1.0 - gray.astype(np.float32) / 255.0
+    ink = 1.0 - read_gray(path).astype(np.float32) / 255.0
     if float(ink.mean()) > 0.5:
         raise CalibrationError(str(path), "is mostly dark: a reference is dark ink on light paper")
     height, width = ink.shape
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
-    square = np.pad(ink, ((top, side - height - top), (left, side - width - left)))
-    return _small(square)
+    return _small(np.pad(ink, ((top, side - height - top), (left, side - width - left))))
 
 
 def as_ink(image: Image) -> Ink:
     """Make ink from an image that was not photographed: its darkness is its coverage."""
     return dict.fromkeys(Tone, image)
+
+
+def round_of(figure: FigureRecord, character: Character, side_mm: float) -> Round:
+    """What the writings of a figure show on average; phases for characters only."""
+    wanted, writings = figure.wanted(), character.captured.values()
+    csim = float(np.mean([compare_ink(as_ink(wanted), ink, HEADLINE)[0] for ink in writings]))
+    lost: dict[str, float] = {}
+    if figure.medians:
+        where = phase_map(figure.paths, side_mm, len(wanted))
+        wrong = np.mean([(wanted > 0.5) != (ink[Tone.BINARY] > 0.5) for ink in writings], axis=0)
+        share = 100.0 * np.bincount(where.ravel(), wrong.ravel(), len(Phase)) / max(1, np.count_nonzero(wanted > 0.5))
+        present = np.unique(where)
+        lost = {str(phase): round(float(share[k]), 2) for k, phase in enumerate(Phase) if k in present}
+    return Round(csim_percent=round(100.0 * csim, 3), lost_percent=lost)

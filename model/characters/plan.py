@@ -1,9 +1,14 @@
-"""From a character to trajectories: along the median, with the depth that gives the stroke's width there.
+"""Trajectories of characters: what brush and arm can do, the phases of a stroke, and leading a dragged brush.
 
 Convention: a point is x, y, H, alpha, heading. x and y are where the tip would meet the paper, in mm from the lower
 left corner of the patch, y upward. H is the depth below the touch height. The ferrule leans by alpha toward `heading`,
 counter-clockwise from x. The brush is pulled: heading is the direction of the stroke, so the ferrule leads and the
 tip trails; the mark's widest place then lies at the brush axis, H tan(alpha) ahead of the point.
+
+A dragged brush is led so that its ink rather than its tip follows the character. The points of all strokes are adjusted
+together until the ink that `model.drag` predicts matches the wanted image: least squares over the pixels, by
+Levenberg-Marquardt, through an edge that is first soft and then sharp. Every trial is made feasible by `Reach.within`
+before it is judged.
 
 A stroke has phases. It begins and ends with an exposed tip where its outline comes to a point, and with a hidden tip
 where it ends broadly. It turns where its median bends by at least `TURN_DEG` over one width of the stroke, and such a
@@ -14,15 +19,17 @@ Calligraphy", Electronics 14 (15) 3000, 2025; the rules here are our own.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.strokes import StrokeModel
+from brushloop.model.damped import Equations, descend
+from brushloop.model.drag import DISCS, Drawings, Footprint, Trails, ink, inked, marks, sampled, sampling
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -33,7 +40,19 @@ TURN_DEG, FOLD_DEG = 35.0, 90.0
 """Least bend of the median of a turning and of a folding."""
 POINTED = 0.5
 """An end narrower than this share of the stroke's median width is an exposed tip."""
-_TABLE = 64
+MARGIN_MM = 6.0
+"""Margin around the font's square."""
+UNITS = np.array([0.3, 0.3, 0.5, 10.0])
+"""Steps of x, y, depth (mm) and heading (deg) that count as equally large."""
+BENT = 0.015
+"""Cost of a squared second difference along a stroke, in these units: keeps the path calm where ink tells nothing."""
+FIRST_SPREADS_MM, LATER_SPREADS_MM = (1.5, 0.8, 0.4, 0.2), (0.8, 0.4, 0.2)
+ROUNDS = 60
+PLUNGE = 3.0
+"""Greatest change of depth per mm of a led path: more than that of `Reach`, since the footprint knows how the brush
+lands straight down and lifts straight up. Corners and ends need it."""
+GAIN = 5e-4
+"""Smallest share by which a step must lower the cost for another one to be made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +75,6 @@ class Reach:
         for name, (low, high) in bounds:
             if not 0 <= low < high < math.inf:
                 raise ValueError(f"{name} = ({low:g}, {high:g}): expected 0 <= low < high")
-        for name in ("plunge", "turn_deg_mm", "wrist_deg", "apart_mm"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name} = {value:g}: expected more than 0")
 
     def within(self, points: Floats, side_mm: float) -> Floats:
         """The feasible trajectory nearest to (N, 5) points on a patch of that side, found in one sweep each way."""
@@ -94,24 +109,18 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """The square patch that a character is written on: its side, and the margin around the font's square."""
+    """The square patch that a character is written on, at least 30 mm wide."""
 
     side_mm: float = 70.0
-    margin_mm: float = 6.0
-
-    def __post_init__(self) -> None:
-        if not 10.0 <= self.side_mm <= 500.0 or not 0 <= self.margin_mm < 0.4 * self.side_mm:
-            sizes = f"patch of {self.side_mm:g} mm with a margin of {self.margin_mm:g} mm"
-            raise ValueError(f"{sizes}: expected 10 to 500 mm, the margin less than 0.4 of it")
 
     @property
     def mm_per_unit(self) -> float:
         """Size of a font unit in mm."""
-        return (self.side_mm - 2 * self.margin_mm) / SIDE_UNITS
+        return (self.side_mm - 2 * MARGIN_MM) / SIDE_UNITS
 
     def to_mm(self, units: Floats) -> Floats:
         """Font units (..., 2) to mm from the patch's lower left corner, y upward."""
-        return self.margin_mm + self.mm_per_unit * (units - np.array([0.0, FOOT_UNITS]))
+        return MARGIN_MM + self.mm_per_unit * (units - np.array([0.0, FOOT_UNITS]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,29 +129,6 @@ class StrokePath:
 
     points: Floats
     half_width_mm: Floats
-
-
-def trajectory(path: StrokePath, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float) -> Floats:
-    """Points (N, 5) of x, y, H, alpha, heading along a path.
-
-    The tip trails behind the axis, so the depth near the beginning is limited to keep the tip within the stroke.
-    """
-    points, half = path.points, path.half_width_mm
-    depth = depth_of(model, reach, tilt_deg, half)
-    median_mm = float(np.median(depth))
-    behind = -float(model.profile(median_mm, tilt_deg).x_min_mm[0]) / median_mm
-    depth = np.minimum(depth, (lengths_along(points) + half[0]) / behind)
-    heading = tangents(points)
-    ahead = (depth * np.tan(np.radians(tilt_deg)))[:, None]
-    tip = points - ahead * directions(heading)
-    return reach.within(np.column_stack((tip, depth, np.full(len(points), tilt_deg), heading)), patch.side_mm)
-
-
-def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: Floats) -> Floats:
-    """The depths at which presses have these half widths, clipped to the feasible range, (N,) -> (N,) mm."""
-    depths = np.linspace(*reach.depth_mm, _TABLE)
-    widths = model.profile(depths, tilt_deg).width_mm
-    return np.interp(2 * half_width_mm, np.maximum.accumulate(widths), depths)
 
 
 def tangents(points: Floats) -> Floats:
@@ -159,7 +145,7 @@ def directions(heading_deg: Floats) -> Floats:
 
 
 def without_tilt(stroke: Floats) -> Floats:
-    """x, y, depth and heading (N, 4) of a trajectory (N, 5): a path as `model.drag` and `model.drag` take it."""
+    """x, y, depth and heading (N, 4) of a trajectory (N, 5): a path as the footprint of `model.drag` follows it."""
     return np.ascontiguousarray(stroke[:, [0, 1, 2, 4]])
 
 
@@ -240,3 +226,149 @@ def phase_map(paths: Sequence[StrokePath], side_mm: float, size_px: int) -> NDAr
     x, y = np.meshgrid(*grid(side_mm, size_px))
     far = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1]) - half
     return number[np.argmin(far, axis=-1)]
+
+
+def first_lead(
+    paths: Sequence[StrokePath], footprint: Footprint, reach: Reach, side_mm: float, tilt_deg: float
+) -> list[Floats]:
+    """Trajectories (N, 5) with the depth of each width, whose tip is one lag ahead along the stroke."""
+    reach = replace(reach, plunge=PLUNGE)
+    depths = np.linspace(*reach.depth_mm, 64)
+    halves = np.maximum.accumulate(footprint.half_width_mm(depths))
+    out: list[Floats] = []
+    for path in paths:
+        depth = np.interp(path.half_width_mm, halves, depths)
+        heading = tangents(path.points)
+        tip = path.points + footprint.lag_mm(depth)[:, None] * directions(heading)
+        out.append(reach.within(np.column_stack((tip, depth, np.full(len(depth), tilt_deg), heading)), side_mm))
+    return out
+
+
+def lead(
+    footprints: Sequence[Footprint],
+    strokes: Sequence[Floats],
+    wanted: Image,
+    side_mm: float,
+    reach: Reach,
+    *,
+    added_mm: Floats | None = None,
+    held: float = 0.0,
+    spreads_mm: Sequence[float] = FIRST_SPREADS_MM,
+) -> list[Floats]:
+    """Adjust trajectories (N, 5) until their predicted ink is `wanted` (S, S), row 0 at the patch's far edge.
+
+    Each stroke has a footprint of its own. x, y and depth of every point change, and the heading in which a stroke
+    lands. `added_mm` (S, S) is added to the predicted signed distances: what the footprints are known to miss. `held`
+    is the cost of the squared change of each variable, in `UNITS`: what was measured along one path holds only near
+    it. Points stay `Reach.apart_mm` apart.
+    """
+    problem = _Problem(footprints, strokes, wanted, side_mm, replace(reach, plunge=PLUNGE), added_mm, held)
+    vector = problem.vector(strokes)
+    for spread_mm in spreads_mm:
+        vector = descend(
+            lambda v, s=spread_mm: problem.equations(v, s),
+            vector,
+            rounds=ROUNDS,
+            most=3.0,
+            gain=GAIN,
+            cost=lambda v, s=spread_mm: problem.cost(v, s),
+            feasible=lambda v: problem.vector(problem.strokes(v)),
+        ).vector
+    return [reach.spaced(np.round(stroke, 3)) for stroke in problem.strokes(vector)]
+
+
+def drawn(footprints: Sequence[Footprint], strokes: Sequence[Floats], side_mm: float, size_px: int) -> Floats:
+    """Signed distance in mm to the edge of the predicted ink, (size, size), positive in ink, row 0 at the far edge.
+
+    Each stroke (N, 5) has a footprint of its own.
+    """
+    return inked(footprints, [without_tilt(stroke) for stroke in strokes], *grid(side_mm, size_px))
+
+
+def covered(distance_mm: Floats, side_mm: float) -> Image:
+    """Ink from 0 to 1 of (size, size) signed distances: rises over one pixel."""
+    return np.clip(0.5 + distance_mm * len(distance_mm) / side_mm, 0.0, 1.0).astype(np.float32)
+
+
+class _Problem:
+    """The least squares of one character. Its vector holds x, y, depth, heading of every point, in `UNITS`."""
+
+    def __init__(
+        self,
+        footprints: Sequence[Footprint],
+        strokes: Sequence[Floats],
+        wanted: Image,
+        side_mm: float,
+        reach: Reach,
+        added_mm: Floats | None,
+        held: float,
+    ) -> None:
+        self._values = np.array([footprint.values for footprint in footprints])
+        self._like = [stroke.copy() for stroke in strokes]
+        self._ends = np.cumsum([0, *(len(stroke) for stroke in strokes)])
+        self._side_mm, self._reach = side_mm, reach
+        self._added_mm = np.zeros((1, *wanted.shape)) if added_mm is None else added_mm[None]
+        one_image = np.array([0, len(strokes)])
+        self._wanted = Drawings(strokes, one_image, wanted[None], *grid(side_mm, len(wanted)))
+        self._bent = _bending(self._ends)
+        self._from, self._held = self.vector(strokes), held
+
+    def vector(self, strokes: Sequence[Floats]) -> Floats:
+        return (np.concatenate([without_tilt(stroke) for stroke in strokes]) / UNITS).ravel()
+
+    def strokes(self, vector: Floats) -> list[Floats]:
+        points = vector.reshape(-1, 4) * UNITS
+        out: list[Floats] = []
+        for like, first, last in zip(self._like, self._ends, self._ends[1:], strict=False):
+            stroke = like.copy()
+            stroke[:, :3], stroke[0, 4] = points[first:last, :3], points[first, 3]
+            out.append(self._reach.within(stroke, self._side_mm))
+        return out
+
+    def cost(self, vector: Floats, spread_mm: float) -> float:
+        at = self._marks([sampled(without_tilt(stroke)) for stroke in self.strokes(vector)])
+        distance_mm = at.distances(self._wanted.x_mm, self._wanted.y_mm) + self._added_mm
+        off = ink(distance_mm, spread_mm) - self._wanted.ink
+        return 0.5 * float(np.sum(off**2)) + self._penalty(vector)
+
+    def equations(self, vector: Floats, spread_mm: float) -> Equations:
+        paths = [without_tilt(stroke) for stroke in self.strokes(vector)]
+        at = self._marks([sampled(path) for path in paths])
+        slopes = np.zeros((len(at.discs), 3, len(vector)))
+        first = 0
+        for number, path in enumerate(paths):
+            nodes, (shares, down) = sampled(path), sampling(path)
+            rows = slice(DISCS * first, DISCS * (first + len(nodes)))
+            first += len(nodes)
+            for point in range(len(path)):
+                for column in range(4 if point == 0 else 3):
+                    moved = nodes.copy()
+                    moved[:, column] += 1e-3 * UNITS[column] * shares[:, point] * (down if column == 2 else 1.0)
+                    changed = marks([moved], self._values[number]).discs
+                    slopes[rows, :, 4 * (self._ends[number] + point) + column] = (changed - at.discs[rows]) / 1e-3
+        found = at.equations(slopes, self._wanted, spread_mm, self._added_mm)
+        gradient = found.gradient + self._bent @ vector + self._held * (vector - self._from)
+        square = found.square + self._bent + self._held * np.eye(len(vector))
+        return Equations(found.cost + self._penalty(vector), square, gradient)
+
+    def _marks(self, nodes: list[Floats]) -> Trails:
+        """The footprints of all strokes, as one image."""
+        at = marks(nodes, self._values)
+        return replace(at, groups=at.groups[[0, -1]])
+
+    def _penalty(self, vector: Floats) -> float:
+        moved = vector - self._from
+        return 0.5 * float(vector @ self._bent @ vector) + 0.5 * self._held * float(moved @ moved)
+
+
+def _bending(ends: NDArray[np.int64]) -> Floats:
+    """The quadratic form of the squared second differences of x, y and depth along each stroke."""
+    size = 4 * int(ends[-1])
+    out = np.zeros((size, size))
+    second = np.array([1.0, -2.0, 1.0])
+    for first, last in itertools.pairwise(ends):
+        for point in range(first + 1, last - 1):
+            for column in range(3):
+                at = 4 * np.array([point - 1, point, point + 1]) + column
+                out[np.ix_(at, at)] += BENT * UNITS[column] ** 2 * np.outer(second, second)
+    return out

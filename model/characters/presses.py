@@ -1,7 +1,7 @@
 """Trajectories as presses laid over each other along the path, and refined until their image is the wanted one.
 
 A pixel is as dark as the darkest mark on it: ink on ink stays ink. Bristles do not lag, and no brush runs dry.
-`model.characters.lead` draws with a brush that is dragged, and needs no torch.
+`model.characters.plan.lead` plans with a brush that is dragged, and needs no torch.
 """
 
 from __future__ import annotations
@@ -14,7 +14,16 @@ import torch
 from torch import Tensor
 
 from brushloop.model.arrays import Array, library, like
-from brushloop.model.characters.plan import Floats, Image, Reach
+from brushloop.model.characters.plan import (
+    Floats,
+    Image,
+    Patch,
+    Reach,
+    StrokePath,
+    directions,
+    lengths_along,
+    tangents,
+)
 from brushloop.model.raster import SIZE_PX, coverage
 from brushloop.model.raster.exact import coverage_at
 from brushloop.model.strokes import StrokeModel
@@ -24,6 +33,30 @@ _RATE = (0.12, 0.12, 0.12, 0.1, 1.5)
 _STIFF = (0.02, 0.02, 0.02, 0.002, 2e-5)
 """Weight of the squared second difference along a stroke."""
 _WIDE_PX, _NARROW_PX = 2.0, 0.6
+_TABLE = 64
+
+
+def trajectory(path: StrokePath, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float) -> Floats:
+    """Points (N, 5) of x, y, H, alpha, heading along a path.
+
+    The tip trails behind the axis, so the depth near the beginning is limited to keep the tip within the stroke.
+    """
+    points, half = path.points, path.half_width_mm
+    depth = depth_of(model, reach, tilt_deg, half)
+    median_mm = float(np.median(depth))
+    behind = -float(model.profile(median_mm, tilt_deg).x_min_mm[0]) / median_mm
+    depth = np.minimum(depth, (lengths_along(points) + half[0]) / behind)
+    heading = tangents(points)
+    ahead = (depth * np.tan(np.radians(tilt_deg)))[:, None]
+    tip = points - ahead * directions(heading)
+    return reach.within(np.column_stack((tip, depth, np.full(len(points), tilt_deg), heading)), patch.side_mm)
+
+
+def depth_of(model: StrokeModel, reach: Reach, tilt_deg: float, half_width_mm: Floats) -> Floats:
+    """The depths at which presses have these half widths, clipped to the feasible range, (N,) -> (N,) mm."""
+    depths = np.linspace(*reach.depth_mm, _TABLE)
+    widths = model.profile(depths, tilt_deg).width_mm
+    return np.interp(2 * half_width_mm, np.maximum.accumulate(widths), depths)
 
 
 def dense(points: Array, per_step: int) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.model.drag import DragModel, distances, trails
+from brushloop.model.drag import DragModel, lagging
 
 STIFF = DragModel(half_mm=2.0, half_per_mm=0.0, leash_mm=0.0, leash_per_mm=0.0, settle_mm=0.0, front=0.0)
 X_MM, Y_MM = np.linspace(-10.0, 50.0, 121), np.linspace(-20.0, 20.0, 81)
@@ -13,7 +13,7 @@ X_MM, Y_MM = np.linspace(-10.0, 50.0, 121), np.linspace(-20.0, 20.0, 81)
 
 def away(model: DragModel, path: np.ndarray, x_mm: np.ndarray, y_mm: np.ndarray) -> np.ndarray:
     """Signed distance in mm to the edge of one path's mark."""
-    return distances(*trails([path], model.vector()), x_mm, y_mm)[0]
+    return lagging([path], model.vector()).distances(x_mm, y_mm)[0]
 
 
 def line(length_mm: float, depth_mm: float = 5.0, nodes: int = 21) -> np.ndarray:
@@ -31,7 +31,7 @@ def test_without_a_leash_the_mark_is_discs_along_the_path() -> None:
 @pytest.mark.parametrize("nodes", [2, 9, 200])
 def test_the_lag_is_that_of_first_order_however_the_path_is_cut(nodes: int) -> None:
     model = DragModel(leash_mm=4.0, leash_per_mm=0.0, front=0.0)
-    trail = trails([line(20.0, nodes=nodes)], model.vector())[0]
+    trail = lagging([line(20.0, nodes=nodes)], model.vector()).discs
     assert trail[-2, 0] == pytest.approx(20.0 - 4.0 * (1.0 - np.exp(-20.0 / 4.0)), abs=1e-9)
 
 
@@ -41,7 +41,7 @@ def test_a_corner_is_cut_and_more_so_at_depth() -> None:
     cut = []
     for depth in (2.0, 8.0):
         corner = np.concatenate([np.column_stack([leg, 0 * leg]), np.column_stack([0 * leg[1:] + 25.0, -leg[1:]])])
-        trail = trails([np.column_stack([corner, np.full(len(corner), depth)])], model.vector())[0]
+        trail = lagging([np.column_stack([corner, np.full(len(corner), depth)])], model.vector()).discs
         cut.append(np.hypot(trail[:, 0] - 25.0, trail[:, 1]).min())
     assert 0.2 < cut[0] < cut[1]
 
@@ -58,14 +58,6 @@ def test_lifting_below_no_width_leaves_no_ink() -> None:
 def test_a_batch_is_its_members() -> None:
     model = DragModel()
     paths = [line(10.0, nodes=5), line(30.0, 8.0)]
-    nodes, starts = trails(paths, model.vector())
-    together = distances(nodes, starts, X_MM, Y_MM)
+    together = lagging(paths, model.vector()).distances(X_MM, Y_MM)
     for one, path in zip(together, paths, strict=True):
         assert np.array_equal(one, away(model, path, X_MM, Y_MM))
-
-
-def test_a_path_needs_two_nodes_of_three_numbers() -> None:
-    with pytest.raises(ValueError, match=r"\(n, 3\)"):
-        trails([np.zeros((1, 3))], DragModel().vector())[0]
-    assert len(DragModel.names()) == len(DragModel().vector()) == 14
-    assert DragModel.of(DragModel().vector()) == DragModel()

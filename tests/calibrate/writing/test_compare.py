@@ -11,16 +11,8 @@ import pytest
 
 from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.compare.score import Polarity
-from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.writing.record import (
-    FigureRecord,
-    PlannedBy,
-    PlanRecord,
-    as_points,
-    encoded,
-    load_plan,
-    points_digest,
-)
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, load_plan
 from brushloop.calibrate.writing.scores import (
     ANOTHER,
     KEYS,
@@ -30,20 +22,14 @@ from brushloop.calibrate.writing.scores import (
     Character,
     aligned,
     as_ink,
-    captured,
     compare_ink,
     read_reference,
     read_written,
     score_character,
     table_3,
 )
-from brushloop.sessions.messages import encode_png
-from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Stroke
-from tests.calibrate.given import CALIBRATION
 from tests.calibrate.records import written_record
 
-CELL = (20.0, 10.0, 60.0, 60.0)
 STRICT = (Alignment.MM, Tone.BINARY, Polarity.INK)
 
 
@@ -53,41 +39,6 @@ def cross(dx: int = 0, width: int = 8) -> np.ndarray:
     image[60 : 60 + width, 30 + dx : 100 + dx] = 1.0
     image[30:100, 62 + dx : 62 + dx + width] = 1.0
     return image
-
-
-def page(*rectangles: tuple[int, int, int, int]) -> np.ndarray:
-    """A 100 x 80 mm page at 10 px/mm with (left, top, right, bottom) px of ink."""
-    image = np.full((800, 1000), 225, np.uint8)
-    for left, top, right, bottom in rectangles:
-        image[top:bottom, left:right] = 25
-    return image
-
-
-def capture(image: np.ndarray, cell: tuple[float, float, float, float] | None = CELL) -> Capture:
-    stroke = Stroke(stroke_id="x-r01", kind="drag", still=0, cell_mm=cell)
-    return Capture(stroke, encode_png(image), "test x-r01")
-
-
-def test_every_stroke_of_a_character_counts_however_far_apart_and_the_neighbour_does_not() -> None:
-    # The cell is x 200..800, y 100..700 px from the page's upper left corner; a dot of 2 mm lies 40 mm from the bar.
-    image = page((250, 600, 750, 640), (300, 180, 320, 200), (850, 300, 950, 500))
-    ink, cut = captured(capture(image), CALIBRATION)
-    assert not cut
-    area_mm2 = float(ink[Tone.BINARY].sum()) * (60 / 128) ** 2
-    assert area_mm2 == pytest.approx(50 * 4 + 2 * 2, rel=0.03)
-    rows = np.flatnonzero((ink[Tone.BINARY] > 0.5).any(axis=1))
-    # Row 0 is the far edge: the dot, 8 mm below it, comes first.
-    assert rows[0] == pytest.approx(8 / 60 * 128, abs=1.5)
-    assert rows[-1] == pytest.approx(54 / 60 * 128, abs=1.5)
-
-
-def test_ink_on_the_edge_of_the_cell_is_reported_and_other_cells_are_refused() -> None:
-    _, cut = captured(capture(page((150, 300, 500, 340))), CALIBRATION)
-    assert cut
-    with pytest.raises(CaptureRefused, match="must be square"):
-        captured(capture(page((250, 300, 500, 340)), (20.0, 10.0, 60.0, 40.0)), CALIBRATION)
-    with pytest.raises(CaptureRefused, match="is blank"):
-        captured(capture(page()), CALIBRATION)
 
 
 def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
@@ -139,7 +90,7 @@ def test_a_writing_alone_has_no_other() -> None:
     assert ANOTHER not in {score.pair for score in score_character(alone)}
 
 
-def test_a_plan_keeps_its_images_and_knows_its_points(tmp_path: Path) -> None:
+def test_a_plan_keeps_its_images_and_its_points(tmp_path: Path) -> None:
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, -0.0001], [5.5, 6.25, 7.125, 8.0, 9.0]])]
     images = {"wanted_png": encoded(cross()), "simulated_png": encoded(cross(width=10))}
     figure = FigureRecord(name="x", source="font", commanded=as_points(strokes), **images)
@@ -149,8 +100,7 @@ def test_a_plan_keeps_its_images_and_knows_its_points(tmp_path: Path) -> None:
     assert loaded == plan
     np.testing.assert_array_equal(loaded.figures[0].wanted(), cross())
     # What the protocol holds has three decimals.
-    assert figure.points_sha256 == points_digest([[[1, 2, 3, 4, 0.0], [5.5, 6.25, 7.125, 8, 9]]])
-    assert figure.points_sha256 != points_digest([[[1, 2, 3, 4, 0.0], [5.5, 6.25, 7.126, 8, 9]]])
+    assert figure.commanded == (((1, 2, 3, 4, 0), (5.5, 6.25, 7.125, 8, 9)),)
     (tmp_path / "plan.json").write_text(plan.model_dump_json().replace(figure.wanted_png, "AAAA"))
     with pytest.raises(CalibrationError, match="x: wanted_png is not a picture"):
         load_plan(tmp_path).figures[0].wanted()

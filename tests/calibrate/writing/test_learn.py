@@ -10,13 +10,12 @@ import pytest
 
 from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing.learn import MOST_MM, learned, lost_by_phase, missed, phase_table, reach_of, round_of
+from brushloop.calibrate.writing.learn import MOST_MM, learned, missed, reach_of
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.calibrate.writing.report import write_written
-from brushloop.calibrate.writing.scores import Character, WritingComparison, as_ink, score_character
+from brushloop.calibrate.writing.scores import Character, WritingComparison, as_ink, round_of, score_character
 from brushloop.model.characters.glyph import swept
-from brushloop.model.characters.lead import covered, drawn, first_lead, lead
-from brushloop.model.characters.plan import StrokePath
+from brushloop.model.characters.plan import StrokePath, covered, drawn, first_lead, lead
 from brushloop.model.drag import NAMES, START, Footprint
 from brushloop.sessions.records import Header, Source
 from tests.calibrate.given import CALIBRATION
@@ -35,10 +34,10 @@ TRUE = brush_of(half_mm_2=-0.1, leash_mm=1.2, across_mm=0.6)
 """The brush that writes: thinner, farther behind and farther to the left than the one that the plan knows."""
 
 
-def plan_of(*, rounds: int = 6) -> PlanRecord:
+def plan_of() -> PlanRecord:
     by = PlannedBy(footprint=PLANNED.values)
     strokes = first_lead([LINE], PLANNED, reach_of(by), SIDE_MM, 5.0)
-    strokes = lead([PLANNED], strokes, WANTED, SIDE_MM, reach_of(by), rounds=rounds)
+    strokes = lead([PLANNED], strokes, WANTED, SIDE_MM, reach_of(by))
     median = tuple((x, y, 2.0) for x, y in LINE.points.tolist())
     figure = FigureRecord(
         name="bar",
@@ -141,11 +140,6 @@ def test_what_is_lost_is_listed_by_phase(plan: PlanRecord) -> None:
     [figure] = plan.figures
     cut = WANTED.copy()
     cut[:, :40] = 0.0  # the first 3 mm of the stroke and its rounding are missing
-    lost = lost_by_phase(figure, cut, SIDE_MM)
+    lost = round_of(figure, session(plan, ink=cut).characters[0], SIDE_MM).lost_percent
     assert max(lost, key=lambda phase: lost[phase]) == "initiation, hidden tip"
     assert lost["termination, hidden tip"] == 0.0
-    found = round_of(figure, session(plan, ink=cut).characters[0], SIDE_MM)
-    assert phase_table([found, found])[0] == (
-        "initiation, hidden tip",
-        [found.lost_percent["initiation, hidden tip"]] * 2,
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib.resources import files
 
 import numpy as np
@@ -10,15 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.model.characters.glyph import (
-    GlyphError,
-    parse_csv,
-    parse_glyph,
-    parse_json,
-    parse_path,
-    paths_of,
-    reference,
-)
+from brushloop.model.characters.glyph import parse_csv, parse_glyph, parse_path, paths_of, reference
 from brushloop.model.characters.plan import Patch
 
 SQUARE = "M 100 100 L 100 300 L 300 300 L 300 100 Z"
@@ -34,9 +27,9 @@ def glyph_text(**changes: object) -> str:
 
 @pytest.mark.parametrize(("name", "strokes"), [("字", 6), ("子", 3), ("永", 5)])
 def test_the_shipped_characters_can_be_read(name: str, strokes: int) -> None:
-    glyph = parse_glyph(shipped(name), name)
-    assert len(glyph.strokes) == strokes
-    ink = reference(glyph, Patch(60.0, 0.0))
+    glyph = parse_glyph(shipped(name))
+    assert len(glyph) == strokes
+    ink = reference(glyph, Patch(50.0))
     assert 0.05 < ink.mean() < 0.3
     assert ink.max() == 1.0
 
@@ -57,9 +50,9 @@ def test_an_outline_is_a_closed_loop_counter_clockwise_whichever_way_it_was_draw
 
 
 def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
-    cell = Patch(70.0, 6.0)
+    cell = Patch(70.0)
     assert cell.to_mm(np.array([[0.0, -124.0], [1024.0, 900.0]])).tolist() == [[6.0, 6.0], [64.0, 64.0]]
-    for path in paths_of(parse_glyph(shipped("永"), "永"), cell, 2.0):
+    for path in paths_of(parse_glyph(shipped("永")), cell, 2.0):
         assert np.all(path.half_width_mm > 0)
         steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
         assert steps.max() < 3.0
@@ -68,72 +61,57 @@ def test_ways_lie_on_the_cell_with_the_foot_of_the_font_at_its_margin() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "is not JSON"),
-        ("[" * 100_000, "is not JSON"),
-        (glyph_text(strokes=[]), "strokes: expected a list of 1 to 64"),
+        ("{", "Invalid JSON"),
+        ("[" * 100_000, "Invalid JSON"),
+        (glyph_text(strokes=[]), "strokes: List should have at least 1 item"),
         (glyph_text(strokes=[SQUARE, SQUARE]), "medians: 1 for 2 strokes"),
-        (glyph_text(strokes=["M 0 0 L 5"]), "strokes.0: L takes 2 numbers"),
-        (glyph_text(strokes=["M 0 0 A 5 5 0 0 1 3 3 Z"]), "expected M first, then L, Q, C or Z"),
-        (glyph_text(strokes=["M 0 0 L 1e9 0 L 0 9 Z"]), "expected 4096 at most"),
+        (glyph_text(strokes=["M 0 0 L 5"]), "strokes.0: is no SVG path"),
+        (glyph_text(strokes=["M 0 0 L 9 0 M 3 3 L 1 9 Z"]), "expected one loop"),
+        (glyph_text(strokes=["M 0 0 L 1e9 0 L 0 9 Z"]), "coordinates of at most 4096"),
         (glyph_text(strokes=["M 0 0 L 9 0 Z"]), "strokes.0: encloses nothing"),
-        (glyph_text(strokes=["M 0 0 L 9 0 #"]), "is not a path at character"),
-        (glyph_text(strokes=["M 0 0 " + "L 1 2 L 3 4 " * 2000]), "more than 1024 pieces"),
-        (glyph_text(medians=[[[0, 0]]]), "medians.0: expected a list of 2 to 256 points"),
-        (glyph_text(medians=[[[0, 0], [0, "x"]]]), "medians.0.1: expected [x, y]"),
+        (glyph_text(strokes=["M 0 0 " + "L 1 2 L 3 4 " * 2000]), "at most 1024 pieces"),
+        (glyph_text(medians=[[[0, 0]]]), "medians.0: List should have at least 2 items"),
+        (glyph_text(medians=[[[0, 0], [0, "x"]]]), "medians.0.1.1: Input should be a valid number"),
         (glyph_text(medians=[[[5, 5], [5, 5]]]), "medians.0: expected two different points"),
         (" " * 300_000, "is longer than"),
     ],
 )
 def test_hostile_characters_are_one_line(text: str, words: str) -> None:
-    with pytest.raises(GlyphError) as caught:
-        parse_glyph(text, "x")
-    assert words in str(caught.value)
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        parse_glyph(text)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 200
 
 
-@given(st.text(alphabet="MLQCZ0123456789 .,-+eE", max_size=60))
-def test_any_path_is_arcs_or_a_glyph_error(path: str) -> None:
+@given(st.text(alphabet="MLQCZmlqc0123456789 .,-+eE", max_size=60))
+def test_any_path_is_arcs_or_an_error(path: str) -> None:
     try:
         arcs = parse_path(path, "strokes.0")
-    except GlyphError:
+    except ValueError:
         return
     assert np.isfinite(arcs).all()
 
 
-def test_a_hand_gives_ways_and_widths() -> None:
+def test_a_hand_gives_paths_and_widths() -> None:
     text = "stroke,x_mm,y_mm,width_mm\n1,10,10,2\n1,30,10,4\n2,10,30,3\n2,10,50,3\n"
-    ways = parse_csv(text, Patch(), 2.0)
-    same = parse_json('{"strokes": [[[10,10,2],[30,10,4]],[[10,30,3],[10,50,3]]]}', Patch(), 2.0)
-    assert len(ways) == len(same) == 2
-    for one, other in zip(ways, same, strict=True):
-        assert np.allclose(one.points, other.points)
-        assert np.allclose(one.half_width_mm, other.half_width_mm)
-    assert ways[0].half_width_mm[[0, -1]].tolist() == [1.0, 2.0]
+    first, second = parse_csv(text, Patch(), 2.0)
+    assert first.points[[0, -1]].tolist() == [[10.0, 10.0], [30.0, 10.0]]
+    assert first.half_width_mm[[0, -1]].tolist() == [1.0, 2.0]
+    assert second.points[[0, -1]].tolist() == [[10.0, 30.0], [10.0, 50.0]]
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("x_mm,y_mm\n1,2\n", "line 1: has no column width_mm"),
-        ("x_mm,y_mm,width_mm,z\n1,2,3,4\n", "line 1: unknown column 'z'"),
-        ("x_mm,y_mm,width_mm\n1,2\n", "line 2: expected 3 values"),
+        ("x_mm,y_mm\n1,2\n", "has no column width_mm"),
+        ("x_mm,y_mm,width_mm\n1,2\n", "line 2: width_mm: must be a number"),
         ("x_mm,y_mm,width_mm\n1,900,3\n", "line 2: y_mm: must be a number, 0 to 70"),
-        ("x_mm,y_mm,width_mm\n1,nan,3\n", "line 2: y_mm: must be a number"),
+        ("x_mm,y_mm,width_mm\n1,x,3\n", "line 2: could not convert"),
         ("x_mm,y_mm,width_mm\n", "holds no stroke"),
         ("x_mm,y_mm,width_mm\n1,1,3\n2,1,3\n", "stroke 1: is 1 mm long"),
-        ('x_mm,y_mm,width_mm\n"1,1,3\n', "is not CSV"),
+        ('x_mm,y_mm,width_mm\n"1,1,3\n', "unexpected end of data"),
     ],
 )
 def test_a_bad_hand_is_one_line(text: str, words: str) -> None:
-    with pytest.raises(GlyphError) as caught:
+    with pytest.raises(ValueError, match=words):
         parse_csv(text, Patch(), 2.0)
-    assert words in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "[]", '{"strokes": 3}', '{"strokes": [3]}', '{"strokes": [[[1,2]]]}', '{"strokes": [[[1,2,true]]]}']
-)
-def test_bad_json_of_a_hand_is_refused(text: str) -> None:
-    with pytest.raises(GlyphError):
-        parse_json(text, Patch(), 2.0)

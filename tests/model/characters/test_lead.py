@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 
 from brushloop.model.characters.glyph import swept
-from brushloop.model.characters.lead import covered, drawn, first_lead, lead
-from brushloop.model.characters.plan import Phase, Reach, StrokePath, phase_map, phases_of, resampled
+from brushloop.model.characters.plan import (
+    Phase,
+    Reach,
+    StrokePath,
+    covered,
+    drawn,
+    first_lead,
+    grid,
+    lead,
+    phase_map,
+    phases_of,
+    resampled,
+)
 from brushloop.model.drag import NAMES, START, Drawings, Footprint, fit_each, fit_footprint, inked, marks, sampled
 
 SIDE_MM, SIZE_PX = 48.0, 96
@@ -41,17 +52,16 @@ def test_a_footprint_is_found_again_from_its_ink() -> None:
     true = Footprint(
         tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "leash_mm": 2.0, "half_mm_2": 0.9}.values())
     )
-    x_mm = (np.arange(64) + 0.5) * SIDE_MM / 64
-    y_mm = SIDE_MM - x_mm
+    x_mm, y_mm = grid(SIDE_MM, 64)
     paths = [
         np.array([[14.0, 24.0, depth, turn], [34.0, 24.0, depth, turn], [30.0, 14.0, 0.5 * depth, turn]])
         for depth, turn in ((3.0, 0.0), (6.0, 30.0), (9.0, -20.0))
     ]
-    ink = np.array([true.distance([path], x_mm, y_mm) > 0.0 for path in paths], np.float32)
-    found = fit_footprint(Drawings(paths, np.arange(4), ink, x_mm, y_mm, np.ones(3)))
+    ink = np.array([inked([true], [path], x_mm, y_mm) > 0.0 for path in paths], np.float32)
+    found = fit_footprint(Drawings(paths, np.arange(4), ink, x_mm, y_mm))
 
     def wrong(brush: Footprint) -> int:
-        seen = [brush.distance([path], x_mm, y_mm) > 0.0 for path in paths]
+        seen = [inked([brush], [path], x_mm, y_mm) > 0.0 for path in paths]
         return np.count_nonzero(np.array(seen) != (ink > 0.5))
 
     assert wrong(found) < 0.4 * wrong(Footprint())
@@ -60,10 +70,9 @@ def test_a_footprint_is_found_again_from_its_ink() -> None:
 
 
 def test_pressing_deeper_on_the_spot_marks_like_landing_as_deep() -> None:
-    middle = (np.arange(64) + 0.5) * SIDE_MM / 64
     lands = np.array([[24.0, 24.0, 8.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
     deepens = np.array([[24.0, 24.0, 2.0, 30.0], [24.01, 24.0, 8.0, 30.0]])
-    ink, slid = (Footprint().distance([path], middle, SIDE_MM - middle) for path in (lands, deepens))
+    ink, slid = (inked([Footprint()], [path], *grid(SIDE_MM, 64)) for path in (lands, deepens))
     deep = ink > 0.3
     assert deep.sum() > 30
     assert np.all(slid[deep] > 0.0)
@@ -78,11 +87,10 @@ def test_each_stroke_has_a_footprint_of_its_own() -> None:
         Footprint(tuple({**dict(zip(NAMES, Footprint().values, strict=True)), "half_mm_2": half}.values()))
         for half in (1.2, 0.4)
     )
-    x_mm = (np.arange(64) + 0.5) * SIDE_MM / 64
-    y_mm = SIDE_MM - x_mm
+    x_mm, y_mm = grid(SIDE_MM, 64)
     paths = [np.array([[12.0, y, 5.0, 0.0], [36.0, y, 5.0, 0.0]]) for y in (16.0, 32.0)]
     ink = (inked([wide, narrow], paths, x_mm, y_mm) > 0.0).astype(np.float32)[None]
-    upper, lower = fit_each(Drawings(paths, np.array([0, 2]), ink, x_mm, y_mm, np.ones(1)), Footprint())
+    upper, lower = fit_each(Drawings(paths, np.array([0, 2]), ink, x_mm, y_mm), Footprint())
     depth = np.array([5.0])
     assert upper.half_width_mm(depth) > lower.half_width_mm(depth) + 0.4
     assert np.count_nonzero((inked([upper, lower], paths, x_mm, y_mm) > 0.0) != (ink[0] > 0.5)) < 40
