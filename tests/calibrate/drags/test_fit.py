@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench import accuracy
+from bench.brushes import DATA
 from brushloop.calibrate.drags import fit as drags
 from brushloop.calibrate.drags.captures import Drawn, commanded_path
 from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_drags, predicted
@@ -94,3 +96,20 @@ def test_a_brush_is_adapted_to_strokes_that_differ_most() -> None:
     commands = np.array([[20.0, 5.0, 2.0, 2.0, 0.0]] * 6 + [[40.0, -5.0, 4.0, 4.0, 0.0], [20.0, -5.0, 4.0, 4.0, 0.0]])
     assert sorted(different(commands, 3)) == [0, 6, 7]
     assert drags.session_change(commands)["leash_per_mm"] == pytest.approx(0.5)
+
+
+def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
+    path = commanded_path(30.0, 12.0, 0.8 * 18.0, 0.2 * 18.0)
+    assert path[0].tolist() == pytest.approx([0.0, 0.0, 0.2 * 18.0])
+    assert path[-1].tolist() == pytest.approx([30.0, 0.0, 0.2 * 18.0])
+    assert path[:, 1].max() == pytest.approx(0.75 * 12.0, abs=0.02)
+    assert path[:, 2].max() == pytest.approx(0.8 * 18.0)
+
+
+@pytest.mark.skipif(not (DATA / accuracy.BIG).is_dir(), reason="the folder of real strokes is not here")
+@pytest.mark.soak
+@pytest.mark.timeout(3000)
+def test_real_strokes_that_were_never_fitted_are_predicted() -> None:
+    means = accuracy.drags_within(20, draw=0, seed=5)
+    assert means[PREDICTED]["csim"] > means[LAG]["csim"] > 0.82
+    assert means[PREDICTED]["iou"] > 0.70
