@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
 from brushloop.calibrate.drags.captures import COMMANDS, Drawn, commanded_path
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.spread import farthest_first
+from brushloop.calibrate.stats import farthest_first
 from brushloop.model.drag import DragModel, Drawings, Floats, Indices, Trails, derivatives, fit_to_ink, lagging
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.errors import SessionDamaged
