@@ -19,15 +19,9 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.compare.place import (
-    Alignment,
-    Field,
-    Tone,
-    brush_of,
-    simulated,
-)
+from brushloop.calibrate.compare.place import Alignment, Field, Tone, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Export, Series
+from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Series, samples, verdicts
 from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit, FitRequest, FitResult, fit_presses
 from brushloop.calibrate.presses import Refused, crop, read_presses
@@ -46,7 +40,6 @@ if TYPE_CHECKING:
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
-NO_TIMES = np.empty(0, np.int64)
 GENERATOR = "ccd-bsmg"
 """The generator that comes with brushloop."""
 
@@ -98,7 +91,7 @@ class RecordedPress:
     @property
     def verdict(self) -> str:
         """`passed` or `failed: ...` by the checks of the run, `was marked bad` by a person, or empty."""
-        return self._capture.bad or self._session.quality.get(self.name, "")
+        return self._capture.bad or self._session.verdicts.get(self.name, "")
 
     @cached_property
     def photograph(self) -> Gray:
@@ -126,12 +119,13 @@ class RecordedPress:
     @property
     def poses(self) -> Poses:
         """Path of the brush tip; empty for an import."""
-        return self._session.samples[0].get(self.name, Poses(NO_TIMES, np.empty((0, 3)), np.empty((0, 4))))
+        t_ns, values = self._session.samples_of(POSES, self.name)
+        return Poses(t_ns, values[:, :3], values[:, 3:])
 
     @property
     def forces(self) -> Forces:
         """Force during the press."""
-        return self._session.samples[1].get(self.name, Forces(NO_TIMES, np.empty((0, 6))))
+        return Forces(*self._session.samples_of(FORCES, self.name))
 
     @cached_property
     def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
@@ -175,33 +169,30 @@ class Session:
         return open_session(self.recording.path)
 
     @cached_property
-    def quality(self) -> dict[str, str]:
+    def verdicts(self) -> dict[str, str]:
         """Result of the checks of the run by name of stroke."""
-        return self._export.quality
-
-    @cached_property
-    def samples(self) -> tuple[dict[str, Poses], dict[str, Forces]]:
-        """Poses and forces by name of stroke."""
-        poses, forces = self._by_stroke(POSES), self._by_stroke(FORCES)
-        return (
-            {name: Poses(t_ns, at[:, :3], at[:, 3:]) for name, (t_ns, at) in poses.items()},
-            {name: Forces(t_ns, wrench) for name, (t_ns, wrench) in forces.items()},
-        )
+        return verdicts(self.recording)
 
     def presses(self) -> Iterator[RecordedPress]:
         """Every press in order, those that were marked bad included."""
         return (RecordedPress(self, capture) for capture in self.recording.captures())
 
-    @cached_property
-    def _export(self) -> Export:
-        return Export(self.recording)
-
-    def _by_stroke(self, series: Series) -> dict[str, tuple[NDArray[np.int64], Floats]]:
-        """Times (n,) and values (n, width) of each stroke that has any."""
-        when, values = self._export.samples(series)
+    def samples_of(self, series: Series, stroke: str) -> tuple[NDArray[np.int64], Floats]:
+        """Times (n,) and values (n, width) of what was sampled during the press of a stroke."""
+        if series not in self._samples:
+            self._samples[series] = samples(self.recording, series)
+        when, values = self._samples[series]
         episode, t_ns = (when[:, SAMPLE_COLUMNS.index(name)] for name in ("episode_index", "t_ns"))
-        strokes = list(self._export.strokes)
-        return {strokes[number]: (t_ns[episode == number], values[episode == number]) for number in np.unique(episode)}
+        its_own = episode == self._numbers[stroke]
+        return t_ns[its_own], values[its_own]
+
+    @cached_property
+    def _samples(self) -> dict[Series, tuple[NDArray[np.int64], Floats]]:
+        return {}
+
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        return {stroke.stroke_id: number for number, stroke in enumerate(self.recording.stroke_records())}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,15 +1,22 @@
 """Exports: what other tools read back is what was recorded, formulas are text, and a folder is whole or not there."""
 
+from __future__ import annotations
+
 import csv
 import io
 import json
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
+from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.export import export
 from brushloop.calibrate.waits import unlike, waits_of
 from brushloop.sessions.disk import as_cell, as_text, csv_text, number
@@ -18,7 +25,11 @@ from brushloop.sessions.events import CaptureResult, PressResult, StepKind
 from brushloop.sessions.imports import ImportOptions
 from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import Check, Quality, Topic, Wrench
+from brushloop.sessions.records import Check, Quality, Stroke, Topic, Wrench
+from tests.calibrate.simulated_rigs import sheet, true_mask
+
+if TYPE_CHECKING:
+    from conftest import Photographed
 
 
 @pytest.fixture
@@ -33,34 +44,15 @@ def few(make, tmp_path):
     return make.record(tmp_path / "a.mcap", make.still(0), make.stroke(0), make.still(1), make.stroke(1, **values))
 
 
-@pytest.fixture
-def felt(make, tmp_path):
-    """A recording of a judged press with two samples of force."""
-    store = make.store(tmp_path / "felt")
-    pushes = [
-        Outgoing(
-            Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fx_n=0.1, fy_n=0.0, fz_n=-float(n), mx_nm=0.0, my_nm=0.0, mz_nm=0.0)
-        )
-        for n in range(2)
-    ]
-    make.take(store, "a press", [*pushes, make.pose(0)], PressResult(press=make.press()), 0)
-    checks = (Check(name="dry", passed=False, reason="is dry"), Check(name="faint", passed=True))
-    judged = Outgoing(Topic.QUALITY, 30, 30, 0, Quality(stroke_id="H13-a05-r00", checks=checks))
-    taken = [make.still(0), judged, make.stroke(0)]
-    make.take(store, "a capture", taken, make.captured("H13-a05-r00", 0))
-    store.close()
-    store.release()
-    return store.folder
-
-
 def rows_of(table):
     with table.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def test_png_and_csv_hold_the_photographs_byte_for_byte(make, closed, to):
+def test_the_photographs_are_those_of_the_recording_byte_for_byte(make, closed, to):
     to.mkdir()  # an empty folder is used
-    export(closed, to, "csv")
+    ran = CliRunner().invoke(app, ["sessions", "export", str(closed), str(to)])
+    assert (ran.exit_code, ran.output) == (0, f"Exported into {to}\n")
     strokes = rows_of(to / "strokes.csv")
     assert [row["stroke_id"] for row in strokes] == ["H13-a05-r00", "H13-a05-r01"]
     assert [(to / row["file"]).read_bytes() for row in strokes] == [make.png(0), make.png(1)]
@@ -78,39 +70,31 @@ def test_the_poses_of_each_press_are_a_time_series_of_its_stroke(make, closed, t
     assert [float(poses[0][c]) for c in ("x_mm", "y_mm", "z_mm", "qw")] == [1.0, 2.0, 3.0, 1.0]
 
 
-def test_what_was_commanded_and_reached_are_columns_and_what_is_not_given_is_empty(few, tmp_path):
+def test_what_was_commanded_and_reached_are_columns_and_what_is_not_given_is_empty(few, to):
     columns = ("depth_mm", "reached_mm", "anchor_x_mm", "anchor_y_mm", "commanded_length_mm")
-    export(few, tmp_path / "csv", "csv")
-    assert [[row[c] for c in columns] for row in rows_of(tmp_path / "csv" / "strokes.csv")] == [
-        [""] * 5,
-        ["13.0", "12.9", "1.5", "2.5", "30.0"],
+    export(few, to, "csv")
+    rows = [[row[c] for c in columns] for row in rows_of(to / "strokes.csv")]
+    assert rows == [[""] * 5, ["13.0", "12.9", "1.5", "2.5", "30.0"]]
+
+
+def test_force_and_quality_are_exported_with_each_stroke(make, tmp_path, to):
+    store = make.store(tmp_path / "felt")
+    torque = {"mx_nm": 0.0, "my_nm": 0.0, "mz_nm": 0.0}
+    pushes = [
+        Outgoing(Topic.WRENCH, 10 + n, 10 + n, n, Wrench(fx_n=0.1, fy_n=0.0, fz_n=-float(n), **torque))
+        for n in range(2)
     ]
-    export(few, tmp_path / "npz", "npz")
-    with np.load(tmp_path / "npz" / "strokes.npz", allow_pickle=False) as arrays:
-        np.testing.assert_array_equal(
-            [arrays[c] for c in columns], [[np.nan, 13.0], [np.nan, 12.9], [np.nan, 1.5], [np.nan, 2.5], [np.nan, 30.0]]
-        )
-
-
-def test_force_and_quality_are_exported_with_each_stroke(felt, to):
-    export(felt, to, "csv")
+    make.take(store, "a press", [*pushes, make.pose(0)], PressResult(press=make.press()), 0)
+    checks = (Check(name="dry", passed=False, reason="is dry"), Check(name="faint", passed=True))
+    judged = Outgoing(Topic.QUALITY, 30, 30, 0, Quality(stroke_id="H13-a05-r00", checks=checks))
+    make.take(store, "a capture", [make.still(0), judged, make.stroke(0)], make.captured("H13-a05-r00", 0))
+    store.close()
+    store.release()
+    export(store.folder, to, "csv")
     forces = [(row["episode_index"], row["frame_index"], row["fz_n"]) for row in rows_of(to / "forces.csv")]
     assert forces == [("0", "0", "-0.0"), ("0", "1", "-1.0")]
     [stroke] = rows_of(to / "strokes.csv")
     assert (stroke["quality"], stroke["marked_bad"]) == ("failed: dry", "")
-
-
-def test_npz_loads_without_pickle(closed, felt, tmp_path):
-    export(closed, tmp_path / "closed", "npz")
-    with np.load(tmp_path / "closed" / "strokes.npz") as strokes:
-        assert strokes["stroke_id"].tolist() == ["H13-a05-r00", "H13-a05-r01"]
-    with np.load(tmp_path / "closed" / "poses.npz") as poses:
-        assert poses["x_mm"].tolist() == [1.0] * 10
-        assert poses["t_ns"].dtype == np.int64
-        assert poses["episode_index"].tolist() == [0] * 5 + [1] * 5
-    export(felt, tmp_path / "felt-out", "npz")
-    with np.load(tmp_path / "felt-out" / "forces.npz") as forces:
-        assert forces["fz_n"].tolist() == [0.0, -1.0]
 
 
 def test_parquet_has_the_same_columns(closed, tmp_path):
@@ -132,22 +116,19 @@ def test_without_pyarrow_the_error_names_the_remedy_and_nothing_is_left(closed, 
     assert list(to.parent.glob("*exported*")) == []
 
 
-@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
-def test_a_full_disk_leaves_nothing(few, tmp_path, to, kind, monkeypatch):
+def test_a_full_disk_leaves_nothing_and_a_folder_that_holds_anything_is_left_as_it_is(few, tmp_path, to, monkeypatch):
     def full(_):
         raise OSError(28, "No space left")
 
-    monkeypatch.setattr("brushloop.sessions.disk.fsync_folder", full)
-    with pytest.raises(SessionError, match="No space left"):
-        export(few, to, kind)
+    with monkeypatch.context() as patch:
+        patch.setattr("brushloop.sessions.disk.fsync_folder", full)
+        with pytest.raises(SessionError, match="No space left"):
+            export(few, to, "csv")
     assert list(tmp_path.glob("*exported*")) == []
-
-
-def test_a_folder_that_holds_anything_is_left_as_it_is(closed, to):
     to.mkdir()
     (to / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="not an empty folder"):
-        export(closed, to, "csv")
+        export(few, to, "csv")
     assert [path.name for path in to.iterdir()] == ["notes.txt"]
 
 
@@ -159,9 +140,60 @@ def test_names_that_a_file_system_would_refuse_become_names(make, tmp_path, to):
     assert names == ["0000-______etc_x.png", "0001-a_b.png", "0002-a_b.png", f"0003-{'_' * 80}.png"]
 
 
-def test_the_command(closed, to):
-    ran = CliRunner().invoke(app, ["sessions", "export", str(closed), str(to), "--format", "npz"])
-    assert (ran.exit_code, ran.output) == (0, f"Exported into {to}\n")
+# Crops
+
+
+def test_crops_and_masks_lie_over_the_true_marks(photographed: Photographed, tmp_path: Path, to: Path) -> None:
+    shot = sheet(0, 2)
+    strokes = [
+        Stroke(stroke_id=f"s{k}", kind="press", still=0, depth_mm=13.0, tilt_deg=5.0, anchor_mm=anchor)
+        for k, anchor in enumerate(shot.anchors_mm)
+    ]
+    session = photographed(tmp_path / "pressed", shot.board, [shot.image], [(one, shot.image) for one in strokes])
+    words = ["sessions", "export", str(session), str(to), "--crops"]
+    refused = CliRunner().invoke(app, words)
+    assert f"is not calibrated: run `brushloop calibrate {session}`" in str(refused.exception)
+    assert not to.exists()
+    calibrate_session(CalibrateRequest(session))
+    assert CliRunner().invoke(app, words).exit_code == 0
+    rows = rows_of(to / "strokes.csv")
+    assert [row["stroke_id"] for row in rows] == ["s0", "s1"]
+    for row, anchor in zip(rows, shot.anchors_mm, strict=True):
+        crop, mask = (cv2.imread(str(to / row[name]), cv2.IMREAD_GRAYSCALE) for name in ("file", "mask_file"))
+        assert crop.shape == mask.shape == (768, 768)
+        assert (float(row["px_per_mm_x"]), float(row["px_per_mm_y"])) == (20.0, 20.0)
+        left, top = (20.0 * v for v in Field().anchor_mm)
+        assert (float(row["anchor_x_px"]), float(row["anchor_y_px"])) == pytest.approx((left, top))
+        truth = true_mask(shot, Field().window_mm(anchor), 20.0)
+        assert ((mask > 0) & truth).sum() / ((mask > 0) | truth).sum() >= 0.9
+        assert crop[mask > 0].mean() < 0.5 * crop[mask == 0].mean()
+
+
+@pytest.mark.parametrize("inked", [True, False])
+def test_imports_are_rescaled_and_what_cannot_be_cropped_is_named(make, tmp_path, photos, run, to, inked):
+    """The second photograph, or both, are blank."""
+    image = np.full((300, 400), 225, np.uint8)
+    blank = cv2.imencode(".png", image)[1].tobytes()
+    cv2.ellipse(image, (200, 150), (60, 20), 0, 0, 360, 25, -1)
+    rows = [{"file": f"{k}.png", "px_per_mm": "10", "depth_mm": "13"} for k in range(2)]
+    make.photographs(photos, *rows)
+    (photos / "1.png").write_bytes(blank)
+    (photos / "0.png").write_bytes(cv2.imencode(".png", image)[1].tobytes() if inked else blank)
+    ran = CliRunner().invoke(app, ["sessions", "export", str(run(ImportOptions())), str(to), "--crops"])
+    if not inked:
+        assert "holds no stroke that can be cropped: 0 is blank" in str(ran.exception)
+        assert not to.exists()
+        return
+    assert ran.exit_code == 3
+    assert "left out: 1: is blank" in ran.output
+    [row] = rows_of(to / "strokes.csv")
+    assert row["mask_file"] == "masks/0000-0.png"
+    mask = cv2.imread(str(to / row["mask_file"]), cv2.IMREAD_GRAYSCALE)
+    assert mask.shape == (600, 800)
+    assert (mask > 0).sum() / 20.0**2 == pytest.approx(np.pi * 6 * 2, rel=0.05)
+
+
+# Waits from dip to touch
 
 
 def test_a_wait_belongs_to_the_take_that_the_photograph_shows(make, store):
@@ -186,14 +218,16 @@ def test_far_is_two_seconds_and_three_median_deviations(waits: list[float], far:
     assert list(unlike(dict(enumerate(waits)))) == far
 
 
-def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp_path):
+def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp_path, to):
     fields = [{"dip_to_touch_s": wait} for wait in (1.0, 1.1, 10.0, 1.2)] + [{}]
     messages = [message for n, one in enumerate(fields) for message in (make.still(n), make.stroke(n, **one))]
-    export(make.record(tmp_path / "a.mcap", *messages), tmp_path / "out", "csv")
-    with (tmp_path / "out" / "strokes.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    export(make.record(tmp_path / "a.mcap", *messages), to, "csv")
+    rows = rows_of(to / "strokes.csv")
     assert [row["dip_to_touch_s"] for row in rows] == ["1.0", "1.1", "10.0", "1.2", ""]
     assert [row["dip_to_touch_unlike"] for row in rows] == ["0.0", "0.0", "1.0", "0.0", ""]
+
+
+# Cells of a CSV file
 
 
 FORMULAS = ['=cmd|"/c calc"!A1', "+1+2", "-1+2", "@SUM(A1)", "\tx", "\r=1", "'=1", "''=1", "＝1"]
@@ -211,16 +245,14 @@ def test_numbers_stay_numbers_and_other_text_stays_itself(value):
     assert as_cell(value) == value
 
 
-def test_names_go_out_and_in_again_by_our_own_importer(make, tmp_path, photos, run):
+def test_names_go_out_and_in_again_by_our_own_importer(make, photos, run, to):
     names = ["=1+1", "@home", "-2-3", "-5", "'=x", "a"]
     rows = [{"file": f"{k}.png", "name": str(as_cell(name)), "px_per_mm": "5"} for k, name in enumerate(names)]
     make.photographs(photos, *rows)
     recorded = run(ImportOptions())
     assert [stroke.stroke_id for stroke in Recording(recorded).stroke_records()] == names
-
-    export(recorded, tmp_path / "exported", "csv")
-    with (tmp_path / "exported" / "strokes.csv").open(newline="", encoding="utf-8") as file:
-        cells = [row["stroke_id"] for row in csv.DictReader(file)]
+    export(recorded, to, "csv")
+    cells = [row["stroke_id"] for row in rows_of(to / "strokes.csv")]
     assert cells == ["'=1+1", "'@home", "'-2-3", "-5", "''=x", "a"]
     assert [as_text(cell) for cell in cells] == names
 
