@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import made_by, put_to_use
 from brushloop.calibrate.board.detect import BoardView, find_board
@@ -27,7 +26,6 @@ from brushloop.calibrate.calibration import FITTED, Calibration
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import (
     BLUE,
-    ORANGE,
     Point,
     about,
     dress,
@@ -155,10 +153,6 @@ def _write_page(
     recording: Recording, calibration: Calibration, path: Path, image: Gray, view: BoardView, moved: Sequence[str]
 ) -> Path:
     """Write the page of the calibration at `path`, which was measured on this photograph, beside it."""
-    expected = calibration.to_image(paper_mm(view, calibration.board))
-    off = view.pixels - expected
-    dropped = np.zeros(len(off), np.bool_)
-    dropped[np.argsort(-np.linalg.norm(off, axis=1))[: calibration.corners_dropped]] = True
     sheet_mm = rig_of(recording).sheet_mm
     sheet = None if sheet_mm is None else _outline(calibration, sheet_mm)
     frame = about(recording.header)
@@ -168,10 +162,9 @@ def _write_page(
         "calibration.html.j2",
         **frame,
         session=recording.header.session_id,
-        picture=_picture(image, view.pixels, expected, dropped, sheet),
+        picture=_picture(calibration, image, view, sheet),
         verdict=list(_verdict(calibration)),
         trust=[source_point(recording.header.source), *_trust(calibration, moved)],
-        residuals=_residuals(off[~dropped], frame["label"]),
         scale=_scale(calibration, image.shape[1], image.shape[0], sheet, frame["label"]),
         facts=[
             *recording_facts(recording.header, recording.path.name, recording.sha256, calibration),
@@ -183,15 +176,16 @@ def _write_page(
     )
 
 
-def _picture(
-    image: Gray, seen: Floats, expected: Floats, dropped: NDArray[np.bool_], sheet: Floats | None
-) -> dict[str, Any]:
+def _picture(calibration: Calibration, image: Gray, view: BoardView, sheet: Floats | None) -> dict[str, Any]:
     """What the template draws over the photograph, in its pixels."""
     height, width = image.shape
-    off = seen - expected
+    expected = calibration.to_image(paper_mm(view, calibration.board))
+    off = view.pixels - expected
+    dropped = np.zeros(len(off), np.bool_)
+    dropped[np.argsort(-np.linalg.norm(off, axis=1))[: calibration.corners_dropped]] = True
     times = _times(expected, off[~dropped])
     ends = expected + times * off
-    rows = zip(seen.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
+    rows = zip(view.pixels.round(1).tolist(), expected.round(1).tolist(), ends.round(1).tolist(), strict=True)
     corners = [
         {"at": at, "from": start, "to": end, "off_px": round(float(np.hypot(*residual)), 2), "dropped": bool(out)}
         for (at, start, end), residual, out in zip(rows, off, dropped, strict=True)
@@ -240,7 +234,7 @@ def _verdict(calibration: Calibration) -> Iterator[str]:
 
 def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
     flat = "a flat, sharp, still board gives 0.1 to 0.3 px"
-    residual = f"The residual is {calibration.rms_px:.2f} px; {flat}, and above {RMS_LIMIT_PX:g} px it warns."
+    residual = f"The residual is {calibration.rms_px:.2f} px, at most {RMS_LIMIT_PX:g} px are good; {flat}."
     yield Point(calibration.rms_px <= RMS_LIMIT_PX, residual)
     reach = _reach(calibration)
     yield Point(reach <= WORST_INTERVAL, f"Scale known to ±{100 * reach:.3f} %, goal ±{100 * WORST_INTERVAL:g} %.")
@@ -261,19 +255,6 @@ def _trust(calibration: Calibration, moved: Sequence[str]) -> Iterator[Point]:
 
 def _reach(calibration: Calibration) -> float:
     return (calibration.mm_per_px_high - calibration.mm_per_px_low) / (2.0 * calibration.mm_per_px)
-
-
-def _residuals(off: Floats, label: str) -> str:
-    """Every kept corner as a point, with circles of one and two times the root mean square."""
-    figure, axis = plot(1, 1, (4.6, 4.4))
-    turn = np.linspace(0.0, 2.0 * np.pi, 73)
-    for circle in (rms(off), 2.0 * rms(off)):
-        axis.plot(circle * np.cos(turn), circle * np.sin(turn), color="0.6", lw=0.8)
-    axis.plot(off[:, 0], off[:, 1], ".", ms=4, alpha=0.6, color=ORANGE)
-    axis.set_aspect("equal")
-    axis.invert_yaxis()
-    dress(axis, f"residual of each corner ({label})", "to the right, px", "down, px")
-    return plot_uri(figure)
 
 
 def _scale(calibration: Calibration, width: int, height: int, sheet: Floats | None, label: str) -> str:

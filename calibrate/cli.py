@@ -46,7 +46,6 @@ def fit(
         float | None,
         typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
     ] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     drags: Annotated[
         bool, typer.Option("--drags", help="Fit bristle lag to drags; writes dragfit/<hash>.json.")
     ] = False,
@@ -61,15 +60,13 @@ def fit(
     if (prior is not None and not drags) or (strokes is not None and prior is None):
         raise typer.BadParameter("--prior needs --drags, and --strokes needs --prior")
     if drags:
-        if calibration is not None:
-            raise typer.BadParameter("--calibration is for presses, not for --drags")
         _fit_drags(session, mm_per_px, prior, strokes)
         return
 
     from brushloop.calibrate.fit.brush import FitRequest, fit_presses
     from brushloop.sessions.terminal import shown
 
-    request = FitRequest(session, mm_per_px or MM_PER_PX, calibration)
+    request = FitRequest(session, mm_per_px or MM_PER_PX)
     with shown() as progress:
         fitted = fit_presses(request, progress)
     say(*fitted.lines())
@@ -97,15 +94,12 @@ def _fit_drags(session: Path, mm_per_px: float | None, prior: Path | None, strok
 def export(
     session: Annotated[Path, typer.Argument(help="A closed session's folder, or an .mcap file.")],
     out: Annotated[Path, typer.Argument(help="The new folder.")],
-    kind: Annotated[str, typer.Option("--format", help="How tables are written: csv, npz or parquet.")] = "csv",
+    kind: Annotated[str, typer.Option("--format", help="How tables are written: csv or parquet.")] = "csv",
     crops: Annotated[
         bool, typer.Option("--crops", help="Rectified crops at 20 px/mm with masks, instead of photographs.")
     ] = False,
-    calibration: Annotated[
-        Path | None, typer.Option(help="With --crops: the calibration; the one in use by default.")
-    ] = None,
 ) -> None:
-    """Export strokes, poses and forces: pictures as files, and tables as CSV, NumPy arrays or Parquet.
+    """Export strokes, poses and forces: pictures as files, and tables as CSV or Parquet.
 
     Ends with exit code 3 if strokes could not be cropped; they are named.
     """
@@ -113,7 +107,7 @@ def export(
     from brushloop.sessions.terminal import shown
 
     with shown() as progress:
-        left_out = write(session, out, kind, progress, crops=crops, calibration=calibration)
+        left_out = write(session, out, kind, progress, crops=crops)
     say(f"Exported into {out}")
     for stroke_id, reason in left_out:
         say(f"left out: {stroke_id}: {reason}", err=True)
@@ -127,7 +121,6 @@ def invert(
         "recovered.csv"
     ),
     fit: Annotated[Path | None, typer.Option(help="A brush fitted to captures; else CCD-BSM as published.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
 ) -> None:
     """Recover depth and tilt of every captured press; writes a CSV and a protocol that presses them again."""
     from brushloop.calibrate.files import check_target
@@ -139,7 +132,7 @@ def invert(
     from brushloop.calibrate.invert import RecoverRequest, recover
     from brushloop.sessions.terminal import show_work
 
-    show_work(recover, RecoverRequest(session, out, fit=fit, calibration=calibration))
+    show_work(recover, RecoverRequest(session, out, fit=fit))
 
 
 def compare_loop(
@@ -195,7 +188,6 @@ def intrinsics(
     square_mm: Square = 12.0,
     marker_mm: Marker = 0.0,
     dictionary: Dictionary = "DICT_5X5_1000",
-    limit_px: Annotated[float, typer.Option(min=0.01, max=10.0, help="Residual above which it warns.")] = 0.5,
     out: Annotated[Path, typer.Option(help="Folder for the lens file.")] = Path("camera"),
 ) -> None:
     """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
@@ -218,7 +210,7 @@ def intrinsics(
                 seen.append(find_board(image, board, str(path)))
             except CalibrationError as error:
                 unusable[str(path)] = error.what
-    lens = fit_lens(seen, describe(board), digests, unusable, limit_px)
+    lens = fit_lens(seen, describe(board), digests, unusable)
     say(*lens.lines(), str(lens.save(out)))
 
 

@@ -110,25 +110,22 @@ def export(
     progress: Progress = unseen,
     *,
     crops: bool = False,
-    calibration: Path | None = None,
 ) -> list[Refused]:
     """Export a session into the new or empty folder `out`, with tables as `csv` or `parquet`.
 
-    With `crops`, every photograph is replaced by a crop and its mask, by this calibration or the one in use; returns
-    the strokes that could not be cropped. Raises `InputError` for an unknown format, a folder that is not empty, or a
+    With `crops`, every photograph is replaced by a crop and its mask, by the calibration in use; returns the
+    strokes that could not be cropped. Raises `InputError` for an unknown format, a folder that is not empty, or a
     session of which no stroke can be cropped, `SessionDamaged` for a recording that cannot be read; nothing is left
     behind then.
     """
     if kind not in FORMATS:
         raise InputError("--format", f"{kind!r}, allowed: {', '.join(FORMATS)}")
-    if calibration is not None and not crops:
-        raise InputError("--calibration", "needs --crops")
     recording = Recording(source)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(out, "exists and is not an empty folder; nothing is ever overwritten")
     if recording.counts[Topic.STROKE] == 0:
         raise InputError(recording.path, "holds no strokes to export")
-    crop = _cropper(recording, calibration) if crops else None
+    crop = _cropper(recording) if crops else None
     left_out: list[Refused] = []
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -152,8 +149,8 @@ def export(
     return left_out
 
 
-def _cropper(recording: Recording, path: Path | None) -> Callable[[Capture], Cropped]:
-    """Make what crops a recording's captures, by the calibration given, else by the one in use.
+def _cropper(recording: Recording) -> Callable[[Capture], Cropped]:
+    """Make what crops a recording's captures, by the calibration in use.
 
     Raises `CalibrationError` where a session was not calibrated; an import needs no calibration.
     """
@@ -162,7 +159,7 @@ def _cropper(recording: Recording, path: Path | None) -> Callable[[Capture], Cro
     from brushloop.calibrate.session import calibration_of
     from brushloop.calibrate.stroke.params import PX_PER_MM
 
-    calibration = calibration_of(recording, next(recording.stroke_records()), recording.sha256, path)
+    calibration = calibration_of(recording, next(recording.stroke_records()))
 
     def cropped(capture: Capture) -> Cropped:
         raster, ink, prepared = crop(capture, calibration)

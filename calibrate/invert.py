@@ -69,8 +69,6 @@ class RecoverRequest:
     """A brush fitted to captures, instead of CCD-BSM as published."""
     depth_range_mm: tuple[float, float] = (2.0, 30.0)
     tilt_range_deg: tuple[float, float] = (0.0, 30.0)
-    calibration: Path | None = None
-    """Artefact; None is the one in use."""
     presses: int | None = None
     """Only this many, spread evenly over the session."""
     repeats: int = 1
@@ -171,7 +169,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     out = request.out
     if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
         raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
-    session = open_session(request.session, request.calibration, "press")
+    session = open_session(request.session, "press")
     inverter, fitted = _inverter(request, session)
     count, refused = len(session.strokes), list[Refused]()
     most = min(count, request.presses or count)

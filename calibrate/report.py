@@ -302,11 +302,6 @@ class Sealed(Frozen):
         """A copy with its digest."""
         return self.model_copy(update={"digest": _digest(self.model_dump(mode="json"))})
 
-    @property
-    def intact(self) -> bool:
-        """Whether the digest is that of the contents."""
-        return self.digest == _digest(self.model_dump(mode="json"))
-
     def to_json(self) -> str:
         """The text that is written to disk."""
         return json.dumps(self.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n"
@@ -317,18 +312,13 @@ S = TypeVar("S", bound=Sealed)
 
 def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
     """Read a JSON report. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
-    data = read_bounded(path, most_bytes)
-    fields: dict[str, Any] = {}
-    digest = ""
     try:
-        parsed: Any = json.loads(data)
-        if isinstance(parsed, dict):
-            fields = cast("dict[str, Any]", parsed)
-            # Digest of the file, not of the model: a field that was added to the model later is not an edit.
-            digest = _digest(fields)
-    except (ValueError, RecursionError):  # no JSON, or text that is no Unicode: reported below
-        fields = {}
-    if "format" not in fields or "digest" not in fields:
+        fields: Any = json.loads(read_bounded(path, most_bytes))
+        # Digest of the file, not of the model: a field that was added to the model later is not an edit.
+        digest = _digest(fields) if isinstance(fields, dict) and {"format", "digest"} <= fields.keys() else ""
+    except (ValueError, RecursionError):  # no JSON, or text that is no Unicode
+        fields, digest = {}, ""
+    if not digest:
         raise CalibrationError(str(path), f"is not a report with a digest: write it with `{kind.MADE_BY}`")
     if fields["format"] != kind.FORMAT:
         raise CalibrationError(str(path), f"format is {str(fields['format'])[:40]!r}, expected {kind.FORMAT!r}")

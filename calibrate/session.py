@@ -46,8 +46,8 @@ class OpenSession:
         return "" if self.calibration is None else self.calibration.digest
 
 
-def open_session(path: Path, calibration: Path | None = None, kind: Kind | None = None) -> OpenSession:
-    """Open a session by its folder or MCAP file, with the calibration given, else the one in use.
+def open_session(path: Path, kind: Kind | None = None) -> OpenSession:
+    """Open a session by its folder or MCAP file, with the calibration in use.
 
     Raises `InputError`, and `CalibrationError` for a session without strokes or with some of another kind, and as
     `calibration_of` does.
@@ -58,24 +58,24 @@ def open_session(path: Path, calibration: Path | None = None, kind: Kind | None 
         raise CalibrationError(str(recording.path), "holds no strokes")
     if kind is not None and any(stroke.kind != kind for stroke in strokes):
         raise CalibrationError(str(recording.path), OTHER_KIND[kind])
-    used = calibration_of(recording, strokes[0], sha256, calibration)
+    used = calibration_of(recording, strokes[0])
     return OpenSession(recording, sha256, strokes, used, Store(recording.path.parent / FINISHED))
 
 
-def calibration_of(recording: Recording, first: Stroke, digest: str, given: Path | None) -> Calibration | None:
-    """The artefact given, or the one that the session uses; None for an import, which brings its own scale.
+def calibration_of(recording: Recording, first: Stroke) -> Calibration | None:
+    """The calibration that a session uses; None for an import, which brings its own scale.
 
     Raises `CalibrationError` where there is none, or it belongs to another recording.
     """
     if first.px_per_mm is not None:
         return None
-    path = given or current(recording.path.parent)
+    path = current(recording.path.parent)
     if path is None:
         raise CalibrationError(
             str(recording.path), f"is not calibrated: run `brushloop calibrate {recording.path.parent}`"
         )
     calibration = load_artefact(path, Calibration)
-    if calibration.recording_sha256 != digest:
+    if calibration.recording_sha256 != recording.sha256:
         problem = f"belongs to another recording ({calibration.session_id}): `brushloop calibrate` makes its own"
         raise CalibrationError(str(path), problem)
     return calibration

@@ -84,7 +84,7 @@ COMMANDS = [
     "sessions import photos --csv photos/table.csv --out imported",
     "sessions verify profile",
     "sessions repair profile",
-    "sessions export profile out --format npz",
+    "sessions export profile out --crops",
     "validate profile --no-held-out",
     "validate closed",
     "validate diff fit.json fit.json",

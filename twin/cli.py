@@ -13,7 +13,6 @@ from brushloop.sessions.terminal import say
 def twin(
     session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
     out: Annotated[Path | None, typer.Option(help="File to write; twin.toml in the session's folder.")] = None,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Fit the simulator's brush, ink and camera noise to a session's presses; writes twin.toml.
@@ -39,7 +38,7 @@ def twin(
     if target.exists() and not replace:
         raise CalibrationError(str(target), "exists: give --out FILE or --replace")
     with shown() as progress:
-        captures = read_presses(session, Field(), calibration, progress)
+        captures = read_presses(session, Field(), progress)
         header, store = captures.session.header, captures.session.store
         brush = captures.radius_mm, captures.length_mm
         with workers() as pool:

@@ -95,13 +95,12 @@ class LensFile(Artefact):
     """What else to photograph; empty where the coverage is good."""
     warnings: tuple[str, ...]
     """What a pre-flight check must show."""
-    schema_version: Literal[3] = 3
+    schema_version: Literal[4] = 4
     software: str
     photographs: dict[str, str]
     """Name of every photograph that was given, and the sha256 of its bytes."""
     board: str
     """Description: kind, size in squares or corners, mm."""
-    rms_limit_px: float
 
     @property
     def focal_reach_px(self) -> tuple[float, float] | None:
@@ -142,7 +141,6 @@ def fit_lens(
     board: str,
     photographs: Mapping[str, str],
     unusable: Mapping[str, str],
-    rms_limit_px: float = RMS_LIMIT_PX,
 ) -> LensFile:
     """Fit a lens by Zhang's method to the views that fit together; `unusable` says why other photographs have no view.
 
@@ -151,6 +149,7 @@ def fit_lens(
     """
     seen, left_out = distinct_views(views)
     left_out = {**unusable, **left_out}
+    useless = [f"{name}: {why}" for name, why in left_out.items()]
     where = f"{len(views) + len(unusable)} photographs"
     _one_size(seen, where)
     kept, dropped = list(seen), dict[str, float]()
@@ -158,7 +157,7 @@ def fit_lens(
         if len(kept) < LEAST_VIEWS:
             out = f", dropped: {', '.join(sorted(dropped))}" if dropped else ""
             problem = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
-            raise CalibrationError(where, "; ".join([problem, *reasons(left_out)]))
+            raise CalibrationError(where, "; ".join([problem, *useless]))
         solved = solve(kept, where)
         residuals = solved.residuals_px
         worst = int(np.argmax(residuals))
@@ -172,11 +171,11 @@ def fit_lens(
     fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
     if fewest < LEAST_VIEWS:
         problem = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
-        raise CalibrationError(where, "; ".join([f"{problem}: slant it to other sides", *reasons(left_out)]))
+        raise CalibrationError(where, "; ".join([f"{problem}: slant it to other sides", *useless]))
     slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(solved.normals[:, 2])), strict=True)}
     warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
-    if solved.rms_px > rms_limit_px:
-        exceeds = f"residual {solved.rms_px:.2f} px exceeds {rms_limit_px:g} px"
+    if solved.rms_px > RMS_LIMIT_PX:
+        exceeds = f"residual {solved.rms_px:.2f} px exceeds {RMS_LIMIT_PX:g} px"
         warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
     return LensFile(
         lens=solved.lens,
@@ -192,7 +191,6 @@ def fit_lens(
         software=made_by(),
         photographs=dict(photographs),
         board=board,
-        rms_limit_px=rms_limit_px,
     )
 
 
@@ -279,14 +277,6 @@ def nominal_normals(views: Sequence[BoardView]) -> Floats:
         normal = np.cross(across, along)
         normals.append(normal / (np.linalg.norm(normal) * (-1.0 if normal[2] < 0.0 else 1.0)))
     return np.array(normals)
-
-
-def reasons(why: Mapping[str, str]) -> list[str]:
-    """Each problem once, with the photographs that have it."""
-    names: dict[str, list[str]] = {}
-    for name, problem in why.items():
-        names.setdefault(problem, []).append(name)
-    return [f"{', '.join(those)}: {problem}" for problem, those in names.items()]
 
 
 def _same(one: BoardView, other: BoardView) -> bool:

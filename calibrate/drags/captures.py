@@ -167,7 +167,7 @@ class Drags:
 
 def read_drags(session: Path, mm_per_px: float = MM_PER_PX, progress: Progress = unseen) -> Drags:
     """Read and measure every drag. Raises `CalibrationError` for presses, and for figures that the arm wrote."""
-    opened = open_session(session, None, "drag")
+    opened = open_session(session, "drag")
     recording = opened.recording
     if opened.calibration is not None:
         what = "holds figures that the arm wrote: `write fit` fits their brush, `write compare` compares them"

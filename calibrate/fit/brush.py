@@ -71,8 +71,6 @@ class FitRequest:
     session: Path
     mm_per_px: float = MM_PER_PX
     """Scale of the images."""
-    calibration: Path | None = None
-    """Artefact; None is the one in use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +137,7 @@ class FitResult:
 def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
     """Fit the brush to the presses of a session, put the fit to use and write its page. Raises `CalibrationError`."""
     view = Field(mm_per_px=request.mm_per_px)
-    captures = read_presses(request.session, view, request.calibration, progress)
+    captures = read_presses(request.session, view, progress)
     fitted = fit_session(captures, view, progress)
     path = put_to_use(fitted.fit, Recording(request.session).path.parent, FOLDER)
     page = write_fit_page(captures, fitted.fit.press(), fitted.sizes, fitted.held_out, path)

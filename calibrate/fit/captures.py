@@ -87,11 +87,9 @@ def grid_of(view: Field) -> Grid:
     return Grid(np.asarray(centres - left), np.asarray(top - centres))
 
 
-def read_presses(
-    session: Path, view: Field, calibration_path: Path | None = None, progress: Progress = unseen
-) -> Captures:
+def read_presses(session: Path, view: Field, progress: Progress = unseen) -> Captures:
     """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
-    opened = open_session(session, calibration_path, "press")
+    opened = open_session(session, "press")
     strokes: list[Pressed] = []
     refused: list[Refused] = []
     for press in presses.read_presses(opened, view, refused, uncommanded, cut, progress=progress):

@@ -23,7 +23,6 @@ def validate(
     model: Annotated[list[str] | None, typer.Option(help="Only these models; all by default.")] = None,
     generator: Annotated[list[Path] | None, typer.Option(help="A trained generator.safetensors.")] = None,
     mm_per_px: Annotated[float, typer.Option(min=0.1, max=1.0, help="Scale of the 128 x 128 mm field.")] = MM_PER_PX,
-    calibration: Annotated[Path | None, typer.Option(help="Artefact; the one in use by default.")] = None,
     fit: Annotated[Path | None, typer.Option(help="Brush fit, the one in use by default; of drags, a dragfit.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report; <session>/validation by default.")] = None,
     gate: Annotated[
@@ -51,7 +50,6 @@ def validate(
         command=" ".join(["brushloop", *sys.argv[1:]]),
         models=tuple(model or ()),
         view=Field(mm_per_px=mm_per_px),
-        calibration=calibration,
         fit=fit,
         generators=tuple(generator or ()),
         curves=tuple(curves or ()),

@@ -98,7 +98,7 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     curves = [read_curve(text) for text in request.curves]
     folder = _folder(request)
     check_writable(folder)
-    sessions = [open_session(place, request.calibration, request.fit) for place in request.places]
+    sessions = [open_session(place, request.fit) for place in request.places]
     one_source(sessions)
     kinds = {session.strokes[0].kind for session in sessions}
     if len(kinds) > 1:
@@ -126,9 +126,9 @@ def check(output: ValidationOutput, request: Request) -> None:
         tables.check_gates(output.report, request.gates)
 
 
-def open_session(place: str, calibration: Path | None = None, fit: Path | None = None) -> FittedSession:
+def open_session(place: str, fit: Path | None = None) -> FittedSession:
     """Open a session by path or URL. Raises `CalibrationError`, `InputError` or `SessionDamaged`, each naming it."""
-    session = open_recording(local_path(place), calibration)
+    session = open_recording(local_path(place))
     path = session.recording.path
     closed = replay(path.parent / JOURNAL_NAME).closed if (path.parent / JOURNAL_NAME).is_file() else None
     if closed is not None and closed.sha256 != session.sha256:

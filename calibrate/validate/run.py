@@ -63,7 +63,6 @@ class Request:
     models: tuple[str, ...] = ()
     """Names; all if empty."""
     view: Field = field(default_factory=Field)
-    calibration: Path | None = None
     fit: Path | None = None
     generators: tuple[Path, ...] = ()
     curves: tuple[str, ...] = ()

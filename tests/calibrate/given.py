@@ -48,7 +48,6 @@ def kept_lens(
         focal_se_px=(1.0, 1.0),
         ways=6,
         rms_px=0.2,
-        rms_limit_px=0.5,
         residuals_px={"0.png": 0.2},
         dropped={},
         unusable={},
