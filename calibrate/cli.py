@@ -173,7 +173,7 @@ def print_board(
     dictionary: Dictionary = "DICT_5X5_1000",
     page: Annotated[str, typer.Option(help="a4, a3, a2 or letter.")] = "a4",
 ) -> None:
-    """Write a printable board as a PDF at true scale, with a ruler to check the print."""
+    """Write a printable board as a PDF at true scale."""
     from brushloop.calibrate.board.spec import describe, write_pdf
 
     board = _board(checkerboard, charuco, square_mm, marker_mm, dictionary)

@@ -38,13 +38,6 @@ ORIGIN = {
     Source.IMPORT_SIMULATED: "simulated ink, as declared when it was imported; not a result on paper",
 }
 """Where the ink comes from."""
-MEANING = {
-    Source.LOOPBACK: "Loopback rig: the numbers test the software and the method. They say nothing about ink on paper.",
-    Source.REAL: "Real capture: the recording says so itself, and its hash is below.",
-    Source.IMPORT: "Imported photographs: scale and commands come from their table, not measured.",
-    Source.IMPORT_SIMULATED: "Imported simulation: the numbers say nothing about ink on paper.",
-}
-"""What that says about the numbers."""
 REMARK = re.compile(r"\(([^()]+)\)(?:, R = [^()]*)?$")
 """Finds the remark in brackets that ends the name of a described brush; the brush's size may follow it."""
 
@@ -132,8 +125,9 @@ class Point:
 
 
 def source_point(source: Source) -> Point:
-    """What the source of a recording says about its numbers."""
-    return Point(True if source is Source.REAL else None, MEANING[source])
+    """Where the ink comes from, as a thing to know."""
+    origin = ORIGIN[source]
+    return Point(True if source is Source.REAL else None, f"{origin[0].upper()}{origin[1:]}.")
 
 
 def brush_and_size(header: Header) -> str:

@@ -19,9 +19,7 @@ Place = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 
 MM_PER_INCH = 25.4
 PAGES_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "letter": (215.9, 279.4)}
-MARGIN_MM = 8.0
-RULER_MM = 100.0
-RULER_ROOM_MM = 14.0
+MARGIN_MM, TEXT_ROOM_MM = 8.0, 8.0
 Rectangle = tuple[float, float, float, float]
 """x, y, width, height in mm, y down from the page's upper edge."""
 
@@ -123,16 +121,16 @@ def _page(board: Board, page: str) -> tuple[float, float]:
     width, height = size_mm(board)
     upright = PAGES_MM[page]
     for page_mm in (upright, (upright[1], upright[0])):
-        if width + 2 * MARGIN_MM <= page_mm[0] and height + 2 * MARGIN_MM + RULER_ROOM_MM <= page_mm[1]:
+        if width + 2 * MARGIN_MM <= page_mm[0] and height + 2 * MARGIN_MM + TEXT_ROOM_MM <= page_mm[1]:
             return page_mm
     raise CalibrationError(
         f"page {page}",
-        f"has no room for a board of {width:g} x {height:g} mm with {MARGIN_MM:g} mm around it and a ruler below",
+        f"has no room for a board of {width:g} x {height:g} mm with {MARGIN_MM:g} mm around it and its name below",
     )
 
 
 def drawn(board: Board, page: str) -> Any:
-    """The page with board and ruler, a matplotlib figure. Raises `CalibrationError` if the board does not fit."""
+    """The page with the board and its name below, a matplotlib figure. Raises `CalibrationError` if it does not fit."""
     from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle as Patch
@@ -140,14 +138,8 @@ def drawn(board: Board, page: str) -> Any:
 
     page_mm = _page(board, page)
     width, height = size_mm(board)
-    left, top = (page_mm[0] - width) / 2.0, (page_mm[1] - height - RULER_ROOM_MM) / 2.0
+    left, top = (page_mm[0] - width) / 2.0, (page_mm[1] - height - TEXT_ROOM_MM) / 2.0
     black = [(left + x, top + y, w, h) for x, y, w, h in rectangles(board)]
-    below = top + height + 5.0
-    ruler_mm = min(RULER_MM, width // 10.0 * 10.0)
-    black.append((left, below, ruler_mm, 0.2))
-    black += [
-        (left + at - 0.1, below, 0.2, 3.0 if at % 50 == 0 else 2.0) for at in np.arange(0.0, ruler_mm + 1.0, 10.0)
-    ]
     figure: Any = Figure(figsize=(page_mm[0] / MM_PER_INCH, page_mm[1] / MM_PER_INCH))
     # From mm with y down to inches with y up.
     from_mm = Affine2D().translate(0.0, -page_mm[1]).scale(1.0 / MM_PER_INCH, -1.0 / MM_PER_INCH)
@@ -155,8 +147,8 @@ def drawn(board: Board, page: str) -> Any:
     figure.add_artist(
         PatchCollection(patches, color="black", linewidth=0.0, transform=from_mm + figure.dpi_scale_trans)
     )
-    words = f"{describe(board)}. Print at 100 %; the line is {ruler_mm:g} mm long."
-    figure.text(left / page_mm[0], 1.0 - (below + 6.5) / page_mm[1], words, fontsize=7.0)
+    words = f"{describe(board)}. Print at 100 %: the board is {width:g} x {height:g} mm."
+    figure.text(left / page_mm[0], 1.0 - (top + height + 6.0) / page_mm[1], words, fontsize=7.0)
     return figure
 
 

@@ -103,7 +103,7 @@ def test_a_printed_board_is_seen_whole_and_at_true_scale(board: Board) -> None:
     assert np.polyfit(view.board_mm[:, 0], view.pixels[:, 0], 1)[0] == pytest.approx(PX_PER_MM, rel=1e-4)
     [words] = drawn(board, "a4").texts
     assert "of 20 mm" in words.get_text()
-    assert "the line is 100 mm long" in words.get_text()
+    assert "Print at 100 %: the board is" in words.get_text()
 
 
 def test_a_page_is_a4_holds_its_board_and_overwrites_nothing_but_a_pdf(tmp_path: Path) -> None:
