@@ -306,13 +306,15 @@ S = TypeVar("S", bound=Sealed)
 
 def load_sealed(path: Path, kind: type[S], most_bytes: int) -> S:
     """Read a JSON report. Raises `CalibrationError`, naming the file, if it is not one, is too new or was edited."""
+    fields: dict[str, Any] = {}
     try:
-        fields: Any = json.loads(read_bounded(path, most_bytes))
+        parsed: Any = json.loads(read_bounded(path, most_bytes))
+        fields = cast("dict[str, Any]", parsed) if isinstance(parsed, dict) else {}
         # Digest of the file, not of the model: a field that was added to the model later is not an edit.
-        digest = _digest(fields) if isinstance(fields, dict) and {"format", "digest"} <= fields.keys() else ""
+        digest = _digest(fields)
     except (ValueError, RecursionError):  # no JSON, or text that is no Unicode
-        fields, digest = {}, ""
-    if not digest:
+        digest = ""
+    if not digest or not {"format", "digest"} <= fields.keys():
         raise CalibrationError(str(path), f"is not a report with a digest: write it with `{kind.MADE_BY}`")
     if fields["format"] != kind.FORMAT:
         raise CalibrationError(str(path), f"format is {str(fields['format'])[:40]!r}, expected {kind.FORMAT!r}")
