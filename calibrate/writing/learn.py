@@ -133,7 +133,7 @@ def fit(session: Path, progress: Progress = unseen) -> Written:
 
     Raises `CalibrationError` if the session is an import, or holds too few strokes.
     """
-    opened = open_session(session, None, "drag")
+    opened = open_session(session, "drag")
     header = opened.header
     if opened.calibration is None:
         raise CalibrationError(str(session), "is an import: a footprint is fitted to figures that the arm wrote")
