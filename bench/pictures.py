@@ -32,8 +32,7 @@ from brushloop.collect.errors import CollectAborted
 from brushloop.collect.start import engine_for
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Question, Target
-from brushloop.collect.teach.watch import watched
-from brushloop.collect.teach.wizard import Wizard
+from brushloop.collect.teach.wizard import Wizard, watched
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.collect.tui.capture_screen import CaptureScreen

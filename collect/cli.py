@@ -189,7 +189,7 @@ def _first_report(config: Path, report: Path) -> bool:
     """Write the archive from what was taught so far, where there is no rig.toml yet; False if nothing was."""
     import asyncio
 
-    from brushloop.collect.teach.find_arm import write_first_report
+    from brushloop.collect.teach.arm import write_first_report
     from brushloop.collect.teach.store import TaughtFile
 
     taught = TaughtFile(config)

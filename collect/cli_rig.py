@@ -21,7 +21,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 RigFile = Annotated[Path, typer.Argument(help="The rig: addresses, frames, limits.")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")]
 
 
 Arm = Annotated[bool, typer.Option("--arm", help="Let the arm move where a step needs it; a key confirms each time.")]
@@ -60,8 +59,7 @@ def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
 
     async def watched_day(guide: ScreenGuide) -> Path | None:
         from brushloop.collect.teach.day import Day
-        from brushloop.collect.teach.watch import watched
-        from brushloop.collect.teach.wizard import Wizard
+        from brushloop.collect.teach.wizard import Wizard, watched
 
         day = Day(guide, rig, HostClock(), armed=arm)
         async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
@@ -76,24 +74,23 @@ def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
 def show(
     rig: RigFile,
     picture: Annotated[Path | None, typer.Option(help="Draw it from above: .png, .svg, .pdf or .jpg.")] = None,
-    as_json: Json = False,
 ) -> None:
     """Show a rig: its box of limits and every place that the tip goes to. Asks no device."""
-    import json
-
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.show import check_picture, draw_rig, rig_json, rig_table
+    from brushloop.collect.rig.show import check_picture, draw_rig, rig_table
 
     if picture is not None:
         check_picture(picture)
     config = load_rig(rig)
     if picture is not None:
         draw_rig(config, picture)
-    say(json.dumps(rig_json(config)) if as_json else rig_table(config))
+    say(rig_table(config))
 
 
 @app.command()
-def check(rig: RigFile, as_json: Json = False) -> None:
+def check(
+    rig: RigFile, as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead of text.")] = False
+) -> None:
     """Report which values of a rig.toml are plausible, contradict each other, or were not measured. Asks no device.
 
     Ends with code 5 if values contradict each other.

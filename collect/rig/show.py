@@ -1,4 +1,4 @@
-"""Where the tip goes, in the base frame: as a table, as JSON, and as a picture from above, which plans use too."""
+"""Where the tip goes, in the base frame: as a table, and as a picture from above, which plans use too."""
 
 from __future__ import annotations
 
@@ -71,29 +71,17 @@ def places_of(config: RigConfig) -> tuple[Place, ...]:
     return tuple(places)
 
 
-def rig_json(config: RigConfig) -> dict[str, Any]:
-    """The box, the cone and the places in the frames of the base and of the paper, in mm and deg."""
-    limits, paper = limits_of(config), config.paper
-    return {
-        "name": config.name,
-        "limits": {"x_mm": limits.x_mm, "y_mm": limits.y_mm, "z_mm": limits.z_mm, "tilt_deg": limits.tilt_deg},
-        "places": [
-            {"name": place.name, "at_mm": place.at_mm, "paper_mm": to_paper(paper, *place.at_mm[:2])}
-            for place in places_of(config)
-        ],
-    }
-
-
 def rig_table(config: RigConfig) -> Table:
-    """The same as a table: a place a row, and the lowest and highest corner of the box."""
-    shown = rig_json(config)
+    """A place a row, in the frames of the base and of the paper, in mm; then two corners of the box of limits."""
+    limits = limits_of(config)
     table = Table("place", "base x", "y", "z", "paper x", "y", title=f"{config.name}: mm")
     for column in table.columns[1:]:
         column.justify = "right"
-    for place in shown["places"]:
-        table.add_row(place["name"], *(f"{v:.1f}" for v in (*place["at_mm"], *place["paper_mm"])))
-    for number, end in enumerate(("lowest", "highest")):
-        table.add_row(f"box, {end}", *(f"{shown['limits'][f'{axis}_mm'][number]:.1f}" for axis in "xyz"))
+    for place in places_of(config):
+        paper_mm = to_paper(config.paper, *place.at_mm[:2])
+        table.add_row(place.name, *(f"{v:.1f}" for v in (*place.at_mm, *paper_mm)))
+    for end, *corner in zip(("lowest", "highest"), limits.x_mm, limits.y_mm, limits.z_mm, strict=True):
+        table.add_row(f"box, {end}", *(f"{v:.1f}" for v in corner))
     return table
 
 

@@ -1,12 +1,25 @@
-"""Step 6: the brush by calipers, and what keeps the well filled."""
+"""Steps 6 and 7: the brush by calipers, what keeps the well filled, and the force sensor, by a push."""
 
 from __future__ import annotations
+
+import asyncio
+import math
+import statistics
+
+import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
+from brushloop.collect.rig.config_devices import ForceConfig
+from brushloop.collect.rig.devices import make_force
 from brushloop.collect.teach.day import Asked, Day, Step
-from brushloop.collect.teach.store import Notebook
+from brushloop.collect.teach.guide import Question, Target
+from brushloop.collect.teach.sheet_fit import corners_of
+from brushloop.collect.teach.store import Notebook, Taught, taught
+from brushloop.drivers.devices import ForceSample
+from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
 from brushloop.drivers.ink.port import InkTable
 from brushloop.drivers.ink.pump import ModbusPumpConfig
 from brushloop.drivers.ink.station import InkStationConfig
@@ -116,3 +129,172 @@ class BrushStep(Step):
         """R, L and the deepest press."""
         radius, length, deepest = (notebook.number(f"brush.{name}_mm") for name in ("radius", "length", "max_depth"))
         return f"R {radius:g}, L {length:g}, deepest press {deepest:g} mm"
+
+
+BUS = Asked("aside.bus", "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor")
+CHANNEL = "can0"
+"""Channel of a gateway, unless one was typed."""
+REST_S = 1.0
+"""How long the sensor is listened to with nothing touching."""
+WAIT_S = 8.0
+"""How long a push is waited for after the person has said that it was done."""
+LEAST_PUSH_N, MOST_PUSH_N = 0.3, 60.0
+"""A finger pushes with more than the first and less than the second: otherwise the scale is wrong."""
+MOST_NOISE_N = 0.05
+STRAIGHT = 0.8
+"""Least share of the push along the sensor's z."""
+LEAN_ROOM_DEG = 0.3
+"""Room for another sheet on the same table."""
+LOOPBACK_STALE_MS = 1000.0
+INSET_MM = 6.0
+"""Distance of the touch points from the sheet's edges: in its margin, where they cost no cell."""
+
+
+class ForceStep(Step):
+    """Where the sensor is, which way it points, and how zero touch is done."""
+
+    name = "force"
+    title = "Force sensor"
+    minutes = 3
+    needs = ("sheet",)
+    observes = ("force.", "touch.", "aside.bus", "aside.force_noise_n")
+
+    async def teach(self, day: Day) -> None:
+        """Find the sensor and have it pushed. Raises `CannotTeach`, `DeviceError`."""
+        await day.values("force", BUS)
+        with day.touched_again_if_refused("aside.bus"):
+            fields = _addressed(str(day.notebook.get("aside.bus")))
+        with day.together():
+            for field, value in fields.items():
+                day.keep("force", f"force.{field}", value, "typed")
+            if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
+                how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
+                day.keep("force", "force.stale_ms", LOOPBACK_STALE_MS, how, "ms")
+        if not day.notebook.get("aside.bus"):
+            await day.say(
+                "Without a force sensor the height of the paper is found by jogging with keys, when a session starts."
+            )
+            return
+        if "touch.force.push_axis" not in day.notebook.values:
+            await self._pushed(day)
+
+    async def _pushed(self, day: Day) -> None:
+        samples = list[ForceSample]()
+        sensor = make_force(ForceConfig.model_validate(day.notebook.table("force.")), day.clock)
+        try:
+            await day.working("listening to the sensor; let nothing touch the brush")
+            identity = await sensor.connect()
+            await sensor.bias(REST_S)
+            sensor.listen(samples.append)
+            await asyncio.sleep(REST_S)
+            noise_n = _noise(samples)
+            await day.say(f"{identity.model}: {sensor.health().rate_hz:.0f} rounds/s, noise {noise_n:.4f} N")
+            samples.clear()
+            how = (
+                "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
+                "then take the finger away."
+            )
+            await day.ask(Question("bring", how, target=Target("push-sensor")))
+            await day.working("waiting for the end of the push")
+            force_n = await self._push(samples)
+        finally:
+            sensor.listen(None)
+            await sensor.close()
+        axis = judged_push(force_n, noise_n)
+        how = f"a finger pushed the tip with {float(np.linalg.norm(force_n)):.1f} N"
+        if axis[2] > 0.0:
+            await day.say(
+                "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
+                "than usual. push_axis takes this into account; nothing has to be changed."
+            )
+        with day.together():
+            day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
+            day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", "N")
+
+    async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
+        """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
+        for _ in range(int(WAIT_S / 0.1)):
+            pushed = strongest(samples)
+            if np.linalg.norm(pushed) > LEAST_PUSH_N and samples and math.hypot(*samples[-1].force_n) < LEAST_PUSH_N:
+                return pushed
+            await asyncio.sleep(0.1)
+        return strongest(samples)
+
+    def derived(self, notebook: Notebook) -> dict[str, Taught]:
+        """How zero touch is done: by force, or by jogging, at four points."""
+        size_x_mm, size_y_mm = notebook.numbers("paper.size_mm")
+        method, why = ("force", "a sensor was found") if notebook.get("aside.bus") else ("jog", "no sensor")
+        middle = np.array([size_x_mm, size_y_mm]) / 2.0
+        points = middle + (corners_of(size_x_mm, size_y_mm) - middle) * (1.0 - INSET_MM / middle)
+        _, slope_x, slope_y = notebook.numbers("aside.plane")
+        lean_deg = math.degrees(math.atan(math.hypot(slope_x, slope_y)))
+        widest_deg = min(max(math.ceil(10.0 * (lean_deg + LEAN_ROOM_DEG)) / 10.0, 1.0), 3.0)
+        leans = f"the sheet leans by {lean_deg:.2f} deg, and {LEAN_ROOM_DEG:g} deg more"
+        return {
+            "touch.method": taught("force", method, why),
+            "touch.points_mm": taught("force", points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
+            "touch.lean_deg": taught("force", widest_deg, leans),
+        }
+
+    def summary(self, notebook: Notebook) -> str:
+        """The bus and the axis."""
+        if not notebook.get("aside.bus"):
+            return "none"
+        sign = "+" if notebook.numbers("touch.force.push_axis")[2] > 0.0 else "-"
+        return f"{notebook.get('aside.bus')}, a push is along {sign}z"
+
+
+def _addressed(bus: str) -> dict[str, str | int]:
+    """The fields of `[force]` for what was typed. Raises `CannotTeach`."""
+    if not bus:
+        return {}
+    host, colon, rest = bus.partition(":")
+    if not colon:
+        return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus}
+    port, _, channel = rest.partition("/")
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise CannotTeach(f"{bus!r} is no bus.", "Type can0, or HOST:PORT/can0 of a gateway.")
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or CHANNEL}
+    return {**at, "host": host, "port": int(port)}
+
+
+def strongest(samples: list[ForceSample], over: int = 20) -> NDArray[np.float64]:
+    """(3,) mean of the `over` consecutive samples with the largest force; zeros where there are fewer."""
+    forces = np.array([sample.force_n for sample in samples], np.float64).reshape(-1, 3)
+    if len(forces) < over:
+        return np.zeros(3)
+    sums = np.cumsum(np.vstack([np.zeros(3), forces]), axis=0)
+    means = (sums[over:] - sums[:-over]) / over
+    return np.asarray(means[int(np.argmax(np.linalg.norm(means, axis=1)))], np.float64)
+
+
+def judged_push(force_n: NDArray[np.float64], noise_n: float) -> list[float]:
+    """The sensor's axis along which the paper pushes, with its sign. Raises `CannotTeach` for an unlikely push."""
+    size_n = float(np.linalg.norm(force_n))
+    if noise_n > MOST_NOISE_N:
+        raise CannotTeach(
+            f"the sensor's noise is {noise_n:.3f} N, limit {MOST_NOISE_N:g} N.",
+            "Let nothing touch the brush; check shielding and termination.",
+        )
+    if size_n < LEAST_PUSH_N:
+        raise CannotTeach(
+            f"no push was felt (at most {size_n:.3f} N).",
+            "Push harder and longer; check that this is the sensor's bus.",
+        )
+    if size_n > MOST_PUSH_N:
+        raise CannotTeach(
+            f"the push reads {size_n:.0f} N, more than a finger gives.",
+            "The sensor's scale or unit is wrong: see its sheet.",
+        )
+    if abs(float(force_n[2])) < STRAIGHT * size_n:
+        listed = ", ".join(f"{v:+.2f}" for v in force_n.tolist())
+        raise CannotTeach(
+            f"the push reads ({listed}) N, not along the sensor's z.",
+            "Push along the brush; the sensor's z must lie along the tool.",
+        )
+    return [0.0, 0.0, math.copysign(1.0, float(force_n[2]))]
+
+
+def _noise(samples: list[ForceSample]) -> float:
+    axes = list(zip(*(sample.force_n for sample in samples), strict=True))
+    return max((statistics.stdev(axis) for axis in axes if len(axis) > 1), default=0.0)

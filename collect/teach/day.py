@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import AsyncGenerator, Callable, Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -11,7 +11,6 @@ from typing import ClassVar
 from brushloop.collect.errors import CannotTeach, StepError
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check
-from brushloop.collect.teach.arm import Address, ArmReader, reading
 from brushloop.collect.teach.guide import Answer, Guide, Picture, Question, Shown, Tone
 from brushloop.collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, taught
 from brushloop.drivers.host import Clock
@@ -168,8 +167,6 @@ class Day:
             assert isinstance(value, int | float | str)
             self.keep(step, asked.field, value, how, asked.unit, sigma=asked.sigma)
 
-    # The arm
-
     async def may_move(self, what: str) -> None:
         """Ask for the key that lets the arm move. Raises `CannotTeach` unless both it and `--arm` are given."""
         if not self.armed:
@@ -177,13 +174,6 @@ class Day:
         question = f"{what}. The arm moves by itself, slower than 50 mm/s. Is nobody within its reach?"
         if await self.choose(question, (ARM, STAY), STAY.key) != ARM.key:
             raise CannotTeach("the arm was left where it is.", "Try this step again once it may move.")
-
-    @contextlib.asynccontextmanager
-    async def arm(self) -> AsyncGenerator[ArmReader]:
-        """The arm that was found, for reading only."""
-        address = Address(str(self.notebook.get("robot.host")), int(self.notebook.number("robot.port")))
-        async with reading(address, self.notebook.framing) as reader:
-            yield reader
 
 
 class Step:

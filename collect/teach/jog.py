@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.devices import sole_driver
-from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Brought, JogStep, JogView, Question, Target, TargetKind, WentBack
 from brushloop.collect.teach.store import Notebook, touch_of
@@ -103,7 +103,7 @@ async def _enabled(day: Day) -> AsyncGenerator[Robot]:
     """The arm, powered, with its limits around what is known; stopped and left where it is at the end."""
     book = day.notebook
     host, port = str(book.get("robot.host")), int(book.number("robot.port"))
-    async with day.arm() as reader:
+    async with taught_arm(book) as reader:
         flange, cabinet = await reader.flange(), await reader.tool()
     x, y, z, rx, ry, rz = cabinet
     tool: Tool = (1e3 * x, 1e3 * y, 1e3 * z), (math.degrees(rx), math.degrees(ry), math.degrees(rz))

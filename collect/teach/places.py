@@ -16,7 +16,7 @@ from brushloop.collect.planning.limit_check import ask_reach
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import to_base, to_paper
 from brushloop.collect.rig.show import draw_rig
-from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
 from brushloop.collect.teach.camera import side_by_side, still, taught_camera
 from brushloop.collect.teach.day import Asked, Day, Step
 from brushloop.collect.teach.guide import Target, TargetKind
@@ -66,7 +66,7 @@ class PlacesStep(Step):
 
     async def teach(self, day: Day) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
-        async with day.arm() as reader:
+        async with taught_arm(day.notebook) as reader:
             await touch(day, reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
             await touch(day, reader, Target("well"), how, "well 0")

@@ -12,7 +12,7 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.intrinsics import read_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
 from brushloop.collect.teach.camera import board_of, still, taught_camera
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.guide import Target, TargetKind
@@ -62,7 +62,7 @@ class SheetStep(Step):
             "along the squares.",
             "Touch each corner with the brush upright (hold a set square beside it), and hold still.",
         )
-        async with day.arm() as reader:
+        async with taught_arm(day.notebook) as reader:
             for number in range(MOST_ROUNDS):
                 for kind, thing in THINGS:
                     if number and kind == BOARD and number % 2:

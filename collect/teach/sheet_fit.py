@@ -72,7 +72,7 @@ def check_board(board: Mapping[str, Sequence[Point]], spec: BoardSpec) -> None:
             f"the corners of the board {problem}.",
             "The name on the print is along its lower edge; seen from above, the corners follow counter-clockwise.",
         )
-    scale = _scale(printed, touched)
+    _, scale = _turn_and_scale(printed, touched)
     distances = _distances(printed * scale, touched)
     if max(distances) > WORST_CORNER_MM:
         listed = ", ".join(f"{name} {off:.1f}" for name, off in zip(CORNERS, distances, strict=True))
@@ -117,7 +117,7 @@ def expected_mm(touched: Mapping[str, Sequence[Point]], name: str, spec: BoardSp
     """Where a corner of the board must lie, (x, y) in the base frame, by two or three others that were touched."""
     printed, known = corners_of(*size_mm(spec)), [CORNERS.index(corner) for corner in touched]
     places = np.array([np.mean(points, axis=0)[:2] for points in touched.values()])
-    turn = _rotation(_turn(printed[known], places))
+    turn = _rotation(_turn_and_scale(printed[known], places)[0])
     x, y = turn @ (printed[CORNERS.index(name)] - printed[known].mean(axis=0)) + places.mean(axis=0)
     return float(x), float(y)
 
@@ -141,7 +141,7 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
         board_at, sheet_at = printed[bk] @ turn.T + [bx, by], corners_of(width, height)[sk] @ turn.T + [sx, sy]
         return np.concatenate([(b - board_at).ravel(), (s - sheet_at).ravel()])
 
-    yaw0 = _turn(printed[bk], b)
+    yaw0, scale = _turn_and_scale(printed[bk], b)
     local = s @ _rotation(yaw0)
     low, high = local.min(axis=0), local.max(axis=0)
     board0 = b.mean(axis=0) - _rotation(yaw0) @ printed[bk].mean(axis=0)
@@ -168,7 +168,7 @@ def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence
         float(max(sigmas[3:5])),
         math.degrees(float(sigmas[0])),
         above_mm / math.sqrt(len(points)),
-        _scale(printed[bk], b),
+        scale,
     )
 
 
@@ -181,7 +181,7 @@ def _check_askew(b: Floats, bk: list[int], s: Floats, sk: list[int], printed: Fl
             "the corners of the sheet were named as in a mirror.", "Seen from above they follow counter-clockwise."
         )
     own = math.atan2(along[1] - up[0], along[0] + up[1])
-    askew = math.degrees(math.remainder(own - _turn(printed[bk], b), math.tau))
+    askew = math.degrees(math.remainder(own - _turn_and_scale(printed[bk], b)[0], math.tau))
     if abs(abs(askew) - 180.0) < 30.0 or abs(abs(askew) - 90.0) < 30.0:
         raise CannotTeach(
             f"the corners of the sheet were named turned by {askew:.0f} deg against those of the board.",
@@ -198,20 +198,16 @@ def _rotation(angle: float) -> Floats:
     return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
-def _turn(printed: Floats, touched: Floats) -> float:
-    """Angle of the rigid fit, in rad."""
-    a, b = printed - printed.mean(axis=0), touched - touched.mean(axis=0)
-    return math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
-
-
-def _scale(printed: Floats, touched: Floats) -> float:
+def _turn_and_scale(printed: Floats, touched: Floats) -> tuple[float, float]:
+    """Angle in rad of the rigid fit, and touched over printed size."""
     a, b = printed - printed.mean(axis=0), touched - touched.mean(axis=0)
     dot, cross = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    return math.hypot(dot, cross) / float((a**2).sum())
+    return math.atan2(cross, dot), math.hypot(dot, cross) / float((a**2).sum())
 
 
 def _distances(printed: Floats, touched: Floats) -> list[float]:
-    turn = _rotation(_turn(printed, touched))
+    """Residuals of the rigid fit."""
+    turn = _rotation(_turn_and_scale(printed, touched)[0])
     off = touched - touched.mean(axis=0) - (printed - printed.mean(axis=0)) @ turn.T
     return [float(v) for v in np.linalg.norm(off, axis=1)]
 

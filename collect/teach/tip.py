@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.check import brush_square
-from brushloop.collect.teach.arm import ArmReader, tip_of
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
 from brushloop.collect.teach.day import Day, Step
 from brushloop.collect.teach.guide import Target
 from brushloop.collect.teach.jog import touch
@@ -230,7 +230,7 @@ class TipStep(Step):
             "Fix a pin upright where all sides of it can be reached; put the pendant into hand guiding.",
             "Touch its point with the tip of the dry brush, each time leaning to another side, and hold still.",
         )
-        async with day.arm() as reader:
+        async with taught_arm(day.notebook) as reader:
             await self._pin(day, reader)
             await day.say("Now the direction of the brush: hold it upright, a set square on the table beside it.")
             await self._uprights(day, reader)

@@ -1,24 +1,30 @@
-"""The first day as a whole: one step after the other, each kept as it is taught, and a `rig.toml` at the end."""
+"""The first day as a whole: one step after the other, each kept as it is taught, and a `rig.toml` at the end.
+
+Where the arm is and what the camera sees meanwhile is for display only: no step depends on it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from pathlib import Path
 
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach, CollectAborted, ConfigError, StepError
 from brushloop.collect.operator import Choice
-from brushloop.collect.teach.brush import BrushStep
-from brushloop.collect.teach.camera import CameraStep
+from brushloop.collect.rig.optics import gray
+from brushloop.collect.teach.arm import ArmStep, taught_arm, tip_of
+from brushloop.collect.teach.brush import BrushStep, ForceStep
+from brushloop.collect.teach.camera import CameraStep, taught_camera
 from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.find_arm import ArmStep
-from brushloop.collect.teach.force import ForceStep
-from brushloop.collect.teach.guide import LeftOff, Question, StepState, WentBack
+from brushloop.collect.teach.guide import LeftOff, Picture, Question, StepState, WentBack
 from brushloop.collect.teach.places import LimitsStep, PlacesStep
 from brushloop.collect.teach.proof import ProofStep
 from brushloop.collect.teach.sheet import SheetStep
 from brushloop.collect.teach.store import Notebook, Value, write_rig
 from brushloop.collect.teach.tip import TipStep
+from brushloop.drivers.devices import Pose, Stamp
 from brushloop.drivers.errors import DeviceError
 
 STEPS = (
@@ -35,6 +41,10 @@ STEPS = (
 AGAIN, LEAVE = Choice("a", "try this step again, where it was"), Choice("q", "stop here; what was taught is kept")
 AFRESH, EARLIER = Choice("f", "teach this step from its beginning"), Choice("b", "teach the step before it again")
 STOPPED = "stopped; the same command resumes from there"
+POSE_S, AGAIN_S = 0.3, 3.0
+"""Time between two poses, and after which a device that did not answer is asked again."""
+See = Callable[[Pose | None, bool], None]
+"""Called with the tip, or with the flange and False before the tip is taught; None while the arm does not answer."""
 Refused = CannotTeach | DeviceError | CalibrationError | StepError | ConfigError
 
 
@@ -173,3 +183,58 @@ def _shown(value: Value) -> str:
     if isinstance(value, list):
         return f"[{', '.join(_shown(v) for v in value)}]"
     return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+@contextlib.asynccontextmanager
+async def watched(
+    day: Day, see_pose: See, see_picture: Callable[[Picture | None], None], wanted: Callable[[], bool]
+) -> AsyncGenerator[None]:
+    """Watch until the block ends. A picture is taken only while one is `wanted`, and only from a stream.
+
+    A device on a cable has one reader at a time, and that is the step.
+    """
+
+    async def poses() -> None:
+        if "robot.framing" not in day.notebook.values:
+            return
+        try:
+            async with taught_arm(day.notebook) as reader:
+                while True:
+                    pose = await reader.flange_now()
+                    known = "robot.tcp_offset_mm" in day.notebook.values
+                    if known:
+                        tip_mm = tip_of(pose, day.notebook.numbers("robot.tcp_offset_mm"))
+                        pose = Pose(*tip_mm, *pose.quaternion)
+                    see_pose(pose, known)
+                    await asyncio.sleep(POSE_S)
+        finally:
+            see_pose(None, False)
+
+    async def pictures() -> None:
+        while not (wanted() and "://" in str(day.notebook.get("camera.source") or "")):
+            await asyncio.sleep(POSE_S)
+        try:
+            async with taught_camera(day.notebook, day.clock) as camera:
+                after = Stamp(0)
+                while wanted():
+                    frame = await camera.fresh(after)
+                    after = Stamp(frame.exposed_after_ns + 1)
+                    see_picture(gray(frame.image))
+                    await asyncio.sleep(POSE_S)
+        finally:
+            see_picture(None)
+
+    tasks = [asyncio.create_task(_again_and_again(look), name=look.__name__) for look in (poses, pictures)]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _again_and_again(look: Callable[[], Awaitable[None]]) -> None:
+    while True:
+        with contextlib.suppress(DeviceError):
+            await look()
+        await asyncio.sleep(AGAIN_S)

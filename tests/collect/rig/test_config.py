@@ -46,15 +46,12 @@ def test_the_rig_that_the_simulator_writes_is_valid(tmp_path: Path) -> None:
         ("port = 30004", "port = 70000", r"rig.toml: robot.port: .*65535.*given: 70000"),
         ("radius_mm = 6.0", "radius_mm = -1.0", r"brush.radius_mm: .*greater than 0"),
         ("radius_mm = 6.0", "radius = 6.0", r"rig.toml: brush.radius: unknown field; did you mean radius_mm\?$"),
-        ("radius_mm = 6.0", "weight-g = 6.0", r"brush.weight-g: unknown field; known are name, radius_mm, length_mm, "),
         ("[brush]", "[bursh]", r"rig.toml: bursh: unknown field; did you mean brush\?; and 1 more$"),
         ('kind = "ink-station"\n', "", r"ink.device.kind: is missing: one of 'ink-station', 'modbus-pump'$"),
         ("touch_z_mm = 120.030", "touch_z_mm = nan", r"paper.touch_z_mm: .*finite"),
-        ("touch_z_mm = 120.030", "touch_z_mm = 1e300", r"paper.touch_z_mm: .*less than or equal to 1000000.*1e\+300"),
         ("touch_z_mm = 120.030", "", r"paper.touch_z_mm: Field required"),
         ("x_mm = [200.0, 640.0]", "x_mm = [640.0, 200.0]", r"robot.limits: .*x_mm = \[640.0, 200.0\]"),
         ("[robot]", "[robot", r"is not TOML"),
-        ("tilt_deg = 15.0", "tilt_deg = 80.0", r"robot.limits.tilt_deg: .*30"),
         ("stale_ms = 100.0", "stale_ms = 3000.0", r"force: stale_ms = 3000: must be from 20 to 2000;"),
     ],
 )
@@ -79,7 +76,6 @@ def test_a_real_sensor_is_never_waited_for_longer_than_a_tenth_of_a_second(tmp_p
         ("ROBOT__PORT", "abc", r"^environment variable BRUSHLOOP_ROBOT__PORT: robot.port: .*integer.*given: 'abc'"),
         ("INK__DEVICE__KIND", "x", r"^environment variable BRUSHLOOP_INK__DEVICE__KIND: ink.device.kind: 'x' is not"),
         ("PAPER__CELL_MM", "[40, -2]", r"^environment variable BRUSHLOOP_PAPER__CELL_MM: paper.cell_mm.1: .*greater"),
-        ("PAPER__CELL_MM", "[1e-5, 1e-5]", r"PAPER__CELL_MM: paper\.cell_mm\.0: .* greater than or equal to 2"),
         ("PAPER", "[" * 100_000, r"environment variable BRUSHLOOP_PAPER: paper: is not JSON"),
         ("PAPER__CELL_MM", "40 x 24", r"^environment variable BRUSHLOOP_PAPER__CELL_MM: paper.cell_mm: .*valid tuple"),
         ("ROBOT__PROT", "5", r"^environment variable BRUSHLOOP_ROBOT__PROT: robot.prot: .*did you mean port\?"),
@@ -104,21 +100,12 @@ def test_a_value_from_the_environment_is_refused_by_its_variable(
     assert "ROBOT__HOST" not in str(refused.value)
 
 
-def test_what_is_wrong_in_the_file_is_not_blamed_on_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("BRUSHLOOP_ROBOT__HOST", "192.0.2.7")
-    with pytest.raises(ConfigError, match=r"rig.toml: robot.port: .*70000\)$"):
-        load_rig(rig_file(tmp_path, "port = 30004", "port = 70000"))
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", r"kind: is missing: one of 'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'$"),
         (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'few-strokes', "),
         (PROTOCOL.replace("depths_mm", "depth_mm"), r"depth_mm: unknown field; did you mean depths_mm"),
-        (PROTOCOL.replace("[11.0, 20.0]", "[]"), r"depths_mm: .*at least 1"),
         (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"depths_mm has the same value twice"),
         (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
         (

@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 import json
+import zipfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.doctor import examine
+from brushloop.collect.rig.doctor import Finding, examine
+from brushloop.collect.rig.report import numbers_only, scrubber_of, write_report
+from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.faults import Device, Fault
-from tests.command import brushloop
-
-if TYPE_CHECKING:
-    from conftest import Lab
-
-
-import zipfile
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from brushloop.collect.rig.doctor import Finding
-from brushloop.collect.rig.report import numbers_only, scrubber_of, write_report
-from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
 from brushloop.drivers.sim.arcs.server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
+from tests.command import brushloop
 from tests.drivers.arcs.transcript import Archive
 
 if TYPE_CHECKING:
@@ -36,22 +28,16 @@ if TYPE_CHECKING:
 
 
 async def test_a_rig_in_order_is_reported_as_it_is_and_left_as_it_was(lab: Lab) -> None:
-    camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
-    assert robot.well
+    findings = await examine(load_rig(lab.folder / "rig.toml"), HostClock())
+    assert all(finding.well for finding in findings)
+    camera, force, ink, robot = findings
     assert robot.identity == "aubo_i5 (brushloop-loopback)"
     assert robot.latency_ms is not None
-    assert robot.latency_ms < 1000.0
     assert "PowerOff, safety Normal, simulated" in robot.notes
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
-    assert camera.well
     assert camera.notes.startswith("board: ")
-    assert "ended" not in camera.notes
-    assert force.well
     assert "rounds/s" in force.notes
-    assert force.notes.endswith("N before bias, simulated")
-    assert ink.well
-    assert (ink.identity, ink.firmware) == ("ink-station", "1.0.0")
-    assert ink.notes == "well 71% full, simulated"
+    assert (ink.identity, ink.firmware, ink.notes) == ("ink-station", "1.0.0", "well 71% full, simulated")
 
 
 async def test_an_instrument_that_was_unplugged_is_reported_and_the_others_are_still_asked(
@@ -139,15 +125,6 @@ def test_an_archive_holds_what_every_device_answered(lab: Lab) -> None:
     assert lab.rig.world.motion._next_id == 0
 
 
-async def test_a_controller_that_is_not_there_is_reported_as_such(rig: Path, tmp_path: Path) -> None:
-    finding = Finding("robot", "127.0.0.1:9", answers=False, problem="connect: 127.0.0.1:9: Connection refused")
-    await write_report(tmp_path / "report.zip", load_rig(rig), [finding])
-    archive = Archive.read(tmp_path / "report.zip")
-    assert [line["method"] for line in archive.lines] == ["connect"]
-    assert "refused" in archive.lines[0]["answer"]
-    assert "127.0.0.1" not in json.dumps([archive.robot, archive.lines])
-
-
 async def test_what_the_controller_refuses_is_kept_word_for_word(rig: Path, tmp_path: Path) -> None:
     server = ArcsServer(World(SimConfig()))
     await server.start("127.0.0.1", 0)
@@ -195,9 +172,9 @@ def test_an_archive_is_never_overwritten(rig: Path, tmp_path: Path) -> None:
 def test_on_the_first_day_there_is_no_rig_yet_and_the_archive_holds_what_is_known(lab: Lab) -> None:
     robot = load_rig(lab.folder / "rig.toml").robot
     rig, report = lab.folder / "new.toml", lab.folder / "report.zip"
-    address = Taught(value=f"{robot.host}:{robot.port}", how="typed", at=now_utc(), step="arm")
-    stream = Taught(value="http://cam.example/stream", how="typed", at=now_utc(), step="camera")
-    squares = Taught(value=[26, 20], how="typed", at=now_utc(), step="camera")
+    address = taught("arm", f"{robot.host}:{robot.port}", "typed")
+    stream = taught("camera", "http://cam.example/stream", "typed")
+    squares = taught("camera", [26.0, 20.0], "typed")
     values = {"aside.address": address, "camera.source": stream, "board.squares": squares}
     TaughtFile(rig).save(Notebook().with_values(values))
     ran = brushloop("doctor", "--config", rig, "--report", report)

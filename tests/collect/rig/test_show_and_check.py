@@ -9,7 +9,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from brushloop.collect.teach.store import Notebook, Taught, TaughtFile, now_utc
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.show import places_of
+from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from tests.command import brushloop
@@ -77,14 +79,13 @@ def test_a_file_that_cannot_be_used_is_one_line_and_code_2(rig: Path) -> None:
 
 
 def test_what_is_shown_is_where_the_tip_goes(rig: Path) -> None:
-    shown = json.loads(brushloop("rig", "show", rig, "--json").stdout)
-    places = {place["name"]: place for place in shown["places"]}
+    places = {place.name: place.at_mm for place in places_of(load_rig(rig))}
     # Yaw 90: paper x runs along base y, paper y against base x.
-    assert places["sheet lower right"]["at_mm"] == pytest.approx([460.0, 134.0, 98.03])
-    assert places["well"]["at_mm"] == pytest.approx([310.0, -185.0, 122.0])
-    assert places["park"]["paper_mm"] == pytest.approx([-120.0, 210.0])
+    assert places["sheet lower right"] == pytest.approx([460.0, 134.0, 98.03])
+    assert places["well"] == pytest.approx([310.0, -185.0, 122.0])
     table = brushloop("rig", "show", rig).stdout
     assert all(name in table for name in places)
+    assert re.search(r"park .* 250\.0 .* -120\.0 .* 210\.0", table)
 
 
 def test_the_picture_shows_the_box_and_every_place(rig: Path, tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_a_picture_has_the_format_of_its_ending(rig: Path, tmp_path: Path) -> No
 
 
 def test_what_was_taught_says_what_was_never_measured(rig: Path) -> None:
-    mass = Taught(value=0.0, unit="kg", how="as set on the pendant", known="not weighed", at=now_utc(), step="arm")
+    mass = taught("arm", 0.0, "as set on the pendant", "kg", known="not weighed")
     TaughtFile(rig).save(Notebook().with_values({"robot.payload_kg": mass}).finished("arm"))
     checks = {check["name"]: check for check in json.loads(brushloop("rig", "check", rig, "--json").stdout)["checks"]}
     assert checks["robot.payload_kg"]["remedy"] == "as set on the pendant, not weighed"

@@ -70,24 +70,16 @@ def holder(path: Path, tmp_path: Path) -> Iterator[Callable[..., subprocess.Pope
         process.communicate()
 
 
-def test_another_temporary_folder_gets_no_second_driver_and_the_first_is_named(
-    rig: RigConfig, holder: Callable[..., subprocess.Popen[str]]
+ROOT = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root becomes another user")
+
+
+@pytest.mark.parametrize("user", [(), pytest.param((str(NOBODY),), marks=ROOT)], ids=["same user", "another user"])
+def test_a_second_driver_is_refused_while_the_first_lives_and_not_afterwards(
+    rig: RigConfig, holder: Callable[..., subprocess.Popen[str]], user: tuple[str, ...]
 ):
-    process = holder()
+    """Whatever its temporary folder."""
+    process = holder(*user)
     with pytest.raises(ConfigError, match=rf"another brushloop is driving the arm at 127.*: process {process.pid} of "):
-        sole_driver(rig.robot.host, rig.robot.port).__enter__()
-    process.kill()
-    process.wait()
-    with sole_driver(rig.robot.host, rig.robot.port):
-        pass
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root becomes another user")
-def test_another_user_is_refused_while_it_lasts_and_not_afterwards(
-    rig: RigConfig, holder: Callable[..., subprocess.Popen[str]]
-):
-    process = holder(str(NOBODY))
-    with pytest.raises(ConfigError, match=rf"process {process.pid} of (nobody|user {NOBODY})"):
         sole_driver(rig.robot.host, rig.robot.port).__enter__()
     process.kill()
     process.wait()

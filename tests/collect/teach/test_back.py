@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.teach.brush import BrushStep
+from brushloop.collect.teach.brush import BrushStep, ForceStep
 from brushloop.collect.teach.camera import CameraStep
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.force import ForceStep
 from brushloop.collect.teach.guide import Answer, LeftOff, Question, WentBack
 from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.collect.teach.wizard import Wizard

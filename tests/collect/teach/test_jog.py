@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from brushloop.collect.teach.arm import taught_arm
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Answer, Brought, JogStep, JogView, Question, Target
 from brushloop.collect.teach.jog import BELOW_MM, touch
@@ -40,7 +41,7 @@ class Jogger(Person):
 
 
 async def touched(day: Day) -> None:
-    async with asyncio.timeout(20.0), day.arm() as reader:
+    async with asyncio.timeout(20.0), taught_arm(day.notebook) as reader:
         await touch(day, reader, Target("well"), "Bring the tip into the well.", "well 0")
 
 

@@ -19,16 +19,15 @@ from brushloop.collect.errors import CannotTeach, ConfigError
 from brushloop.collect.rig.check import brush_square
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.teach import proof
-from brushloop.collect.teach.arm import Address, reading
+from brushloop.collect.teach.arm import Address, ArmStep, reading
 from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.find_arm import ArmStep
 from brushloop.collect.teach.guide import Answer, Brought, Question, Target
 from brushloop.collect.teach.proof import ProofStep, slowly
 from brushloop.collect.teach.sheet import BOARD, all_corners
 from brushloop.collect.teach.sheet_fit import Margins, check_seen, seen_margins
 from brushloop.collect.teach.store import Notebook, Value, taught, touch_of
 from brushloop.collect.teach.tip import TipStep
-from brushloop.collect.teach.watch import watched
+from brushloop.collect.teach.wizard import watched
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
