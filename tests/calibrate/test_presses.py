@@ -80,7 +80,7 @@ def same(one: Press, other: Press) -> bool:
 
 
 def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, work: Counter[str]) -> None:
-    request = Request(places=(str(session),), out=tmp_path / "report", parquet=False)
+    request = Request(places=(str(session),), out=tmp_path / "report")
     fit_presses(FitRequest(session))
     validate(request)
     assert (work["prepare_job"], work["refit"], work["score_job"]) == (3, 3, 3)
