@@ -16,7 +16,6 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
-from brushloop.calibrate.compare.place import Alignment, Tone
 from brushloop.calibrate.validate.report import load_report
 from brushloop.calibrate.validate.tables import table_1
 from brushloop.sessions.journal import replay
@@ -89,7 +88,7 @@ def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactl
     assert "not a result on paper" in page
     assert Path(printed[2]).is_file()
     report = load_report(Path(printed[1]).with_name("report.json"))
-    rows = {row.label: row.ours for row in table_1(report, (Alignment.MM, Tone.BINARY))}
+    rows = {row.label: row.scores for row in table_1(report)}
     assert rows.pop("another press") is rows.pop("ceiling") is None  # no cell was pressed twice
     assert set(rows) == {"CCD-BSM", "CCD-BSMG", "robot writing", "CCD-BSM calibrated"}
     assert None not in rows.values()
