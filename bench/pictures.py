@@ -34,12 +34,10 @@ from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Question, Target
 from brushloop.collect.teach.wizard import Wizard, watched
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.browser import Paths, SessionBrowser
 from brushloop.collect.tui.capture_screen import CaptureScreen
-from brushloop.collect.tui.end_screen import EndScreen
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.collect.tui.start_screen import Paths, SessionBrowser, StartScreen
 from brushloop.collect.tui.teach_app import TeachApp
 from brushloop.collect.tui.teach_guide import ScreenGuide
 from brushloop.drivers.host import HostClock
@@ -188,8 +186,6 @@ async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
     protocol.write_text(PROTOCOL, encoding="utf-8")
     async with app.run_test(size=SIZE) as pilot:
         tour = _Tour(app, pilot)
-        await pilot.press("d")
-        await app.workers.wait_for_complete()
         await tour.take("start")
         await pilot.press("n")
         await app.workers.wait_for_complete()
@@ -223,7 +219,7 @@ async def _tour(app: OperatorApp, rig: LoopbackRig) -> None:
         await tour.until(lambda: tour.strokes() > before + 3)
         await tour.take("run")
         await tour.until(lambda: app.engine is not None and app.engine.snapshot().state is State.DONE)
-        await tour.until(lambda: isinstance(app.screen, EndScreen))
+        await tour.until(lambda: isinstance(app.screen, AskScreen))
         await app.workers.wait_for_complete()
         await tour.take("end")
         await pilot.press("escape")
@@ -258,9 +254,9 @@ class _Person:
             await self._pilot.pause(0.2)
             if self._app.teaching.finished:
                 return None
-            question = self._app.teaching.guide.view.question
-            if question is not None and question.number > self._number and self._app.asking:
-                self._number = question.number
+            question, prompt = self._app.teaching.guide.question, self._app.first_day.prompt
+            if question is not None and prompt is not None and prompt.number > self._number:
+                self._number = prompt.number
                 await self._pilot.pause(0.5)
                 return question
         raise TimeoutError(f"no question in {DAY_WAIT_S:g} s")
@@ -323,7 +319,7 @@ async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
         person = _Person(app, pilot, lab, loop)
         while (question := await person.question()) is not None:
             if question.text.startswith("How to go on"):
-                raise RuntimeError("\n".join(app.teaching.guide.view.findings[-1].lines))
+                raise RuntimeError("\n".join(app.teaching.guide.findings[-1].lines))
             words = question.text.lower()
             for name in (name for part, name in PICTURES.items() if part in words and name not in taken):
                 taken.add(name)

@@ -84,8 +84,8 @@ def collect(
 
 def browse() -> None:
     """Open the start screen: `brushloop` without arguments. The screen appears before the engine is imported."""
-    from brushloop.collect.tui.browser import Paths, SessionBrowser
-    from brushloop.collect.tui.runner import run_browser
+    from brushloop.collect.tui.app import run_browser
+    from brushloop.collect.tui.start_screen import Paths, SessionBrowser
 
     def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
         from brushloop.collect import start

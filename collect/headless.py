@@ -10,62 +10,19 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.operator import OperatorRequest
 from brushloop.sessions.terminal import plain_console
+
+if TYPE_CHECKING:
+    from brushloop.collect.engine.engine import Engine
 
 REFRESH_S = 0.1
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class RunnableEngine(Protocol):
-    """What a screen or a progress bar may do with an engine. Every method may be called from any thread."""
-
-    def start(self) -> None:
-        """Begin the run."""
-        ...
-
-    @property
-    def finished(self) -> bool:
-        """True once the run is over."""
-        ...
-
-    def join(self) -> None:
-        """Wait for the end; raise the error that ended the run."""
-        ...
-
-    def snapshot(self) -> Snapshot:
-        """Return the state of the run; never blocks."""
-        ...
-
-    def pause(self) -> None:
-        """Pause before the next step."""
-        ...
-
-    def resume(self) -> None:
-        """Go on after a pause."""
-        ...
-
-    def answer(self, number: int, key: str) -> bool:
-        """Answer question `number`; False if it is closed."""
-        ...
-
-    def request(self, request: OperatorRequest) -> None:
-        """Make or withdraw a request."""
-        ...
-
-    def park(self) -> None:
-        """End the run after this step with the arm lifted and parked; no more questions are asked."""
-        ...
-
-    def stop(self) -> None:
-        """Stop the arm now and end the run, in any state. Not an emergency stop."""
-        ...
-
-
-def run_headless(engine: RunnableEngine) -> None:
+def run_headless(engine: Engine) -> None:
     """Run to the end; raise the error that ended the run. If the output goes away, the step ends and the arm parks."""
     with stop_signals(partial(obey, engine)):
         engine.start()
@@ -79,13 +36,13 @@ def run_headless(engine: RunnableEngine) -> None:
             engine.join()
 
 
-def obey(engine: RunnableEngine, number: int) -> None:
+def obey(engine: Engine, number: int) -> None:
     """On SIGHUP finish the step, lift and park: nobody is there to lift a brush that was stopped on the paper. On any
     other signal stop at once, also while the arm is being parked."""
     (engine.park if number == signal.SIGHUP else engine.stop)()
 
 
-def _show(engine: RunnableEngine) -> None:
+def _show(engine: Engine) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     shown, silent = 0, False

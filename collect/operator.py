@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from brushloop.collect.errors import NeedsOperator
 
@@ -30,20 +30,32 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """A question to the operator; it waits until it is answered."""
+    """A question to a person, answered by a key or by a typed line; it waits until it is answered."""
 
     question: str
-    choices: tuple[Choice, ...]
-    default: str
-    """Key of the answer that moves nothing: it holds if nobody can answer, and for an empty line in the first day."""
+    choices: tuple[Choice, ...] = ()
+    """A line for each key that answers it."""
+    default: str = ""
+    """Answer that moves nothing, which holds if nobody can answer; on the first day, what Enter stands for."""
     image: NDArray[np.uint8] | None = field(default=None, compare=False)
     """Gray picture of what the question is about."""
     number: int = 0
     """Number of the question in its run, from 1; set by `Asker.ask`."""
+    answers: Mapping[str, object] = field(default_factory=dict[str, object])
+    """What keys stand for, if not for themselves: `enter`, `left`, `j`."""
+    read: Callable[[str], object] | None = None
+    """Reads a typed line; raises ValueError, worded for the person. None where the answer is a key."""
+    allowed: str = ""
+    """What a typed line may be, or what more keys do."""
+
+    def answer_to(self, *keys: str) -> object | None:
+        """What the first of these keys answers that answers anything."""
+        answers = {choice.key: choice.key for choice in self.choices} | dict(self.answers)
+        return next((answers[key] for key in keys if key in answers), None)
 
 
 class Asker:
-    """Passes one question at a time from the engine's event loop to a screen, and the answer back."""
+    """Passes one question at a time from an event loop to a screen, and the answer back. Only `ask` is of the loop."""
 
     def __init__(
         self, *, watched: bool, waiting: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
@@ -52,38 +64,38 @@ class Asker:
         self.attended = watched
         """Whether the run was begun with somebody who watches; the screen may be gone since."""
         self._waiting = waiting
-        self._watched = watched
+        self._given_up: Callable[[str], Exception] | None = None if watched else NeedsOperator
         self._lock = threading.Lock()
         self._count = 0
-        self._open: tuple[Prompt, asyncio.AbstractEventLoop, asyncio.Future[str]] | None = None
+        self._open: tuple[Prompt, asyncio.AbstractEventLoop, asyncio.Future[Any]] | None = None
 
     @property
     def watched(self) -> bool:
         """Whether somebody watches a screen that can answer."""
-        return self._watched
+        return self._given_up is None
 
     @property
     def prompt(self) -> Prompt | None:
-        """The question that waits for an answer; from any thread."""
+        """The question that waits for an answer."""
         with self._lock:
             return None if self._open is None else self._open[0]
 
-    def abandon(self) -> None:
-        """Fail the open question and every later one with `NeedsOperator`: nobody is watching now. From any thread."""
+    def abandon(self, error: Callable[[str], Exception] = NeedsOperator) -> None:
+        """Fail the open question and every later one with this error: nobody is watching now."""
         with self._lock:
-            self._watched = False
-            if self._open is not None:
-                _, loop, answered = self._open
-                loop.call_soon_threadsafe(_give_up, answered)
+            self._given_up = error
+        if (prompt := self.prompt) is not None:
+            self.settle(prompt.number, error("nobody is at the screen now"))
 
-    async def ask(self, prompt: Prompt) -> str:
-        """Return the key of the answer. Raises `NeedsOperator` if nobody can answer."""
+    async def ask(self, prompt: Prompt) -> Any:
+        """The key of the answer, or what stands for it. Raises `NeedsOperator`, or what `abandon` says, if nobody can
+        answer, and the exception that it is settled with."""
         loop = asyncio.get_running_loop()
-        answered: asyncio.Future[str] = loop.create_future()
+        answered: asyncio.Future[Any] = loop.create_future()
         with self._waiting():
             with self._lock:
-                if not self._watched:
-                    raise NeedsOperator(prompt.question)
+                if self._given_up is not None:
+                    raise self._given_up(prompt.question)
                 self._count += 1
                 self._open = (replace(prompt, number=self._count), loop, answered)
             try:
@@ -100,25 +112,24 @@ class Asker:
             return prompt.default
 
     def answer(self, number: int, key: str) -> bool:
-        """Answer question `number`; False if it is closed or has no such choice. From any thread."""
+        """Answer question `number` by key; False if it is closed or has no such choice."""
+        prompt = self.prompt
+        answer = None if prompt is None else prompt.answer_to(key)
+        return answer is not None and self.settle(number, answer)
+
+    def settle(self, number: int, answer: object) -> bool:
+        """Answer question `number`, with an exception to raise there; False if it is closed."""
+
+        def settle() -> None:
+            if not answered.done():
+                answered.set_exception(answer) if isinstance(answer, Exception) else answered.set_result(answer)
+
         with self._lock:
             if self._open is None or self._open[0].number != number:
                 return False
-            prompt, loop, answered = self._open
-            if key not in {choice.key for choice in prompt.choices}:
-                return False
-            loop.call_soon_threadsafe(_settle, answered, key)
+            _, loop, answered = self._open
+            loop.call_soon_threadsafe(settle)
             return True
-
-
-def _give_up(answered: asyncio.Future[str]) -> None:
-    if not answered.done():
-        answered.set_exception(NeedsOperator("nobody is at the screen now"))
-
-
-def _settle(answered: asyncio.Future[str], key: str) -> None:
-    if not answered.done():
-        answered.set_result(key)
 
 
 class OperatorRequest(StrEnum):

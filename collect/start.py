@@ -15,7 +15,7 @@ from brushloop.collect.engine.dry_run import DryRunEngine
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.live import LiveView
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
-from brushloop.collect.headless import RunnableEngine, run_headless
+from brushloop.collect.headless import run_headless
 from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
@@ -148,12 +148,10 @@ def ending(folder: Path, kind: str) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
-def _run(
-    engine: RunnableEngine, preview: Preview, again: Callable[[str], Engine] | None, *, on_screen: bool
-) -> RunnableEngine:
+def _run(engine: Engine, preview: Preview, again: Callable[[str], Engine] | None, *, on_screen: bool) -> Engine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
     if on_screen:
-        from brushloop.collect.tui.runner import run_screen
+        from brushloop.collect.tui.app import run_screen
 
         return run_screen(engine, preview, again)
     run_headless(engine)

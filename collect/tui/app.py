@@ -1,4 +1,7 @@
-"""The operator's app: shows the engine's snapshot ten times a second; its keys send the engine requests."""
+"""The operator's app: shows the engine's snapshot ten times a second; its keys send the engine requests.
+
+However it ends, by a signal, a lost terminal or a crash, no arm is left unwatched.
+"""
 
 from __future__ import annotations
 
@@ -7,67 +10,74 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from textual import events, work
 from textual.app import SystemCommand
-from textual.binding import BindingType
+from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.errors import NOT_AT_REST, ConfigError
-from brushloop.collect.headless import REFRESH_S, RunnableEngine
-from brushloop.collect.operator import OperatorRequest
-from brushloop.collect.tui.browser import SessionBrowser
-from brushloop.collect.tui.keys import CAN_GO_ON, CAN_PAUSE, CAN_RESUME, RUN_BINDINGS, RUN_KEYS, help_text, is_stop_key
-from brushloop.collect.tui.panes import live_content
-from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.question_screens import AT_WORK, NOT_PARKED, UNSEEN, AskScreen, Confirm
-from brushloop.collect.tui.run_screen import RunScreen
-from brushloop.collect.tui.start_screen import StartScreen
+from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
+from brushloop.collect.headless import REFRESH_S, obey, stop_signals
+from brushloop.collect.operator import Choice, OperatorRequest, Prompt
+from brushloop.collect.tui.pictures import Pictures, Preview
+from brushloop.collect.tui.question_screens import LEAVE, NOT_PARKED, UNSEEN, YES, AskScreen
+from brushloop.collect.tui.run_screen import RUN_BINDINGS, RunScreen, live_content
+from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.terminal import PlainApp
-from brushloop.collect.tui.text import plain
-from brushloop.collect.tui.widgets import HelpScreen
+from brushloop.collect.tui.widgets import HELP_KEY, plain
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.recording import mark_bad_or_good
 
+if TYPE_CHECKING:
+    from brushloop.collect.engine.engine import Engine
+
+COMMANDS = {"f": ("sessions", "verify"), "c": ("calibrate",), "t": ("fit",), "w": ("validate",)}
+"""What can be done with a session on which no run is in progress, in the order in which it is done."""
+LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
 BOUNCE_S = 0.7
 """Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
+CAN_BEGIN_AGAIN = frozenset({State.STOPPED, State.FAILED})
+"""States in which a run has ended before its session was finished."""
+CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
+CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
 
 
 class OperatorApp(PlainApp):
     """The operator's app: for a whole day with a browser, for one run with an engine."""
 
-    TITLE = "brushloop"
-    # A selection would be copied with ctrl+c, which is a stop key here.
-    ALLOW_SELECT = False
-    BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
+    BINDINGS: ClassVar[list[BindingType]] = [
+        # During a run, ctrl+c is a stop key and does not reach this binding.
+        Binding("ctrl+c", "quit", "Leave", show=False, priority=True),
+        Binding("q", "quit", "Leave"),
+        HELP_KEY,
+    ]
 
     def __init__(
         self,
-        engine: RunnableEngine | None = None,
+        engine: Engine | None = None,
         *,
         browser: SessionBrowser | None = None,
-        again: Callable[[str], RunnableEngine] | None = None,
+        again: Callable[[str], Engine] | None = None,
         pictures: Pictures | None = None,
-        theme_file: Path | None = None,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """With an engine, show that run; with a browser, the start screen first.
 
-        `again` makes the engine that resumes a session after a stop. `theme_file` keeps the colours for
-        the next start. `now_s` is the clock of ages.
+        `again` makes the engine that resumes a session after a stop.
         """
-        super().__init__(theme_file)
-        self.engine: RunnableEngine | None = engine
-        self._again: Callable[[str], RunnableEngine] | None = again
+        super().__init__()
+        self.engine = engine
         self._pictures = pictures or Pictures()
+        self._browser = browser
+        self._again = again if browser is None else partial(browser.engine, preview=self._pictures.camera_shown)
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
         self._main: RunScreen | None = None
-        self._browser = browser
         self._now_s = now_s
         self._leave = threading.Event()
         self._leave_when_over = False
@@ -76,16 +86,15 @@ class OperatorApp(PlainApp):
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
         if self._browser is not None:
-            self._again = partial(self._browser.engine, preview=self._pictures.camera_shown)
-            begin = partial(partial, self._browser.engine, preview=self._pictures.camera_shown)
-            self.push_screen(
-                StartScreen(
-                    self._browser,
-                    lambda session_id: self._begin(begin(session_id)),
-                    self._review_named,
-                    now_s=self._now_s,
-                )
+            make = partial(partial, self._browser.engine, preview=self._pictures.camera_shown)
+            root = self._browser.paths.root
+            start = StartScreen(
+                self._browser,
+                lambda session_id: self._begin(make(session_id)),
+                lambda session_id: self._review(root / session_id),
+                self.run_command,
             )
+            self.push_screen(start)
         if self.engine is not None:
             self._show_run()
         self.call_after_refresh(self._poll)
@@ -96,33 +105,37 @@ class OperatorApp(PlainApp):
         """Whether a run is in progress."""
         return self._now is not None and self._now.state not in FINAL
 
-    async def on_event(self, event: events.Event) -> None:
-        """Handle stop keys before textual, which would give a letter to a field that takes text, as in the palette."""
-        if is_stop_key(event) and self.at_work:
-            self.action_stop()
-            return
-        await super().on_event(event)
+    def stops(self, event: events.Key) -> bool:
+        """A stop key stops the arm whenever a run is in progress."""
+        return self.at_work
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Disable the keys of a run if there is no run."""
-        if action == "stop":
-            return self.at_work
-        if action == "pause":
-            return self._now is not None and self._now.state in CAN_PAUSE | CAN_RESUME
-        if action in ("request", "mark_last"):
-            return self.at_work
-        if action == "enter":
-            return self._can_go_on or (self._now is not None and self._now.last is not None)
-        if action == "review":
-            return self._now is not None and bool(self._now.folder)
-        return super().check_action(action, parameters)
+        """Disable the keys that would do nothing now."""
+        now = self._now
+        match action:
+            case "stop" | "request" | "mark_last":
+                return self.at_work
+            case "pause":
+                return self.at_work and now is not None and now.state not in CAN_RESUME
+            case "go_on":
+                return now is not None and now.state in CAN_RESUME
+            case "begin_again":
+                return self._can_begin_again
+            case "enlarge":
+                return now is not None and now.last is not None and not self._can_begin_again
+            case "review":
+                return now is not None and bool(now.folder)
+            case _:
+                return super().check_action(action, parameters)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """List the keys of a run by name, then the colours."""
-        for key in RUN_KEYS:
-            if key.title and self.check_action(key.action.partition("(")[0], ()):
-                run = partial(self.call_later, self.run_action, key.action)
-                yield SystemCommand(key.title, key.what, run)
+        for binding in RUN_BINDINGS if self._now is not None else ():
+            action = binding.action.removeprefix("app.")
+            if action != binding.action and self.check_action(action.partition("(")[0], ()):
+                yield SystemCommand(
+                    binding.description, binding.tooltip, partial(self.call_later, self.run_action, action)
+                )
         yield from super().get_system_commands(screen)
 
     def action_stop(self) -> None:
@@ -135,9 +148,14 @@ class OperatorApp(PlainApp):
                 self.notify("STOP SENT", severity="warning", timeout=2)
 
     def action_pause(self) -> None:
-        """Pause before the next step, or go on."""
-        if self.engine is not None and self._now is not None:
-            (self.engine.resume if self._now.state in CAN_RESUME else self.engine.pause)()
+        """Pause before the next step; while the arm is being stopped or a question waits, nothing is to be paused."""
+        if self.engine is not None and self._now is not None and self._now.state in CAN_PAUSE:
+            self.engine.pause()
+
+    def action_go_on(self) -> None:
+        """Go on after a pause."""
+        if self.engine is not None:
+            self.engine.resume()
 
     def action_mark_last(self) -> None:
         """Mark the newest capture bad, or good again; the mark is on disk at once."""
@@ -147,28 +165,28 @@ class OperatorApp(PlainApp):
         try:
             bad = mark_bad_or_good(Path(self._now.folder), last.still, last.press.stroke_id, time.time_ns())
         except SessionError as error:
-            self.notify(plain(str(error)), severity="error")
+            self._complain(error)
             return
         mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
         self.notify(f"{last.press.stroke_id}: {mark}")
 
-    def action_help(self) -> None:
-        """Show every key."""
-        if not isinstance(self.screen, HelpScreen):
-            self.push_screen(HelpScreen(help_text()))
+    def action_request(self, name: str) -> None:
+        """Send the engine a request, or withdraw it."""
+        if self.engine is not None and self._now_s() >= self._deaf_until_s:
+            self.engine.request(OperatorRequest[name])
+            self._poll()
+
+    def action_enlarge(self) -> None:
+        """Show the last capture large."""
+        if self._now is not None and self._now.last is not None and self.screen is self._main:
+            from brushloop.collect.tui.capture_screen import CaptureScreen, of_last
+
+            self.push_screen(CaptureScreen(of_last(self._now.last), self._pictures))
 
     def action_review(self) -> None:
         """Look through the captures of the run that is shown."""
         if self._now is not None and self._now.folder and self.screen is self._main:
             self._review(Path(self._now.folder))
-
-    def action_enlarge(self) -> None:
-        """Show the last capture large."""
-        if self._now is not None and self._now.last is not None and self.screen is self._main:
-            from brushloop.collect.tui.capture_screen import CaptureScreen
-            from brushloop.collect.tui.large import of_last
-
-            self.push_screen(CaptureScreen(of_last(self._now.last), self._pictures, at_work=self.at_work))
 
     def _review(self, folder: Path) -> None:
         from brushloop.collect.tui.captures import Review
@@ -176,15 +194,22 @@ class OperatorApp(PlainApp):
 
         try:
             review = Review(folder)
+            self.push_screen(ReviewScreen(review, self._pictures, self._finish, at_work=lambda: self.at_work))
         except SessionError as error:
-            self.notify(plain(str(error)), severity="error")
-            return
-        self.push_screen(ReviewScreen(review, self._pictures, at_work=lambda: self.at_work))
+            self._complain(error)
+
+    def _complain(self, error: Exception) -> None:
+        self.notify(plain(str(error)), severity="error", timeout=20)
 
     @property
-    def _can_go_on(self) -> bool:
+    def _can_begin_again(self) -> bool:
         now = self._now
-        return self._again is not None and now is not None and now.state in CAN_GO_ON and bool(now.folder)
+        return self._again is not None and now is not None and now.state in CAN_BEGIN_AGAIN and bool(now.folder)
+
+    def action_begin_again(self) -> None:
+        """Resume the session of a run that ended before its time: the engine asks first."""
+        if self._now is not None and self._again is not None and self.screen is self._main:
+            self._begin(partial(self._again, Path(self._now.folder).name))
 
     @property
     def leaving(self) -> bool:
@@ -195,47 +220,31 @@ class OperatorApp(PlainApp):
         """End the app soon, whatever the state; from any thread."""
         self._leave.set()
 
-    def action_request(self, name: str) -> None:
-        """Send the engine a request, or withdraw it."""
-        if self.engine is not None and self._now_s() >= self._deaf_until_s:
-            self.engine.request(OperatorRequest[name])
-            self._poll()
-
-    def action_enter(self) -> None:
-        """Resume the session of a run that ended before its time: the engine asks first; else show the last capture."""
-        if self._now is None or self.screen is not self._main:
-            return
-        if self._can_go_on and self._again is not None:
-            self._begin(partial(self._again, Path(self._now.folder).name))
-        else:
-            self.action_enlarge()
-
     async def action_quit(self) -> None:
         """Leave; ask first if the arm is not parked."""
-        if isinstance(self.screen, Confirm):
-            return
         now = self._now
+        if isinstance(self.screen, AskScreen) and self.screen.own:
+            return
         if now is None:
             self.exit()
         elif now.state is State.STOPPING:
             self.notify("The arm is being stopped. Press the red button if it keeps moving.", severity="warning")
         elif now.rest_unknown:
-            self.push_screen(Confirm(*UNSEEN), self._leave_answered)
+            self._confirm(UNSEEN, self._away)
         elif now.state not in FINAL:
-            self.push_screen(Confirm(*AT_WORK), self._park_answered)
+            self._confirm(LEAVE, self._park_and_leave)
         elif now.parked or now.target_mm is None:
             self._away()
         else:
-            self.push_screen(Confirm(*NOT_PARKED), self._leave_answered)
+            self._confirm(NOT_PARKED, self._away)
 
-    def _park_answered(self, yes: bool | None) -> None:
-        if yes and self.engine is not None:
+    def _confirm(self, question: Prompt, do: Callable[[], None]) -> None:
+        self.push_screen(AskScreen(question), lambda key: do() if key == YES else None)
+
+    def _park_and_leave(self) -> None:
+        if self.engine is not None:
             self._leave_when_over = True
             self.engine.park()
-
-    def _leave_answered(self, yes: bool | None) -> None:
-        if yes:
-            self._away()
 
     def _away(self) -> None:
         """Go back to the start screen if there is one, else end the app."""
@@ -250,7 +259,7 @@ class OperatorApp(PlainApp):
         self._leave_when_over = False
 
     @work(exclusive=True, group="begin")
-    async def _begin(self, make: Callable[[], RunnableEngine]) -> None:
+    async def _begin(self, make: Callable[[], Engine]) -> None:
         """Wait for the end of the run before; read and check the files off the screen's loop; start the run."""
         try:
             engine = await asyncio.to_thread(_after, self.engine, make)
@@ -258,7 +267,7 @@ class OperatorApp(PlainApp):
             if isinstance(self.screen, StartScreen):
                 self.screen.show_trouble(str(error))
             else:
-                self.notify(plain(str(error)), severity="error", timeout=20)
+                self._complain(error)
             return
         if self.leaving:
             return  # a signal came meanwhile: nobody would watch this run
@@ -268,14 +277,10 @@ class OperatorApp(PlainApp):
         self._now = engine.snapshot()
         self._show_run()
 
-    def _review_named(self, session_id: str) -> None:
-        assert self._browser is not None
-        self._review(self._browser.paths.root / session_id)
-
     def _show_run(self) -> None:
         """Show the run screen."""
         if self._main is None:
-            self._main = RunScreen(self._pictures, resumable=self._again is not None, now_s=self._now_s)
+            self._main = RunScreen(self._pictures, resumable=self._again is not None)
             self.push_screen(self._main)
 
     def _poll(self) -> None:
@@ -289,9 +294,11 @@ class OperatorApp(PlainApp):
         if self._main is not None and self._main.is_mounted:
             self._main.show(self._now)
         self._ask(self._now)
-        if self._now.state is not before.state:
+        if _what_keys_depend_on(self._now) != _what_keys_depend_on(before):
             self.refresh_bindings()
-            if self._now.state in FINAL | {State.STOPPING} and isinstance(self.screen, Confirm):
+        if self._now.state is not before.state:
+            over = self._now.state in FINAL | {State.STOPPING}
+            if over and isinstance(self.screen, AskScreen) and self.screen.own:
                 self.pop_screen()  # what it asks about is over
             if self._now.state is State.DONE and self._again is not None:
                 self._show_end(self._now)
@@ -302,36 +309,105 @@ class OperatorApp(PlainApp):
                 self._away()
 
     def _show_end(self, now: Snapshot) -> None:
-        """Show the card of a finished session, unless the operator is looking at something else."""
+        """Show what can be done with a finished session, unless the operator is looking at something else."""
         if now.folder and self.screen is self._main and not self._leave_when_over:
-            from brushloop.collect.tui.end_screen import EndScreen
+            self._finish(Path(now.folder))
 
-            self.push_screen(EndScreen(now, self._pictures), self._end_answered)
+    def _finish(self, folder: Path) -> None:
+        """Offer the next commands of a session, one after the other."""
 
-    def _end_answered(self, answer: str | None) -> None:
-        if answer == "review":
-            self.call_after_refresh(self.action_review)
-        elif answer == "finish" and self._now is not None:
-            from brushloop.collect.tui.finish_screen import FinishScreen
+        def answered(key: str | None) -> None:
+            if key in COMMANDS:
+                self.run_command(*COMMANDS[key], str(folder))
+                self._finish(folder)
+            elif key == LOOK.key:
+                self.call_after_refresh(self.action_review)
 
-            self.push_screen(FinishScreen(Path(self._now.folder), is_open=False))
+        choices = [Choice(key, f"brushloop {' '.join(words)}") for key, words in COMMANDS.items()]
+        choices = [*([LOOK] if self.screen is self._main else []), *choices, BACK]
+        self.push_screen(AskScreen(Prompt(f"What comes next with {folder}?", tuple(choices), BACK.key)), answered)
 
     def _ask(self, now: Snapshot) -> None:
+        """Show the engine's question, and take it away once it is answered."""
         prompt = now.prompt
-        shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen)), None)
+        shown = next((screen for screen in self.screen_stack if isinstance(screen, AskScreen) and not screen.own), None)
         if shown is not None and prompt is not None and shown.prompt.number == prompt.number:
             shown.show(live_content(now))
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()
             self._deaf_until_s = self._now_s() + BOUNCE_S
-        if prompt is not None and self.engine is not None and not isinstance(self.screen, Confirm | AskScreen):
-            self.push_screen(AskScreen(prompt, self.engine, self._pictures))
+        if prompt is not None and self.engine is not None and not isinstance(self.screen, AskScreen):
+            self.push_screen(AskScreen(prompt, partial(self.engine.answer, prompt.number), self._pictures))
 
 
-def _after(before: RunnableEngine | None, make: Callable[[], RunnableEngine]) -> RunnableEngine:
+def _what_keys_depend_on(now: Snapshot) -> tuple[bool, ...]:
+    """Few things: textual makes the whole line of keys again when one of them changes."""
+    state = now.state
+    return state in FINAL, state in CAN_RESUME, state in CAN_BEGIN_AGAIN, now.last is None, bool(now.folder)
+
+
+def _after(before: Engine | None, make: Callable[[], Engine]) -> Engine:
     """Make an engine once the one before has let go of session and devices; how that one ended was shown."""
     if before is not None:
         with contextlib.suppress(Exception):
             before.join()
     return make()
+
+
+class ScreenCrashed(Exception):
+    """The screen crashed and has printed the error; the arm was stopped."""
+
+
+def run_screen(engine: Engine, preview: Preview = "auto", again: Callable[[str], Engine] | None = None) -> Engine:
+    """Run under the screen until the operator leaves; raises what ended the run.
+
+    `again` makes the engine that resumes a session after a stop. Returns the engine that ran last.
+    """
+    app = OperatorApp(engine, again=again, pictures=Pictures(preview))
+    with _signals(app):
+        engine.start()
+        _run(app)
+        assert app.engine is not None
+        app.engine.join()
+        return app.engine
+
+
+def run_browser(browser: SessionBrowser) -> None:
+    """Show the start screen, and run what is started from it; raises what ended the last run."""
+    app = OperatorApp(browser=browser, pictures=Pictures("auto"))
+    with _signals(app):
+        _run(app)
+        if app.engine is not None:
+            app.engine.join()
+
+
+def _run(app: OperatorApp) -> None:
+    intact = False
+    try:
+        app.run()
+        # A screen that ended because its terminal was lost did not crash.
+        intact = app.leaving or not app.return_code
+    finally:
+        engine = app.engine
+        if engine is not None:
+            # However the screen ended, nobody watches the arm from here on. An arm that is already parking continues.
+            if not engine.finished and not app.leaving:
+                engine.stop()
+            if not intact:
+                # The engine's thread dies with the process: let it bring the arm to rest and close the session first.
+                with contextlib.suppress(CollectAborted):
+                    engine.join()
+    if not intact:
+        raise ScreenCrashed("the screen crashed; the arm was stopped")
+
+
+def _signals(app: OperatorApp) -> AbstractContextManager[None]:
+    """On a signal end the run as without a screen, then the screen."""
+
+    def on_signal(number: int) -> None:
+        if app.engine is not None:
+            obey(app.engine, number)
+        app.leave()
+
+    return stop_signals(on_signal)

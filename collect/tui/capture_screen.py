@@ -2,136 +2,183 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
-from textual import events
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
+from textual.widgets import Footer
 
-from brushloop.collect.tui.large import BOTH, CAPTURED, PREDICTED, LargeCapture, limit_text, number_text
-from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.text import one_line, plain
-from brushloop.collect.tui.widgets import KeyBar, Line, app_of
+from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.widgets import STOP, Line, condition_text, labelled, one_line, plain
 
-KEYS = (("escape", "back"), ("→", "next picture"), ("1-4", "picture"))
-KEYS_AT_WORK = (("s", "STOP"), *KEYS)
-TWO_COLUMNS = 150
-"""Width from which the photograph is shown beside the other pictures."""
-NAME, VALUE = 10, 6
-"""Columns of a check's name and value: with its limit and unit they fit beside the picture."""
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from brushloop.collect.engine.last_capture import LastCapture
+    from brushloop.collect.quality.verdict import Check
+    from brushloop.sessions import records
+    from brushloop.sessions.events import Press
+
+    AnyCheck = Check | records.Check
+    """A check of a capture, from the running engine or from a recording."""
+
+WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
+"""Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
+OVERLAY_PX = 384
+LINE_PX = 3
 
 
-class CaptureScreen(Screen[None]):
+@dataclass(frozen=True, slots=True, eq=False)
+class LargeCapture:
+    """One capture, for the large view."""
+
+    press: Press
+    photo: NDArray[np.uint8] | None
+    binary: NDArray[np.bool_] | None
+    predicted: NDArray[np.bool_] | None
+    """Mark that a model predicts on the field of `binary`; None without one."""
+    model: str
+    """Which model that is, or why there is none."""
+    csim: float | None
+    checks: tuple[AnyCheck, ...]
+
+    def pictures(self) -> dict[str, NDArray[np.uint8]]:
+        """The pictures there are, by name, in the order in which they are shown."""
+        both = self.binary is not None and self.predicted is not None
+        named = {
+            "photograph": self.photo,
+            "binarised": binary_picture(self.binary),
+            "overlay": over_photograph(self.photo, self.predicted) if both and self.photo is not None else None,
+            "difference": difference(self.binary, self.predicted) if both else None,
+        }
+        return {name: picture for name, picture in named.items() if picture is not None}
+
+
+def of_last(last: LastCapture) -> LargeCapture:
+    """The newest capture of a run, with CCD-BSM as published."""
+    model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
+    checks = () if last.verdict is None else last.verdict.checks
+    return LargeCapture(last.press, last.photo, last.binary, last.model, model, last.likeness, checks)
+
+
+def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """The edge of the predicted mark on the photograph of the same field."""
+    import cv2
+    import numpy as np
+
+    picture = cv2.cvtColor(cv2.resize(photo, (OVERLAY_PX, OVERLAY_PX)), cv2.COLOR_GRAY2RGB)
+    mask = cv2.resize(np.asarray(predicted, np.uint8), (OVERLAY_PX, OVERLAY_PX), interpolation=cv2.INTER_LINEAR)
+    edges, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(picture, edges, -1, PREDICTED, LINE_PX), np.uint8)
+
+
+def difference(captured: NDArray[np.bool_] | None, predicted: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """Where both have ink, only the capture has it, and only the prediction has it."""
+    import numpy as np
+
+    colours = np.array((WHITE, PREDICTED, CAPTURED, BOTH), np.uint8)
+    return colours[2 * np.asarray(captured, np.uint8) + np.asarray(predicted, np.uint8)]
+
+
+def checks_content(checks: tuple[AnyCheck, ...]) -> Content:
+    """A line for each check with value and limit, those missed first, with what to do about them."""
+    lines: list[Content] = []
+    for check in sorted(checks, key=lambda check: check.passed):
+        sign, style = ("✓", "") if check.passed else ("!", "bold $text-warning")
+        value = f"{sign} {check.name:<10}{_number(check.score):>6}"
+        lines.append(Content.assemble((value, style), (f"  {_limit(check)}", "dim")))
+        if check.reason:
+            lines.append(Content(plain(check.reason)))
+    return Content("\n").join(lines or [Content.styled("not judged", "dim")])
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
+
+
+def _limit(check: AnyCheck) -> str:
+    """`≤ 0.25 mm`, or nothing for a check without a limit."""
+    if check.score is None or check.threshold is None:
+        return ""
+    sign = "≤" if (check.score <= check.threshold) == check.passed else "≥"
+    return f"{sign} {_number(check.threshold)} {getattr(check, 'unit', '')}".rstrip()
+
+
+class CaptureScreen(Screen[None], inherit_bindings=False):
     """One capture; arrows and digits choose the picture."""
 
     AUTO_FOCUS = None
     DEFAULT_CSS = """
     CaptureScreen #large-title { height: 1; padding: 0 1; background: $panel; text-style: bold; }
-    CaptureScreen #large-body { height: 1fr; }
     CaptureScreen #large-pictures { width: 1fr; padding: 0 1; }
     CaptureScreen #large-names { height: 1; text-wrap: nowrap; }
-    CaptureScreen #large-photo { display: none; margin-right: 1; }
-    CaptureScreen.-two #large-photo { display: block; }
     CaptureScreen #large-side { width: 36; padding: 0 1; border-left: solid $foreground 40%; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape,enter,q", "back", "Back"),
+        STOP,
+        Binding("escape,enter,q", "app.pop_screen", "Back"),
         Binding("right,tab", "turn(1)", "Next picture"),
         Binding("left,shift+tab", "turn(-1)", "Picture before"),
         *(Binding(str(number), f"choose({number - 1})", "Picture", show=False) for number in range(1, 5)),
     ]
 
-    def __init__(self, capture: LargeCapture, pictures: Pictures, *, at_work: bool) -> None:
-        """`at_work`: whether a run is on, which `s` stops."""
+    def __init__(self, capture: LargeCapture, pictures: Pictures) -> None:
         super().__init__()
         self._capture = capture
         self._images = capture.pictures()
-        self._at = len(self._images) - 1
-        self._names = Line("large-names")
-        self._photo, self._picture = pictures.make("large-photo"), pictures.make("large-picture")
-        self._keys = KeyBar(KEYS_AT_WORK if at_work else KEYS)
+        self._at = len(self._images) - 1  # the last picture says most
+        self._names, self._picture = Line("large-names"), pictures.make("large-picture")
 
     def compose(self) -> ComposeResult:
-        """Lay out the pictures beside the checks."""
-        title = Line("large-title")
-        title.show(one_line(self._capture.title))
+        """Lay out the picture beside the checks."""
+        title, words = Line("large-title"), Line("large-words")
+        press = self._capture.press
+        title.show(f"{one_line(press.stroke_id)}   {condition_text(press.condition)}")
+        words.show(words_content(self._capture))
         yield title
-        with Horizontal(id="large-body"):
+        with Horizontal():
             with Vertical(id="large-pictures"):
                 yield self._names
-                with Horizontal():
-                    yield self._photo
-                    yield self._picture
-            with VerticalScroll(id="large-side") as side:
-                side.can_focus = False
-                words = Line("large-words")
-                words.show(words_content(self._capture))
+                yield self._picture
+            with VerticalScroll(id="large-side", can_focus=False):
                 yield words
-        yield self._keys
+        yield Footer()
 
     def on_mount(self) -> None:
-        """Show the last picture, which says most."""
-        self._photo.show(self._capture.photo)
-        self._show()
-
-    def on_resize(self, event: events.Resize) -> None:
-        """Show the photograph beside the picture where there is room."""
-        self.set_class(event.size.width >= TWO_COLUMNS, "-two")
-
-    def action_back(self) -> None:
-        """Go back."""
-        app_of(self).pop_screen()
+        """Show the picture."""
+        self.action_choose(self._at)
 
     def action_turn(self, by: int) -> None:
         """Show the next picture, or the one before."""
-        if self._images:
-            self.action_choose((self._at + by) % len(self._images))
+        self.action_choose((self._at + by) % max(len(self._images), 1))
 
     def action_choose(self, at: int) -> None:
         """Show the picture of this number, if there is one."""
-        if at < len(self._images):
-            self._at = at
-            self._show()
-
-    def _show(self) -> None:
         if not self._images:
             self._names.show("no picture: the board is not seen in this photograph")
-            return
-        names = list(self._images)
-        self._names.show(
-            Content("  ").join(
-                Content.styled(f" {number} {name} ", "bold reverse" if number == self._at + 1 else "dim")
-                for number, name in enumerate(names, 1)
+        elif at < len(self._images):
+            self._at = at
+            names = (
+                Content.styled(f" {n + 1} {name} ", "bold reverse" if n == at else "dim")
+                for n, name in enumerate(self._images)
             )
-        )
-        self._picture.show(self._images[names[self._at]])
+            self._names.show(Content("  ").join(names))
+            self._picture.show(list(self._images.values())[at])
 
 
 def words_content(capture: LargeCapture) -> Content:
-    """The checks with value and limit, those missed first with what to do; then what is compared."""
-    lines: list[Content] = []
-    missed = [check for check in capture.checks if not check.passed]
-    for check in missed:
-        lines.append(_row("!", check.name, number_text(check.score), limit_text(check), "bold $text-warning"))
-        lines.append(Content(plain(check.reason)))
-    if missed:
-        lines.append(Content(""))
-    for check in capture.checks:
-        if check.passed:
-            lines.append(_row("✓", check.name, number_text(check.score), limit_text(check), ""))
-    if not capture.checks:
-        lines.append(Content.styled("not judged", "dim"))
-    lines += [Content(""), Content.styled(plain(capture.model), "bold")]
+    """The checks, then what is compared."""
+    lines = [checks_content(capture.checks), Content(""), Content.styled(plain(capture.model), "bold")]
     if capture.csim is not None:
-        lines.append(Content(f"CSIM {100.0 * capture.csim:.1f} % in mm"))
+        lines.append(labelled("CSIM", f"{100.0 * capture.csim:.1f} % in mm"))
     if capture.predicted is not None and capture.binary is not None:
         for colour, what in ((BOTH, "both"), (CAPTURED, "captured only"), (PREDICTED, "predicted only")):
             lines.append(Content.assemble(("██", "rgb({},{},{})".format(*colour)), f" {what}"))
     return Content("\n").join(lines)
-
-
-def _row(sign: str, name: str, value: str, limit: str, style: str) -> Content:
-    return Content.assemble((f"{sign} {name:<{NAME}}{value:>{VALUE}}", style), (f"  {limit}", "dim"))

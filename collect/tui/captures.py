@@ -1,4 +1,4 @@
-"""What the review shows of a session: its captures, their pictures, and how alike the presses of a patch are."""
+"""What the review shows of a session: its captures, their pictures, and how alike the presses of a condition are."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from brushloop.calibrate.session import lens_in_use
 from brushloop.calibrate.waits import unlike, waits_of
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch
-from brushloop.collect.tui.large import LargeCapture, title_of
+from brushloop.collect.tui.capture_screen import LargeCapture
 from brushloop.model.similarity import csim
 from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionDamaged
@@ -147,9 +147,7 @@ class Review:
         except CalibrationError as error:
             model = str(error)
         alike = likeness(pictures.binary, predicted)
-        return LargeCapture(
-            title_of(capture.press), pictures.photo, pictures.binary, predicted, model, alike, pictures.checks
-        )
+        return LargeCapture(capture.press, pictures.photo, pictures.binary, predicted, model, alike, pictures.checks)
 
     def _make_pictures(self, capture: ReviewCapture) -> CapturePictures:
         path = self.folder / capture.file
@@ -167,23 +165,16 @@ class Review:
                 stroke = Stroke.model_validate_json(message.data)
         if image is None:
             raise SessionDamaged(path, f"holds no still {capture.result.still}")
-        patch = self._cell(stroke)
-        if patch is None or self._board is None:
-            return CapturePictures(image, None, log_ns, checks)
+        whole = CapturePictures(image, None, log_ns, checks)
+        if stroke is None or stroke.cell_mm is None or self._board is None:
+            return whole  # a take that does not count has no stroke record
         if self._lens is not None:
             if image.shape[::-1] != self._lens.size_px:
-                return CapturePictures(image, None, log_ns, checks)  # the lens was calibrated for another size
+                return whole  # the lens was calibrated for another size
             image = self._lens.undistort(image)
         try:
             self._plane = see_board(image, self._board)
         except CalibrationError:
             if self._plane is None:
-                return CapturePictures(image, None, log_ns, checks)
-        photo, binary = pictures_of(image, self._plane, patch)
-        return CapturePictures(photo, binary, log_ns, checks)
-
-    def _cell(self, stroke: Stroke | None) -> Patch | None:
-        """Where the stroke lies; None for a take that does not count, which has no stroke record and is shown whole."""
-        if stroke is None or stroke.cell_mm is None:
-            return None
-        return Patch(0, *stroke.cell_mm)
+                return whole
+        return CapturePictures(*pictures_of(image, self._plane, Patch(0, *stroke.cell_mm)), log_ns, checks)

@@ -1,18 +1,22 @@
-"""Pictures in a terminal: braille cells that work anywhere, or pixels where textual-image finds that it has them."""
+"""Pictures in a terminal: braille cells that work anywhere, or pixels where textual-image finds that it has them.
+
+A braille cell has eight dots and two colours. Its ground has the colour of most of its pixels; the dots are the others.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
+from rich.segment import Segment
+from rich.style import Style
 from textual.app import ComposeResult
 from textual.containers import Container
 from textual.geometry import Region, Size
 from textual.strip import Strip
 from textual.widget import Widget
-
-from brushloop.collect.tui.dots import Cells
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,6 +24,61 @@ if TYPE_CHECKING:
 
 Preview = Literal["auto", "cells", "off"]
 """How pictures are shown: in pixels where the terminal has them, in cells, or without those of the camera."""
+EMPTY = 0x2800
+"""The braille pattern without dots; its 256 patterns follow each other."""
+ROWS, COLUMNS = 4, 2
+BITS = (0x01, 0x08, 0x02, 0x10, 0x04, 0x20, 0x40, 0x80)
+"""The bit of each dot, row by row."""
+LEVELS = 32
+"""Steps of red, green and blue: fewer colours make longer runs, less to send over a slow line."""
+COLOURS = LEVELS**3
+FLAT = 24
+"""Sum over three colours by which the pixels of a cell may differ without being drawn as dots: noise of the camera."""
+
+
+def braille(image: NDArray[np.uint8], size: Size) -> NDArray[np.int64]:
+    """Fit a gray (h, w) or RGB (h, w, 3) picture into cells, its shape kept: (lines, columns) of
+    `(colour of the dots * COLOURS + colour of the ground) * 256 + dots`."""
+    import cv2
+    import numpy as np
+
+    scale = min(COLUMNS * size.width / image.shape[1], ROWS * size.height / image.shape[0])
+    columns = max(1, int(image.shape[1] * scale / COLUMNS))
+    lines = max(1, int(image.shape[0] * scale / ROWS))
+    small = np.asarray(cv2.resize(image, (COLUMNS * columns, ROWS * lines), interpolation=cv2.INTER_AREA), np.int64)
+    pixels = small if small.ndim == 3 else small[..., None].repeat(3, axis=2)
+    blocks = pixels.reshape(lines, ROWS, columns, COLUMNS, 3).swapaxes(1, 2).reshape(lines, columns, -1, 3)
+    bright = blocks.sum(-1)
+    low, high = bright.min(-1), bright.max(-1)
+    dark = (2 * bright < (low + high)[..., None]) & (high - low >= FLAT)[..., None]
+    count = dark.sum(-1)[..., None]
+    bright_mean = (blocks * ~dark[..., None]).sum(2) // (ROWS * COLUMNS - count)
+    dark_mean = (blocks * dark[..., None]).sum(2) // np.maximum(count, 1)  # nowhere drawn where there are none
+    mostly_dark = count > ROWS * COLUMNS // 2
+    dots = (dark ^ mostly_dark) @ np.array(BITS)
+    places = np.array((LEVELS * LEVELS, LEVELS, 1))
+    dark_number, bright_number = dark_mean * LEVELS // 256 @ places, bright_mean * LEVELS // 256 @ places
+    dark_ground = mostly_dark[..., 0]
+    ground = np.asarray(np.where(dark_ground, dark_number, bright_number), np.int64)
+    other = np.asarray(np.where(dark_ground, bright_number, dark_number), np.int64)
+    return (other * COLOURS + ground) * 256 + dots
+
+
+def strip_of(line: NDArray[np.int64]) -> Strip:
+    """One line of cells as text."""
+    segments: list[Segment] = []
+    for pair, cells in groupby(line.tolist(), lambda cell: cell // 256):
+        segments.append(Segment("".join(chr(EMPTY + cell % 256) for cell in cells), _style(pair)))
+    return Strip(segments, len(line))
+
+
+@lru_cache(maxsize=4096)
+def _style(pair: int) -> Style:
+    def rgb(number: int) -> str:
+        parts = number // (LEVELS * LEVELS), number // LEVELS % LEVELS, number % LEVELS
+        return "rgb({},{},{})".format(*(255 * part // (LEVELS - 1) for part in parts))
+
+    return Style.parse(f"{rgb(pair // COLOURS)} on {rgb(pair % COLOURS)}")
 
 
 class CellPicture(Widget):
@@ -32,33 +91,34 @@ class CellPicture(Widget):
     def __init__(self, id: str | None = None) -> None:  # noqa: A002 - textual's name
         super().__init__(id=id)
         self._image: NDArray[np.uint8] | None = None
-        self._cells = Cells(None, Size())
+        self._cells: NDArray[np.int64] | None = None
         self._made_for: Size | None = None
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
         """Draw the lines of this picture that changed; nothing where it is the same object."""
         if image is self._image:
             return
-        self._image, before = image, self._cells.codes
-        self._fit(self._cells)
-        codes = self._cells.codes
-        if before is None or codes is None or before.shape != codes.shape or image is None or image.ndim == 3:
+        self._image, before = image, self._cells
+        self._fit()
+        if before is None or self._cells is None or before.shape != self._cells.shape:
             self.refresh()
             return
-        for y in (before != codes).any(axis=1).nonzero()[0].tolist():
+        for y in (before != self._cells).any(axis=1).nonzero()[0].tolist():
             self.refresh(Region(0, y, self.size.width, 1))
 
     def render_line(self, y: int) -> Strip:
         """Draw one line of cells."""
         if self._made_for != self.size:
-            self._fit(None)
+            self._fit()
         width, ground = self.size.width, self.rich_style
-        if self._cells.codes is None or y >= len(self._cells.codes):
+        if self._cells is None or y >= len(self._cells):
             return Strip.blank(width, ground)
-        return self._cells.strip(y).extend_cell_length(width, ground)
+        return strip_of(self._cells[y]).extend_cell_length(width, ground)
 
-    def _fit(self, before: Cells | None) -> None:
-        self._cells, self._made_for = Cells(self._image, self.size, before), self.size
+    def _fit(self) -> None:
+        self._made_for = self.size
+        drawn = self._image is not None and self._image.size and self.size.area
+        self._cells = braille(self._image, self.size) if drawn and self._image is not None else None
 
 
 class ImagePicture(Container):
@@ -80,15 +140,11 @@ class ImagePicture(Container):
 
     def show(self, image: NDArray[np.uint8] | None) -> None:
         """Draw this picture, unless it is the same object."""
-        if image is self._image:
-            return
-        self._image = image
-        if image is None:
-            self._inner.image = None
-            return
         from PIL import Image
 
-        self._inner.image = Image.fromarray(image)
+        if image is not self._image:
+            self._image = image
+            self._inner.image = None if image is None else Image.fromarray(image)
 
 
 AnyPicture = CellPicture | ImagePicture
@@ -118,8 +174,8 @@ def _best_kind() -> Callable[[str], AnyPicture]:
     return CellPicture
 
 
-def binary_picture(binary: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def binary_picture(binary: NDArray[np.bool_] | None) -> NDArray[np.uint8] | None:
     """Ink black on white."""
     import numpy as np
 
-    return np.where(binary, 0, 255).astype(np.uint8)
+    return None if binary is None else np.where(binary, 0, 255).astype(np.uint8)

@@ -1,10 +1,11 @@
-"""Questions to the operator: the engine's, with its picture and its answers on keys, and the screen's own yes or no.
+"""Questions to the operator, with their answers on keys: the engine's, and the screen's own.
 
-The stop keys work over both.
+The stop keys work over all of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar
 
 from textual import events
@@ -13,32 +14,35 @@ from textual.binding import Binding, BindingType
 from textual.containers import Vertical
 from textual.content import Content
 from textual.screen import ModalScreen
-from textual.widgets import Static
+from textual.widgets import Footer, Static
 
 from brushloop.collect.errors import NOT_AT_REST
-from brushloop.collect.headless import RunnableEngine
-from brushloop.collect.operator import Prompt
+from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.text import plain
-from brushloop.collect.tui.widgets import Line
+from brushloop.collect.tui.widgets import HELP_KEY, STOP, Line, app_of, plain
 
-LEAVE_LINE = "q  leave: park the arm, answer nothing"
-STOP_LINE = "s  stop the arm now: software stop; red button: emergency stop"
-LEAVE_KEYS = "y  leave it as it is      n  stay"
-AT_WORK = (
-    "A run is in progress. Finish its step, park the arm, and leave?",
-    "y  park and leave      n  go on      s  stop now",
+YES, NO = "y", "n"
+
+
+def yes_or_no(question: str, yes: str, no: str) -> Prompt:
+    """A question of the screen itself; escape means no."""
+    return Prompt(question, (Choice(YES, yes), Choice(NO, no)), NO)
+
+
+LEAVE = yes_or_no(
+    "A run is in progress. Finish its step, park the arm, and leave?", "park the arm and leave", "let the run continue"
 )
-NOT_PARKED = (
+NOT_PARKED = yes_or_no(
     "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
     "The next run begins by lifting it. Leave it as it is?",
-    LEAVE_KEYS,
+    "leave it as it is",
+    "stay",
 )
-UNSEEN = (f"{NOT_AT_REST} Leave this screen anyway?", LEAVE_KEYS)
+UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it is", "stay")
 
 
-class AskScreen(ModalScreen[None]):
-    """Shows one prompt of the engine until it is answered."""
+class AskScreen(ModalScreen[str]):
+    """One question. The engine's stays until the engine has its answer; the screen's own ends with the key."""
 
     DEFAULT_CSS = """
     AskScreen { align: center middle; }
@@ -46,78 +50,74 @@ class AskScreen(ModalScreen[None]):
         width: 90%; max-width: 76; height: auto; max-height: 95%; padding: 0 2;
         border: heavy $warning; background: $surface; overflow-y: auto;
     }
-    AskScreen #question { text-style: bold; margin-bottom: 1; }
+    AskScreen #question { margin-bottom: 1; }
     AskScreen #cause { height: 9; margin-bottom: 1; }
     AskScreen #live { height: auto; margin: 1 0; background: $boost; text-wrap: nowrap; }
-    AskScreen #left { color: $text-muted; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("q", "app.quit", "Leave"),
-        Binding("question_mark", "app.help", "Help"),
+        STOP,
+        Binding("q", "leave", "Leave: park the arm, answer nothing"),
+        Binding("escape", "refuse", "Back"),
+        HELP_KEY,
     ]
 
-    def __init__(self, prompt: Prompt, engine: RunnableEngine, pictures: Pictures) -> None:
+    def __init__(
+        self, prompt: Prompt, answer: Callable[[str], object] | None = None, pictures: Pictures | None = None
+    ) -> None:
+        """`answer` passes a key on to the engine; without it the question is the screen's own."""
         super().__init__()
         self.prompt = prompt
-        self._engine = engine
-        self._pictures = pictures
+        self._answer = answer
+        self._pictures = pictures or Pictures()
         self._live = Line("live")
+
+    @property
+    def own(self) -> bool:
+        """Whether the screen itself asks, not the engine."""
+        return self._answer is None
 
     def compose(self) -> ComposeResult:
         """Lay out the question, its picture, and a line for each answer."""
         with Vertical():
-            yield Static(plain(self.prompt.question), id="question", markup=False)
+            yield Static(question_content(self.prompt), id="question", markup=False)
             if self.prompt.image is not None:
                 picture = self._pictures.make("cause")
                 picture.show(self.prompt.image)
                 yield picture
-            yield Static(_choices_content(self.prompt), markup=False)
-            yield self._live
-            yield Static(LEAVE_LINE, markup=False)
-            yield Static(STOP_LINE, markup=False)
-            yield Static("Waits until it is answered; the arm does not move meanwhile.", id="left", markup=False)
+            if not self.own:
+                yield self._live
+                yield Static("Waits until it is answered; the arm does not move meanwhile.", markup=False)
+        yield Footer(compact=True, show_command_palette=False)
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Escape answers only the screen's own questions, and q leaves only the engine's."""
+        if action in ("refuse", "leave"):
+            return self.own is (action == "refuse")
+        return super().check_action(action, parameters)
 
     def on_key(self, event: events.Key) -> None:
         """Answer, if it is the key of an answer."""
-        if any(choice.key == event.character for choice in self.prompt.choices):
+        if self.prompt.answer_to(event.character or "") is not None:
             event.stop()
-            self._engine.answer(self.prompt.number, str(event.character))
+            (self._answer or self.dismiss)(str(event.character))
+
+    async def action_leave(self) -> None:
+        """Leave the run, whatever is asked."""
+        await app_of(self).action_quit()
+
+    def action_refuse(self) -> None:
+        """Answer what changes nothing."""
+        self.dismiss(self.prompt.default)
 
     def show(self, live: Content) -> None:
         """Show where the arm is and what it feels: a person who jogs, or turns the lens, watches that."""
         self._live.show(live)
 
 
-def _choices_content(prompt: Prompt) -> Content:
-    """A line for each answer."""
-    return Content("\n").join(
-        Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}") for choice in prompt.choices
-    )
-
-
-class Confirm(ModalScreen[bool]):
-    """A question of the screen itself with yes and no; true for yes."""
-
-    DEFAULT_CSS = """
-    Confirm { align: center middle; }
-    Confirm Vertical {
-        width: 90%; max-width: 64; height: auto; padding: 1 2; border: heavy $warning; background: $surface;
-    }
-    Confirm Static { text-align: center; }
-    Confirm #question { text-style: bold; margin-bottom: 1; }
-    """
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("y", "dismiss(True)", "Yes"),
-        Binding("n,escape", "dismiss(False)", "No"),
-    ]
-
-    def __init__(self, question: str, keys: str) -> None:
-        super().__init__()
-        self._question = question
-        self._keys = keys
-
-    def compose(self) -> ComposeResult:
-        """Lay out the question and its keys."""
-        with Vertical():
-            yield Static(self._question, id="question", markup=False)
-            yield Static(self._keys, id="keys", markup=False)
+def question_content(prompt: Prompt) -> Content:
+    """The question, a line for each answer, and what else is allowed."""
+    lines = [Content.styled(plain(prompt.question), "bold")]
+    for choice in prompt.choices:
+        mark = "   (Enter)" if prompt.default == choice.key and "enter" in prompt.answers else ""
+        lines.append(Content.assemble((choice.key, "bold $text-accent"), f"  {plain(choice.label)}{mark}"))
+    return Content("\n").join([*lines, Content(plain(prompt.allowed))] if prompt.allowed else lines)

@@ -6,129 +6,133 @@ import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.teach.guide import Answer, LeftOff, Picture, Question, Shown, StepState, WentBack
+from brushloop.collect.operator import Asker, Choice, Prompt
+from brushloop.collect.teach.guide import (
+    Answer,
+    Brought,
+    JogStep,
+    JogView,
+    Picture,
+    Question,
+    Shown,
+    StepState,
+    number_in,
+)
 from brushloop.drivers.devices import Pose
 
 MOST_FINDINGS = 200
 """Findings that can be scrolled back to."""
-
-
-@dataclass(frozen=True, slots=True)
-class TeachView:
-    """Everything that the screen shows; replaced whole, so that any thread may read it."""
-
-    steps: tuple[StepState, ...] = ()
-    findings: tuple[Shown, ...] = ()
-    question: Question | None = None
-    picture: Picture | None = None
-    """The newest picture of a finding."""
-    tip: Pose | None = None
-    """Where the tip is now, or the flange before the tip is taught."""
-    tip_known: bool = False
-    live: Picture | None = None
-    """What the camera sees now, where that is known."""
-    doing: str = ""
-    """What is at work while nothing is asked; empty where no step has said so."""
-    doing_since_s: float = 0.0
-    """Since when, by `time.monotonic`."""
+JOG_KEYS: Mapping[str, tuple[Literal["x", "y", "z"], float]] = {
+    "left": ("x", -1.0),
+    "right": ("x", 1.0),
+    "down": ("y", -1.0),
+    "up": ("y", 1.0),
+    "pagedown": ("z", -1.0),
+    "pageup": ("z", 1.0),
+}
+THERE = Choice("enter", "it is there")
+BY_KEYS = Choice("j", "bring the tip the last millimetres by keys")
+SKIP = Choice("k", "skip it")
 
 
 class ScreenGuide:
-    """`Guide` for a screen. The methods that a step awaits run in the steps' event loop, all others in any thread."""
+    """`Guide` for a screen, which reads its fields. What a step awaits runs in the steps' loop, all else anywhere."""
 
     def __init__(self, findings: tuple[Shown, ...] = ()) -> None:
         """`findings` are those of an earlier run, which was stopped."""
-        self._lock = threading.Lock()
-        self._view = TeachView(findings=findings, doing_since_s=time.monotonic())
-        self._count = 0
-        self._open: tuple[asyncio.AbstractEventLoop, asyncio.Future[Answer]] | None = None
-        self._leaving = False
-
-    @property
-    def view(self) -> TeachView:
-        """What the screen should show now."""
-        with self._lock:
-            return self._view
-
-    # Of the steps
+        self.asker = Asker(watched=True)
+        self.steps: tuple[StepState, ...] = ()
+        self.findings = findings
+        self.picture: Picture | None = None
+        """The newest picture of a finding."""
+        self.tip: Pose | None = None
+        """Where the tip is now, or the flange before the tip is taught."""
+        self.tip_known = False
+        self.live: Picture | None = None
+        """What the camera sees now, where that is known."""
+        self.question: Question | None = None
+        self.doing: tuple[str, float] = ("", time.monotonic())
+        """What is at work while nothing is asked, empty where no step has said so, and since when."""
+        self._size = 0
+        """Index of the size of a step by jog."""
 
     async def overview(self, steps: tuple[StepState, ...]) -> None:
         """Show the steps and their states."""
-        self._change(steps=steps)
+        self.steps = steps
 
     async def show(self, what: Shown) -> None:
         """Add a finding, and show its picture if it has one; progress is shown until there is something newer."""
         if what.tone == "progress":
-            self._change(doing=" ".join(what.lines), doing_since_s=time.monotonic())
+            self.doing = " ".join(what.lines), time.monotonic()
             return
-        findings = (*self.view.findings, what)[-MOST_FINDINGS:]
-        self._change(findings=findings, picture=self.view.picture if what.picture is None else what.picture)
+        self.findings = (*self.findings, what)[-MOST_FINDINGS:]
+        self.picture = self.picture if what.picture is None else what.picture
 
     async def ask(self, question: Question) -> Answer:
-        """Show the question and wait for the answer; the screen takes only one that the question allows."""
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[Answer] = loop.create_future()
-        with self._lock:
-            if self._leaving:
-                raise LeftOff
-            self._count += 1
-            self._open = (loop, future)
-            self._view = replace(self._view, question=replace(question, number=self._count))
+        """Wait for the answer. While the tip is jogged, digits choose the size of the steps, and nothing else."""
+        self.question = question
         try:
-            return await future
+            while isinstance(answer := await self.asker.ask(self._prompt(question)), int):
+                self._size = answer - 1
+            return answer
         finally:
-            with self._lock:
-                self._open = None
-                self._view = replace(self._view, question=None, doing="", doing_since_s=time.monotonic())
+            self.question, self.doing = None, ("", time.monotonic())
+
+    def _prompt(self, question: Question) -> Prompt:
+        text, default = question.text, question.default
+        match question.kind:
+            case "choose":
+                return Prompt(text, question.choices, default, answers={"enter": default} if default else {})
+            case "text":
+                return Prompt(text, default=default, read=str)
+            case "number":
+
+                def read(line: str) -> float:
+                    return number_in(line, question.unit, question.low, question.high)
+
+                allowed = f"{question.low:g} to {question.high:g} {question.unit}"
+                return Prompt(text, default=default, read=read, allowed=allowed)
+            case "bring":
+                answers = {"enter": Brought.DONE}
+                answers |= {"j": Brought.JOG} if question.may_jog else {}
+                answers |= {"k": Brought.SKIP} if question.may_skip else {}
+                choices = tuple(choice for choice in (THERE, BY_KEYS, SKIP) if choice.key in answers)
+                return Prompt(text, choices, answers=answers)
+            case "jog":
+                assert question.jog is not None
+                return self._jog_prompt(text, question.jog)
+
+    def _jog_prompt(self, text: str, view: JogView) -> Prompt:
+        chosen_mm = view.steps_mm[min(self._size, len(view.steps_mm) - 1)]
+        answers: dict[str, object] = {"enter": Brought.DONE}
+        answers |= {str(n): n for n in range(1, len(view.steps_mm) + 1)}
+        answers |= {key: JogStep(axis, sign * chosen_mm) for key, (axis, sign) in JOG_KEYS.items()}
+        sizes = (f"{'›' if mm == chosen_mm else ' '}{n}: {mm:g} mm" for n, mm in enumerate(view.steps_mm, 1))
+        lines = [
+            f"moved by ({', '.join(f'{v:+.2f}' for v in view.moved_mm)}) mm, base x y z",
+            f"step  {'  '.join(sizes)}",
+            "arrows: x y   page up, page down: z   enter: it is there",
+            *([f"! {view.refused}"] if view.refused else []),
+        ]
+        return Prompt(text, answers=answers, allowed="\n".join(lines))
 
     def see_pose(self, tip: Pose | None, tip_known: bool) -> None:
         """Show where the arm is."""
-        self._change(tip=tip, tip_known=tip_known)
-
-    def see_picture(self, picture: Picture | None) -> None:
-        """Show what the camera sees."""
-        self._change(live=picture)
+        self.tip, self.tip_known = tip, tip_known
 
     @property
     def looking(self) -> bool:
         """Whether the person guides something by hand, and wants to see it."""
-        question = self.view.question
-        return question is not None and question.kind in ("bring", "jog")
+        return self.question is not None and self.question.kind in ("bring", "jog")
 
-    # Of the screen
-
-    def answer(self, number: int, answer: Answer) -> None:
-        """Answer the question of that number; nothing happens if it is answered already."""
-        self._settle(number, lambda future: future.set_result(answer))
-
-    def back(self, number: int) -> None:
-        """Go back to the question before."""
-        self._settle(number, lambda future: future.set_exception(WentBack()))
-
-    def leave(self) -> None:
-        """End at the open question, or at the next one."""
-        with self._lock:
-            self._leaving, question = True, self._view.question
-        if question is not None:
-            self._settle(question.number, lambda future: future.set_exception(LeftOff()))
-
-    def _settle(self, number: int, settle: Callable[[asyncio.Future[Answer]], None]) -> None:
-        with self._lock:
-            if self._open is None or self._view.question is None or self._view.question.number != number:
-                return
-            loop, future = self._open
-            self._open = None
-        loop.call_soon_threadsafe(lambda: None if future.done() else settle(future))
-
-    def _change(self, **fields: Any) -> None:
-        with self._lock:
-            self._view = replace(self._view, **fields)
+    def see_picture(self, picture: Picture | None) -> None:
+        """Show what the camera sees."""
+        self.live = picture
 
 
 class Teaching:

@@ -8,41 +8,24 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
+import signal
+import subprocess
+import sys
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TextIO
 
 from rich.segment import Segment
+from textual import events
 from textual.app import App, SystemCommand
 from textual.color import Color
 from textual.drivers.linux_driver import LinuxDriver
 from textual.filter import LineFilter
 from textual.screen import Screen
-from textual.theme import BUILTIN_THEMES
+from textual.widgets import HelpPanel
 
-from brushloop.sessions.terminal import inert
+from brushloop.sessions.terminal import inert, plain
 
-DARK = "textual-dark"
-MAX_BYTES = 64
-
-
-def theme_file() -> Path:
-    """Where the choice of colours is kept for the next start."""
-    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(state) / "brushloop" / "theme"
-
-
-def chosen_theme(file: Path | None) -> str:
-    """The theme that was chosen last; dark where none was, or where the file holds anything else."""
-    if file is None:
-        return DARK
-    try:
-        with file.open("rb") as stream:
-            name = stream.read(MAX_BYTES).decode("ascii", "replace").strip()
-    except OSError:
-        return DARK
-    return name if name in BUILTIN_THEMES else DARK
+STOP_KEYS = frozenset({"s", "ctrl+c"})
 
 
 class TerminalDriver(LinuxDriver):
@@ -68,24 +51,58 @@ class TerminalDriver(LinuxDriver):
 
 
 class PlainApp(App[None]):
-    """An app that shows text of any origin without letting it control the terminal, in the colours that were chosen."""
+    """An app that shows text of any origin without letting it control the terminal, and takes stop keys first."""
 
-    def __init__(self, theme_file: Path | None = None) -> None:
-        """`theme_file` keeps the choice of colours; None where it is not kept."""
+    TITLE = "brushloop"
+    # A selection would be copied with ctrl+c, which is a stop key here.
+    ALLOW_SELECT = False
+
+    def __init__(self) -> None:
         super().__init__(driver_class=TerminalDriver)
-        self._theme_file = theme_file
-        self.theme = chosen_theme(theme_file)
+
+    async def on_event(self, event: events.Event) -> None:
+        """Handle stop keys before textual, which would give a letter to a field that takes text, as in the palette."""
+        if isinstance(event, events.Key) and event.key in STOP_KEYS and self.stops(event):
+            self.action_stop()
+            return
+        await super().on_event(event)
+
+    def stops(self, event: events.Key) -> bool:
+        """Whether this stop key stops the arm now."""
+        raise NotImplementedError
+
+    def action_stop(self) -> None:
+        """Stop the arm at once."""
+        raise NotImplementedError
+
+    def action_help(self) -> None:
+        """Show or hide textual's list of the keys of this screen."""
+        (self.action_hide_help_panel if self.screen.query(HelpPanel) else self.action_show_help_panel)()
+
+    def run_command(self, *words: str) -> None:
+        """Hand the terminal to a command of brushloop, which may take minutes, and come back on Enter.
+
+        Ctrl-c ends the command, not the screen.
+        """
+
+        def ignore(_number: int, _frame: object) -> None:
+            pass
+
+        with self.suspend():
+            before = signal.signal(signal.SIGINT, ignore)
+            try:
+                sys.stdout.write(f"$ brushloop {plain(' '.join(words))}\n")
+                sys.stdout.flush()
+                code = subprocess.run([sys.executable, "-m", "brushloop", *words], check=False).returncode
+                sys.stdout.write(f"{f'exit code {code}' if code else 'done'}. Enter: back to the screen\n")
+                sys.stdout.flush()
+                sys.stdin.readline()
+            finally:
+                signal.signal(signal.SIGINT, before)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """Only the choice of colours: textual's own way to quit would leave a moving arm."""
         yield SystemCommand("Colours", "Choose dark, light or other colours", self.action_change_theme)
-
-    def watch_theme(self, name: str) -> None:
-        """Keep a choice; where the folder cannot be written, it holds until the program ends."""
-        if self._theme_file is not None and name != chosen_theme(self._theme_file):
-            with contextlib.suppress(OSError):
-                self._theme_file.parent.mkdir(parents=True, exist_ok=True)
-                self._theme_file.write_text(f"{name}\n", encoding="ascii")
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Add `PlainLines` after textual's own filters."""

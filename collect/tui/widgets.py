@@ -1,30 +1,30 @@
-"""Parts that several screens use: text that is drawn only when it changed, a list, the line of keys, the help page."""
+"""What several screens use: literal text that is drawn only when it changed, and values in words."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar, cast
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, ClassVar, cast
 
-from rich.cells import cell_len
-from textual import events
-from textual.app import App, ComposeResult, RenderResult
+from textual.app import App
 from textual.binding import Binding, BindingType
-from textual.containers import VerticalScroll
 from textual.content import Content
 from textual.dom import DOMNode
-from textual.screen import ModalScreen
 from textual.widget import Widget
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-Key = tuple[str, str]
-"""The key and what it does."""
-KEY_NAMES = {"?": "question_mark", "→": "right", "ctrl-p": "ctrl+p", "esc": "escape"}
-"""Textual's names of keys that are shown by another."""
+from brushloop.sessions import terminal
+
+if TYPE_CHECKING:
+    from brushloop.sessions.records import Condition
+
 NARROW_COLUMNS = 110
 """Width from which a picture has room beside the text."""
-GAP = 2
-CURSOR, ELSEWHERE = "›", " "
+SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
+SHORT_STOP = "s: software stop; red button: emergency stop"
+STOP = Binding("s", "app.stop", "STOP", tooltip="Stop the arm at once, on every screen and over every question")
+"""Shown first on every screen while the arm may move. The app takes this key and ctrl-c before any screen sees them."""
+HELP_KEY = Binding("question_mark", "app.help", "Help", key_display="?", tooltip="Every key of this screen, on and off")
 
 
 def app_of(node: DOMNode) -> App[None]:
@@ -49,94 +49,56 @@ class Line(Static):
             self.update(content, layout=not self._sized)
 
 
+class Rows(OptionList):
+    """A list whose rows are literal text."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("enter", "select", "Open")]
+
+    def __init__(self, place: str) -> None:
+        super().__init__(id=place, markup=False)
+
+    def fill(self, rows: Iterable[Content], at: int = 0) -> None:
+        """Replace all rows, and put the cursor on one of them."""
+        self.clear_options()
+        self.add_options(Option(row) for row in rows)
+        if self.option_count:
+            self.highlighted = min(at, self.option_count - 1)
+
+
 def entitle(widget: Widget, title: str) -> None:
     """Set the title in a widget's border, if it is new: textual draws the whole widget again."""
     if widget.border_title != title:
         widget.border_title = title
 
 
-class Rows(OptionList):
-    """A list whose row under the cursor carries a sign as well as a colour, for terminals without colours."""
-
-    def __init__(self, id: str) -> None:  # noqa: A002 - textual's name
-        super().__init__(id=id, markup=False)
-        self._rows: list[Content] = []
-        self._signed: int | None = None
-
-    def fill(self, rows: Sequence[tuple[str | None, Content]]) -> None:
-        """Replace all rows: the id of each, and its text."""
-        self._rows, self._signed = [content for _, content in rows], None
-        self.clear_options()
-        self.add_options(Option(Content.assemble(ELSEWHERE, content), id=name) for name, content in rows)
-
-    def watch_highlighted(self, highlighted: int | None) -> None:
-        """Move the sign with the cursor."""
-        super().watch_highlighted(highlighted)
-        for index, sign in ((self._signed, ELSEWHERE), (highlighted, CURSOR)):
-            if index is not None and index < len(self._rows):
-                self.replace_option_prompt_at_index(index, Content.assemble(sign, self._rows[index]))
-        self._signed = highlighted
+def plain(text: str) -> str:
+    """Escape every character that a terminal acts on; a device's reply may hold an escape code."""
+    return terminal.plain(text, keep="\n")
 
 
-class KeyBar(Widget):
-    """The line of keys at the bottom of a screen: as many as fit, in the order given."""
-
-    DEFAULT_CSS = """
-    KeyBar { dock: bottom; height: 1; background: $panel; color: $foreground; text-wrap: nowrap; padding: 0 1; }
-    """
-
-    def __init__(self, keys: Sequence[Key] = ()) -> None:
-        super().__init__()
-        self._keys = tuple(keys)
-        self._places: list[tuple[str, int, int]] = []
-        """Each key that is drawn, with its first column and the one after its last."""
-
-    def show(self, keys: Sequence[Key]) -> None:
-        """Replace the keys, if they differ."""
-        if tuple(keys) != self._keys:
-            self._keys = tuple(keys)
-            self.refresh()
-
-    def on_click(self, event: events.Click) -> None:
-        """Do what the key under the pointer does."""
-        # One column of padding.
-        key = next((key for key, start, end in self._places if start <= event.x - 1 < end), None)
-        if key is not None:
-            app_of(self).simulate_key(KEY_NAMES.get(key, key))
-
-    def render(self) -> RenderResult:
-        """Draw `s STOP  space pause  q leave ...` as far as it fits."""
-        parts: list[Content] = []
-        self._places = []
-        used = 0
-        for key, label in self._keys:
-            width = cell_len(key) + 1 + cell_len(label)
-            if used + width > self.size.width:
-                break
-            parts.append(Content.assemble((key, "bold $text-accent"), f" {label}"))
-            self._places.append((key, used, used + width))
-            used += width + GAP
-        return Content(" " * GAP).join(parts)
+def one_line(text: str) -> str:
+    """The same text on one line."""
+    return plain(" ".join(text.split()))
 
 
-class HelpScreen(ModalScreen[None]):
-    """Every key on one page; escape, q, ? and Enter close it."""
+def trouble(error: Exception | str) -> Content:
+    """What went wrong, in the colour of errors."""
+    return Content.styled(plain(str(error)), "bold $text-error")
 
-    DEFAULT_CSS = """
-    HelpScreen { align: center middle; }
-    HelpScreen VerticalScroll {
-        width: 80; max-width: 100%; height: auto; max-height: 100%; padding: 0 1;
-        border: heavy $accent; background: $surface;
-    }
-    """
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,question_mark,enter", "dismiss(None)", "Close")]
 
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self._text = text
+def labelled(name: str, text: Content | str, columns: int = 10) -> Content:
+    """A value after its name, which takes this many columns."""
+    return Content.assemble((name.ljust(columns), "dim"), text)
 
-    def compose(self) -> ComposeResult:
-        """Lay out the page."""
-        with VerticalScroll() as page:
-            page.border_title = "Help, escape closes"
-            yield Static(self._text, markup=False)
+
+def condition_text(condition: Condition) -> str:
+    """`H 13 mm  α 5°`."""
+    return f"H {condition.depth_mm:g} mm  α {condition.tilt_deg:g}°"
+
+
+def tip_text(tip_mm: tuple[float, float, float] | None) -> str:
+    """The tip's position, or `no pose`."""
+    if tip_mm is None:
+        return "no pose"
+    x, y, z = tip_mm
+    return f"x {x:7.2f}  y {y:7.2f}  z {z:7.2f} mm"

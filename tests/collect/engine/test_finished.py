@@ -28,7 +28,7 @@ def test_it_is_printed_after_the_screen_too(
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
     monkeypatch.setattr(
-        "brushloop.collect.tui.runner.run_screen",
+        "brushloop.collect.tui.app.run_screen",
         lambda engine, *_options: (engine.start(), wait_for_end(engine), engine)[-1],
     )
     folder, given_up = collect(

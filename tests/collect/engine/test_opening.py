@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import (
     Difference,
     Opening,
@@ -20,10 +21,9 @@ from brushloop.collect.engine.open_or_resume import (
     put_in_sheet,
 )
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.headless import RunnableEngine
 from brushloop.collect.planning.limit_check import distinct_steps
 from brushloop.collect.protocols.steps import StepKind
-from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.start_screen import Paths, SessionBrowser
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
@@ -192,7 +192,7 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) 
     Path("protocol.toml").write_text('kind = "calibration"\n')
     openings: list[Opening] = []
 
-    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> RunnableEngine:
+    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
         openings.append(opening)
         return FakeEngine(picture())
 

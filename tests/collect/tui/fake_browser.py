@@ -2,43 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brushloop.collect.rig.doctor import Finding
-from brushloop.collect.tui.browser import Paths, SessionBrowser
+from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import ReviewScreen
+from brushloop.collect.tui.start_screen import Paths, SessionBrowser
 from brushloop.sessions.events import CaptureResult, Press, Remark
 from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.show import Details, Summary
 from tests.collect.tui.fake import blot
-
-FINDINGS = [
-    Finding(
-        "camera",
-        "http://127.0.0.1:1/",
-        True,
-        "loopback",
-        latency_ms=131.2,
-        notes="board: 184 corners, residual 0.11 px",
-    ),
-    Finding("force", "can0", True, "SRI M8123", latency_ms=1.1, notes="1000 rounds/s, 0.412 N before bias, simulated"),
-    Finding(
-        "robot",
-        "127.0.0.1:30004",
-        True,
-        "AUBO-i5",
-        latency_ms=2.0,
-        problem="safety mode is ProtectiveStop",
-        remedy="Look at the pendant; nothing is cleared from here.",
-    ),
-]
-
 
 LATE = "touched the paper 10.2 s after its dip, the others after 1.1 s"
 
@@ -48,16 +25,13 @@ def engine_for(*_arguments: Any, **_options: Any) -> Any:
 
 
 class FakeBrowser(SessionBrowser):
-    """Two sessions, one cut in its middle, and a rig with trouble."""
+    """Two sessions, one cut in its middle."""
 
-    def __init__(self, rows: tuple[Summary, ...] | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__(Paths(), engine_for)
-        self._rows = rows
         self.asked: list[Any] = []
 
     def recent(self) -> list[Summary]:
-        if self._rows is not None:
-            return list(self._rows)
         return [
             Summary("2026-11-21-grid-02", "open", "", 13, ""),
             Summary("2026-11-21-grid-01", "closed", "loopback rig", 150, "2026-11-21-grid-01.mcap"),
@@ -69,9 +43,6 @@ class FakeBrowser(SessionBrowser):
         details.void = ["press H15-a5-r01, attempt 1: the process ended during it"]
         details.next, details.sheets = "press H15-a5-r01", {1: [1, 2]}
         return details
-
-    def health(self) -> list[Finding]:
-        return FINDINGS
 
     def planned(self) -> str:
         return "30 strokes on 1 sheet, about 21 min"
@@ -107,5 +78,5 @@ class FakeReview(Review):
         return 0.914, 9
 
 
-def a_review(folder: Path, at_work: Callable[[], bool] = lambda: False) -> ReviewScreen:
-    return ReviewScreen(FakeReview(folder), Pictures(), at_work=at_work, now_ns=lambda: 5)
+def a_review(folder: Path, app: OperatorApp) -> ReviewScreen:
+    return ReviewScreen(FakeReview(folder), Pictures(), app._finish, at_work=lambda: app.at_work)

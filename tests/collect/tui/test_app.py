@@ -6,7 +6,6 @@ import asyncio
 import functools
 import io
 import os
-import re
 import signal
 from dataclasses import replace
 
@@ -15,51 +14,39 @@ from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.errors import CollectAborted, ConfigError
-from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.keys import RUN_KEYS
-from brushloop.collect.tui.question_screens import Confirm
-from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT
-from brushloop.collect.tui.runner import ScreenCrashed, run_screen
+from brushloop.collect.tui.app import OperatorApp, ScreenCrashed, run_screen
+from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT, RunScreen
 from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
-from brushloop.collect.tui.text import SOFTWARE_STOP
-from brushloop.collect.tui.widgets import HelpScreen
-from tests.collect.tui.fake import (
-    FAILED,
-    PAUSED,
-    SPLIT,
-    FakeEngine,
-    picture,
-)
+from brushloop.collect.tui.widgets import SOFTWARE_STOP
+from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, picture
 from tests.collect.tui.screen_text import look, shown
 from tests.waiting import PATIENCE_S
 
 AT_WORK = sorted(set(State) - FINAL)
+KEYS = ("space", "r", "k", "n", "j", "b")
+
+
+def asks(app: OperatorApp) -> bool:
+    return isinstance(app.screen, AskScreen) and app.screen.own
 
 
 async def test_space_pauses_and_resumes_and_says_which() -> None:
     engine = FakeEngine(picture())
     app = OperatorApp(engine)
     async with app.run_test(size=(80, 24)) as pilot:
-        assert "space pause" in await look(app, pilot)
-        await pilot.press("space")
-        assert engine.calls == ["pause"]
-        for state in (State.PAUSING, State.PAUSED):
+        for state, word, calls in (
+            (State.RUNNING, "space Pause", ["pause"]),
+            (State.PAUSING, "space Resume", ["resume"]),
+            (State.PAUSED, "space Resume", ["resume"]),
+            (State.STOPPING, "", []),
+            (State.DONE, "", []),
+        ):
             engine.calls.clear()
             engine.now = picture(state=state)
-            assert "space resume" in await look(app, pilot)
+            assert word in await look(app, pilot)
             await pilot.press("space")
-            assert engine.calls == ["resume"]
-
-
-async def test_space_does_nothing_once_the_end_has_begun() -> None:
-    engine = FakeEngine(picture())
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        for state in sorted({State.STOPPING} | FINAL):
-            engine.now = picture(state=state)
-            assert "space" not in await look(app, pilot)
-            await pilot.press("space")
-            assert engine.calls == []
+            assert engine.calls == calls
 
 
 async def test_stop_keys_stop_in_every_state_of_a_run() -> None:
@@ -82,10 +69,9 @@ async def test_the_stop_key_stops_over_whatever_lies_on_the_screen(over: str) ->
         await look(app, pilot)
         if over == "prompt":
             engine.now = picture(state=State.ASKING, prompt=SPLIT)
-            await look(app, pilot)
         else:
             await pilot.press(over)
-            await look(app, pilot)
+        await look(app, pilot)
         await pilot.press("s")
         assert engine.calls == ["stop"]
 
@@ -121,25 +107,17 @@ async def test_requests_are_passed_on_and_shown_until_they_are_carried_out() -> 
             assert "red button: emergency stop" in text
 
 
-async def test_q_asks_while_the_run_is_on_and_n_goes_back() -> None:
+async def test_q_asks_while_the_run_is_on_and_parks_before_it_leaves() -> None:
     engine = FakeEngine(picture())
     app = OperatorApp(engine)
     async with app.run_test() as pilot:
         await look(app, pilot)
         for quit_key, no_key in (("q", "n"), ("ctrl+q", "escape")):
             await pilot.press(quit_key, quit_key)
-            assert isinstance(app.screen, Confirm)
+            assert asks(app)
             await pilot.press(no_key)
-            assert not isinstance(app.screen, Confirm)
+            assert isinstance(app.screen, RunScreen)
         assert engine.calls == []
-        assert app.is_running
-
-
-async def test_y_parks_the_arm_and_leaves_only_then() -> None:
-    engine = FakeEngine(picture())
-    app = OperatorApp(engine)
-    async with app.run_test() as pilot:
-        await look(app, pilot)
         await pilot.press("q", "y")
         assert engine.calls == ["park"]
         while app.is_running:
@@ -153,7 +131,7 @@ async def test_while_the_arm_is_being_stopped_q_asks_nothing_and_the_red_button_
     async with app.run_test(size=(80, 24)) as pilot:
         assert "not seen at rest yet: press the red button" in await look(app, pilot)
         await pilot.press("q")
-        assert not isinstance(app.screen, Confirm)
+        assert not asks(app)
         assert engine.calls == []
 
 
@@ -187,43 +165,32 @@ async def test_a_key_that_bounces_after_an_answer_asks_for_nothing() -> None:
 
 
 @pytest.mark.parametrize("state", sorted(FINAL))
-async def test_q_leaves_at_once_when_the_run_is_over_and_the_arm_parked(state: State) -> None:
+async def test_what_is_over_can_only_be_left(state: State) -> None:
     engine = FakeEngine(picture(state=state, parked=True, target_mm=(0.0, 0.0, 0.0)))
     app = OperatorApp(engine)
-    async with app.run_test() as pilot:
+    async with app.run_test(size=(80, 24)) as pilot:
         text = await look(app, pilot)
         assert OVER in text
         assert state.upper() in text
+        assert (COMMAND_GOES_ON in text) is (state is not State.DONE)
+        assert (SOFTWARE_STOP in text) is (state is State.DONE)
+        assert "s STOP" not in text
+        await pilot.press(*KEYS)
+        assert engine.calls == []
         await pilot.press("q")
         assert not app.is_running
-    assert engine.calls == []
 
 
 async def test_help_names_every_key_and_goes_away() -> None:
     app = OperatorApp(FakeEngine(picture()))
-    async with app.run_test(size=(80, 24)) as pilot:
+    async with app.run_test(size=(120, 50)) as pilot:
         await look(app, pilot)
         await pilot.press("question_mark")
         text = await look(app, pilot)
-        for key in RUN_KEYS:
-            assert re.search(rf"\b{key.key}\b.* {key.what}" if key.key != "?" else key.what, text), key
-        assert SOFTWARE_STOP in text
-        await pilot.press("escape")
-        assert not isinstance(app.screen, HelpScreen)
-
-
-@pytest.mark.parametrize("state", [State.STOPPED, State.FAILED])
-async def test_what_is_over_offers_no_resume_and_says_what_goes_on(state: State) -> None:
-    engine = FakeEngine(PAUSED)
-    app = OperatorApp(engine)
-    async with app.run_test(size=(80, 24)) as pilot:
-        assert "space resume" in await look(app, pilot)
-        engine.now = replace(PAUSED, state=state, error="stopped by the operator")
-        text = await look(app, pilot)
-        assert COMMAND_GOES_ON in text
-        assert not [word for word in ("space", "s STOP", "r retake", SOFTWARE_STOP) if word in text]
-        await pilot.press("space", "p", "r", "n", "j")
-        assert engine.calls == []
+        for part in ("Stop the arm at once", "Pause before the next step", "Retake", "New sheet", "Jog", "! bad takes"):
+            assert part in text
+        await pilot.press("question_mark")
+        assert "Stop the arm at once" not in await look(app, pilot)
 
 
 @pytest.mark.parametrize("unseen", [False, True])
@@ -240,7 +207,7 @@ async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_en
     app = OperatorApp(stopped, again=again)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await look(app, pilot)
-        assert "enter resume" in text
+        assert "Resume the session" in text
         assert (GOES_ON in text) is not unseen
         await pilot.press("enter")
         await app.workers.wait_for_complete()
@@ -250,12 +217,15 @@ async def test_enter_resumes_a_stopped_session_and_leaves_the_question_to_the_en
         assert "RUNNING" in await look(app, pilot)
 
 
-async def test_a_run_is_not_begun_once_a_signal_ends_the_app() -> None:
+@pytest.mark.parametrize("why", ["a signal", "a refusal"])
+async def test_a_run_that_cannot_begin_leaves_the_screen_as_it_is(why: str) -> None:
     stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
     stopped.stop()
     resumed = FakeEngine(picture())
 
     def again(_session_id: str) -> FakeEngine:
+        if why == "a refusal":
+            raise ConfigError("rig.toml", "", "goes on with no open session")
         app.leave()  # the signal comes while files are read
         return resumed
 
@@ -264,24 +234,10 @@ async def test_a_run_is_not_begun_once_a_signal_ends_the_app() -> None:
         await look(app, pilot)
         await pilot.press("enter")
         await app.workers.wait_for_complete()
+        if why == "a refusal":
+            assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
     assert resumed.calls == []
     assert app.engine is stopped
-
-
-async def test_a_session_that_cannot_be_resumed_says_why() -> None:
-    def again(_session_id: str) -> FakeEngine:
-        raise ConfigError("rig.toml", "", "goes on with no open session")
-
-    stopped = FakeEngine(picture(state=State.STOPPED, folder="sessions/2026-11-21-grid-01"))
-    stopped.stop()
-    app = OperatorApp(stopped, again=again)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await look(app, pilot)
-        await pilot.press("enter")
-        while not app._notifications:
-            await look(app, pilot)
-        assert [note.message for note in app._notifications] == ["rig.toml: goes on with no open session"]
-        assert app.engine is stopped
 
 
 def without_terminal(monkeypatch: pytest.MonkeyPatch, pilot: object) -> None:
@@ -293,8 +249,12 @@ async def until_over(pilot: Pilot[None]) -> None:
         await asyncio.sleep(0.02)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_stops_the_arm_and_ends_the_screen(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("number", "call"), [(signal.SIGTERM, "stop"), (signal.SIGINT, "stop"), (signal.SIGHUP, "park")]
+)
+def test_a_signal_stops_the_arm_a_lost_terminal_parks_it_and_both_end_the_screen(
+    number: int, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def send(pilot: Pilot[None]) -> None:
         os.kill(os.getpid(), number)
         await until_over(pilot)
@@ -304,20 +264,8 @@ def test_a_signal_stops_the_arm_and_ends_the_screen(number: int, monkeypatch: py
     before = signal.getsignal(number)
     with pytest.raises(CollectAborted):
         run_screen(engine)
-    assert engine.calls == ["start", "stop", "join"]
+    assert engine.calls == ["start", call, "join"]
     assert signal.getsignal(number) == before
-
-
-def test_a_lost_terminal_parks_the_arm_and_ends_the_screen(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def hang_up(pilot: Pilot[None]) -> None:
-        os.kill(os.getpid(), signal.SIGHUP)
-        await until_over(pilot)
-
-    without_terminal(monkeypatch, hang_up)
-    engine = FakeEngine(picture())
-    with pytest.raises(CollectAborted):
-        run_screen(engine)
-    assert engine.calls == ["start", "park", "join"]
 
 
 def test_a_screen_that_breaks_stops_the_arm(
@@ -348,7 +296,7 @@ def test_a_screen_that_cannot_begin_stops_the_arm(monkeypatch: pytest.MonkeyPatc
     assert engine.calls == ["start", "stop", "join"]
 
 
-def test_writes_to_a_lost_terminal_are_lost_and_hurt_nobody() -> None:
+def test_a_lost_terminal_hurts_nobody_and_does_not_start_the_driver_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     class Gone(io.StringIO):
         def write(self, _text: str) -> int:
             raise OSError(5, "Input/output error")
@@ -359,11 +307,7 @@ def test_writes_to_a_lost_terminal_are_lost_and_hurt_nobody() -> None:
     file = _LostWrites(Gone())
     assert file.write("abc") == 3
     file.flush()
-
-
-def test_a_hang_up_does_not_start_the_driver_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[str] = []
     monkeypatch.setattr(TerminalDriver, "start_application_mode", lambda _driver: started.append("start"))
-    driver = TerminalDriver.__new__(TerminalDriver)
-    driver.resume_application_mode()
+    TerminalDriver.__new__(TerminalDriver).resume_application_mode()
     assert started == []

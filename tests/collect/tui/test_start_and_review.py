@@ -1,28 +1,25 @@
-"""The screens around a run: start, review, finish, pictures."""
+"""The screens around a run: start, review, what comes next, pictures."""
 
 from __future__ import annotations
 
+import io
+import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from textual.geometry import Size
 from textual.pilot import Pilot
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.dots import Cells
-from brushloop.collect.tui.finish_screen import FinishScreen, run_command, verdict_content
-from brushloop.collect.tui.pictures import CellPicture, Pictures
-from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.pictures import CellPicture, Pictures, braille, strip_of
+from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.start_screen import StartScreen
-from brushloop.collect.tui.text import plot, plot_title, scale_n, spark
 from brushloop.sessions.recording import remarks_of
-from brushloop.sessions.terminal import Progress
-from brushloop.sessions.verify import Verdict
 from tests.collect.tui.fake import PAUSED, FakeEngine, picture
 from tests.collect.tui.fake_browser import FakeBrowser, a_review
 from tests.collect.tui.screen_text import has_picture, look, shown
@@ -45,26 +42,15 @@ async def ready(app: OperatorApp, pilot: Pilot[None]) -> str:
     return shown(app)
 
 
-async def test_the_start_screen_shows_what_is_finished_void_and_next() -> None:
-    app = OperatorApp(browser=FakeBrowser())
-    async with app.run_test(size=(80, 24)) as pilot:
-        text = await ready(app, pilot)
-        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 strokes", "1 cut short", "the process", "press H15-a5-r01"):
-            assert part in text
-        await pilot.press("d")
-        text = await ready(app, pilot)
-        for part in ("✓ well    camera", "! trouble robot", "ProtectiveStop"):
-            assert part in text
-
-
 async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_first() -> None:
     browser = Beginning()
     app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
-        await ready(app, pilot)
+        text = await ready(app, pilot)
+        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 strokes", "1 cut short", "the process", "press H15-a5-r01"):
+            assert part in text
         await pilot.press("n")
-        await ready(app, pilot)
-        assert isinstance(app.screen, Confirm)
+        assert "30 strokes on 1 sheet" in await ready(app, pilot)
         await pilot.press("n")
         assert browser.asked == []
         await pilot.press("n")
@@ -76,11 +62,11 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
         await pilot.press("enter")
         await ready(app, pilot)
         assert browser.asked[1:] == [("2026-11-21-grid-02", True)]
-        assert app.engine is not None
-        assert app.engine.calls == ["start"]  # type: ignore[attr-defined]
+        assert isinstance(app.engine, FakeEngine)
+        assert app.engine.calls == ["start"]
         await look(app, pilot)
         await pilot.press("s")
-        assert "stop" in app.engine.calls  # type: ignore[attr-defined]
+        assert "stop" in app.engine.calls
 
 
 async def test_other_files_can_be_typed_and_letters_of_stop_keys_too(
@@ -94,10 +80,8 @@ async def test_other_files_can_be_typed_and_letters_of_stop_keys_too(
         await pilot.press("e", "ctrl+u", *"s2.toml", "enter")
         await ready(app, pilot)
         assert str(browser.paths.config) == "s2.toml"
-        assert isinstance(app.screen, StartScreen)
         await pilot.press("e", "ctrl+u", "enter")
         assert "s2.toml" in await ready(app, pilot), "an emptied field leaves the file as it was"
-    assert str(browser.paths.config) == "s2.toml"
     assert FakeBrowser().paths == browser.paths, "the next start knows the files"
 
 
@@ -105,8 +89,7 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
     app = OperatorApp(browser=FakeBrowser())
     async with app.run_test(size=(120, 40)) as pilot:
         await ready(app, pilot)
-        review = a_review(tmp_path)
-        app.push_screen(review)
+        app.push_screen(a_review(tmp_path, app))
         text = await ready(app, pilot)
         for part in (
             "1 of 3 count",
@@ -127,8 +110,6 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
         text = await ready(app, pilot)
         assert "marked bad" in text
         assert "墨 ran" in text
-        await pilot.press("down")
-        assert "! touched the paper 10.2 s after its dip" in await ready(app, pilot)
         await pilot.press("escape")
         assert isinstance(app.screen, StartScreen)
 
@@ -138,48 +119,50 @@ async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> No
     app = OperatorApp(engine)
     async with app.run_test(size=(120, 40)) as pilot:
         await look(app, pilot)
-        review = a_review(tmp_path, lambda: app.at_work)
-        app.push_screen(review)
+        app.push_screen(review := a_review(tmp_path, app))
         text = await ready(app, pilot)
-        for words in ("A run is in progress", "red button", "s STOP"):
+        for words in ("red button", "s STOP"):
             assert words in text
-        assert "o note" not in text
-        assert "arm is at work" not in text
-        await pilot.press("o", "s")
+        assert "o Note" not in text
+        await pilot.press("o", "f", "s")
         assert engine.calls == ["stop"]
+        assert app.screen is review
         assert not review.has_class("-noting")
 
 
-async def test_finishing_verifies_and_runs_what_comes_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[tuple[str, Path]] = []
+async def test_after_a_session_the_next_commands_run_in_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[list[str]] = []
 
-    def command(name: str, folder: Path, progress: Progress) -> tuple[int, str]:
-        ran.append((name, folder))
-        progress("captures", 3, 30)
-        return 0, "\n".join(f"line {n}" for n in range(30))
+    def run(command: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:
+        ran.append(command[3:])
+        return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr("brushloop.collect.tui.finish_screen.run_command", command)
-    monkeypatch.setattr(
-        "brushloop.collect.tui.finish_screen.verify", lambda _folder: Verdict("s", "closed", files=3, strokes=2)
-    )
+    monkeypatch.chdir(tmp_path)
     app = OperatorApp(browser=FakeBrowser())
+    monkeypatch.setattr(app, "suspend", nullcontext)
+    monkeypatch.setattr("subprocess.run", run)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
     async with app.run_test(size=(120, 40)) as pilot:
         await ready(app, pilot)
-        app.push_screen(FinishScreen(tmp_path, is_open=False))
-        text = await ready(app, pilot)
-        assert "✓ sound" in text
-        await pilot.press("c")
-        text = await ready(app, pilot)
-        assert ran == [("calibrate", tmp_path)]
-        assert "line 29" in text
-    assert "! damaged" in verdict_content(Verdict("s", "closed", findings={"a.mcap": ["is cut"]})).plain
-
-
-def test_a_session_that_cannot_be_calibrated_fitted_or_validated_says_why_and_the_screen_stays(tmp_path: Path) -> None:
-    for name in ("calibrate", "fit", "validate"):
-        code, said = run_command(name, tmp_path / "nowhere", lambda _what, _done, _total: None)
-        assert code == 2
-        assert "nowhere" in said
+        app.push_screen(a_review(Path(), app))
+        await ready(app, pilot)
+        await pilot.press("f")
+        assert "c  brushloop calibrate" in await ready(app, pilot)
+        for key in ("f", "c", "t", "w"):
+            await pilot.press(key)
+            await ready(app, pilot)
+            assert isinstance(app.screen, AskScreen), "back at the question"
+        await pilot.press("escape", "escape", "d")
+    folder = "2026-11-21-grid-01"
+    assert ran == [
+        ["sessions", "verify", folder],
+        ["calibrate", folder],
+        ["fit", folder],
+        ["validate", folder],
+        ["doctor", "--config", "rig.toml"],
+    ]
 
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,39 +173,12 @@ def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:
     paper = np.full((4, 4), 255, np.uint8)
     paper[0, 0] = paper[3, 3] = 0
-    [line] = [Cells(paper, Size(2, 1)).strip(0)]
-    assert line.text == "⠁⢀"
-    numbers = np.zeros((4, 4), np.uint8)
-    numbers[:, 2] = 1
-    numbers[1, 3] = 2
-    colours = np.array(((255, 255, 255), (0, 0, 0), (0, 114, 178)), np.uint8)
-    strip = Cells(colours[numbers], Size(2, 1)).strip(0)
-    assert strip.text[0] == "⠀"
-    assert {str(part.style) for part in strip} == {
-        "rgb(255,255,255) on rgb(255,255,255)",
-        "rgb(255,255,255) on rgb(0,0,0)",
-    }
-
-
-def test_the_noise_of_a_camera_is_not_drawn_and_a_change_is() -> None:
-    rng = np.random.default_rng(0)
-
-    def frame(gray: float) -> NDArray[np.uint8]:
-        return np.clip(rng.normal(gray, 3.0, (160, 320)), 0, 255).astype(np.uint8)
-
-    dark = Cells(frame(100.0), Size(64, 16))
-    again, brighter = Cells(frame(100.0), Size(64, 16), dark), Cells(frame(115.0), Size(64, 16), dark)
-    assert dark.codes is not None
-    assert again.codes is not None
-    assert brighter.codes is not None
-    assert (again.codes == dark.codes).mean() > 0.95
-    assert (brighter.codes != dark.codes).mean() > 0.95
-
-
-def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
-    assert spark([0.0, 0.5, 1.0], 4) == "  ▄█"
-    assert spark([0.001, 0.0], 2) == "▁ "
-    assert [scale_n([force_n]) for force_n in (0.0, 0.04, 0.11, 0.9, 3.0)] == [0.1, 0.1, 0.2, 1.0, 5.0]
-    assert plot([0.0, 1.0], 10, 2).plain == "    1 N┤ █\n    0 N┤ █"
-    assert plot([0.0, 1.0], 10, 2, ceiling_n=0.6).plain == "    1 N┤╌█\n    0 N┤ █"
-    assert "5 N" in plot_title(5.0)
+    [line] = braille(paper, Size(2, 1))
+    assert strip_of(line).text == "⠁⢀"
+    colours = np.full((4, 4, 3), 255, np.uint8)
+    colours[:, 2:] = (0, 114, 181)
+    colours[0, 3] = 255
+    [line] = braille(colours, Size(2, 1))
+    strip = strip_of(line)
+    assert strip.text == "⠀⠈"
+    assert str(list(strip)[1].style) == "rgb(255,255,255) on rgb(0,115,180)"

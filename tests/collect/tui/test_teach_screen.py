@@ -13,7 +13,7 @@ import pytest
 from textual.pilot import Pilot
 
 from brushloop.collect.teach.guide import Brought, JogStep, LeftOff, WentBack
-from brushloop.collect.tui.question_screens import Confirm
+from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.teach_app import TeachApp
 from brushloop.collect.tui.teach_guide import Teaching
 from tests.collect.tui.screen_text import shown
@@ -33,7 +33,7 @@ async def until(condition: Callable[[], bool]) -> None:
 async def running(asking: Asking) -> AsyncIterator[tuple[TeachApp, Pilot[None]]]:
     app = app_of(asking)
     async with app.run_test(size=SIZE) as pilot:
-        await until(lambda: app._screen._drawn is not None and (app._screen.asking or not asking.kinds))
+        await until(lambda: app.first_day.is_mounted and (app.first_day.prompt is not None or not asking.kinds))
         await pilot.pause()
         try:
             yield app, pilot
@@ -74,10 +74,14 @@ async def test_a_question_is_answered_by_its_keys(kind: str, keys: list[str], an
 async def test_arrows_jog_by_the_chosen_step() -> None:
     asking = Asking("jog")
     async with running(asking) as (app, pilot):
-        await pilot.press("3", "left")
-        await seen(app, pilot, lambda: len(asking.answers) == 1 and app._screen.asking)
-        await pilot.press("1", "pageup")
-        await seen(app, pilot, lambda: len(asking.answers) == 2 and app._screen.asking)
+        await pilot.press("3")
+        await seen(app, pilot, lambda: "›3: 2 mm" in shown(app))
+        await pilot.press("left")
+        await seen(app, pilot, lambda: len(asking.answers) == 1 and app.first_day.prompt is not None)
+        await pilot.press("1")
+        await seen(app, pilot, lambda: "›1: 0.1 mm" in shown(app))
+        await pilot.press("pageup")
+        await seen(app, pilot, lambda: len(asking.answers) == 2 and app.first_day.prompt is not None)
     assert asking.answers == [JogStep("x", -2.0), JogStep("z", 0.1)]
 
 
@@ -87,7 +91,7 @@ async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
         await pilot.press("9", "9", "enter")
         await pilot.pause()
         assert "99 is outside 3 to 50 squares" in shown(app)
-        assert app._screen.asking
+        assert app.first_day.prompt is not None
     assert asking.answers == []
 
 
@@ -104,12 +108,12 @@ async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str, work: st
     asking = Asking("choose", work)
     async with running(asking) as (app, pilot):
         await pilot.press("y")
-        await seen(app, pilot, lambda: asking.at_work and not app._screen.asking)
+        await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
         assert re.search(r"at work, \d+ s; s: software stop", shown(app))
         await pilot.press(key)
         await seen(app, pilot, lambda: asking.stopped_arm and "Stopped." in shown(app))
         await pilot.press("g")
-        await seen(app, pilot, lambda: app._screen.asking)
+        await seen(app, pilot, lambda: app.first_day.prompt is not None)
         assert not app.teaching.finished
 
 
@@ -136,9 +140,9 @@ async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_ov
     asking = Asking("choose", "move")
     async with running(asking) as (app, pilot):
         await pilot.press("y")
-        await seen(app, pilot, lambda: asking.at_work and not app._screen.asking)
+        await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
         await pilot.press("q")
         await pilot.pause()
-        assert isinstance(app.screen, Confirm)
+        assert isinstance(app.screen, AskScreen)
         await pilot.press("s")
         await seen(app, pilot, lambda: asking.stopped_arm)
