@@ -219,7 +219,7 @@ class Well:
     level: float | None
     """0 to 1; None where the device has no gauge."""
     dosed_ml: float = 0.0
-    """What was added just now."""
+    """What the device has given since it was connected, by a replenishing that failed half way too."""
 
 
 @runtime_checkable

@@ -154,10 +154,11 @@ class ModbusPump:
         self._running = asyncio.Lock()
         self._connected = False
         self._may_run = False
+        self._dosed_ml = 0.0
 
     async def connect(self) -> Identity:
         """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
-        self._connected = False
+        self._connected, self._dosed_ml = False, 0.0
         await self._port.open()
         try:
             await self._refuse_echo()
@@ -202,13 +203,13 @@ class ModbusPump:
                     condition=f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped.",
                     remedy="Something held the host up.",
                 )
+            self._dosed_ml += volume_ml
 
     async def replenish(self, dips: int) -> Well:
         """Dose before every `every_dips`-th dip. Raises as `dose` does."""
-        if dips % self._config.every_dips != self._config.every_dips - 1:
-            return Well(None)
-        await self.dose(self._config.dose_ml)
-        return Well(None, self._config.dose_ml)
+        if dips % self._config.every_dips == self._config.every_dips - 1:
+            await self.dose(self._config.dose_ml)
+        return Well(None, self._dosed_ml)
 
     async def light(self) -> float | None:
         """None: a pump has no light."""

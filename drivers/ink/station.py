@@ -153,11 +153,11 @@ class InkStation:
         self._budget = DoseBudget(
             DEVICE, smallest_ml=SMALLEST_ML, max_dose_ml=config.dose_ml, max_per_minute_ml=config.max_per_minute_ml
         )
-        self._number = 0
+        self._number, self._dosed_ml = 0, 0.0
 
     async def connect(self) -> Identity:
         """Open the port and learn who answers; moves nothing. Raises `DeviceError`; nothing is left open then."""
-        self._number = 0
+        self._number, self._dosed_ml = 0, 0.0
         await self._port.open()
         try:
             return await self._identify()
@@ -177,19 +177,19 @@ class InkStation:
         given_ml = self._number_in(reply, "dose")
         if abs(given_ml - volume_ml) > max(2 * SMALLEST_ML, 0.05 * volume_ml):
             raise DeviceError(DEVICE, "dose", f"gave {given_ml:.3f} ml instead of {volume_ml:.3f} ml")
+        self._dosed_ml += volume_ml
 
     async def replenish(self, dips: int) -> Well:
         """Dose until the gauge shows `keep_level`. Raises `DoseLost` if a dose does not arrive, and as `dose` does."""
-        level, dosed_ml, dose_ml = await self.level(), 0.0, self._config.dose_ml
+        level, dose_ml = await self.level(), self._config.dose_ml
         while level < self._config.keep_level:
             await self.dose(dose_ml)
-            dosed_ml += dose_ml
             before, level = level, await self.level()
             if level < before + LEVEL_RISES:
                 what = f"a dose of {dose_ml:g} ml left the well at {level:.0%} of its capacity"
                 remedy = "Look at the tube, the reservoir and the gauge."
                 raise DoseLost(DEVICE, "dose", what, condition="Nothing was dipped.", remedy=remedy)
-        return Well(level, dosed_ml)
+        return Well(level, self._dosed_ml)
 
     async def light(self) -> float | None:
         """Set the light as the table says; return it, None if the table says nothing. Raises as `level` does."""

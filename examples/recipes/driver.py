@@ -41,7 +41,7 @@ class SyringePump:
 
     async def replenish(self, dips: int) -> Well:
         await self.dose(self._table.dose_ml)
-        return Well(level=None, dosed_ml=self._table.dose_ml)
+        return Well(level=None, dosed_ml=(dips + 1) * self._table.dose_ml)
 
     async def light(self) -> None:
         pass

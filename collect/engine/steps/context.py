@@ -56,8 +56,6 @@ class RunContext:
     """Sheet whose free patches were seen to be blank."""
     dips: int = 0
     """Dips since the run began."""
-    dosed_ml: float = 0.0
-    """Ink dosed since the run began."""
     light: float | None = None
     """Light of the ink station as it was set; None without one."""
 

@@ -13,7 +13,7 @@ from brushloop.collect.engine.steps.capture import look_at_sheet
 from brushloop.collect.engine.steps.context import RunContext, StepContext
 from brushloop.collect.motion.moves import Move
 from brushloop.collect.motion.procedures import TOUCH_TOLERANCE_MM
-from brushloop.drivers.devices import PoseSample
+from brushloop.drivers.devices import PoseSample, Well
 from brushloop.sessions.events import DipResult
 
 STALE_INK_S = 5.0
@@ -23,22 +23,23 @@ STALE_INK_S = 5.0
 async def dip(context: StepContext) -> DipResult:
     """The DIP step. Looks at the sheet first, so that the filled brush does not wait for it."""
     await look_at_sheet(context)
-    level = await fill_brush(context)
-    return DipResult(ink_level=level, dosed_ml=None if level is None else context.run.dosed_ml)
+    well = await fill_brush(context)
+    if well is None or well.level is None:
+        return DipResult()
+    return DipResult(ink_level=well.level, dosed_ml=well.dosed_ml)
 
 
-async def fill_brush(context: StepContext) -> float | None:
-    """Fill up the well if needed, then dip. Return the level of the well, 0 to 1; None if nothing measures it."""
-    run = context.run
+async def fill_brush(context: StepContext) -> Well | None:
+    """Fill up the well if needed, then dip. Return how the well was; None without an ink device."""
+    run, well = context.run, None
     with run.progress.meanwhile("dip"):
-        level = None
         if run.rig.ink is not None:
             well = await run.rig.ink.replenish(run.dips)
-            level, run.dips, run.dosed_ml = well.level, run.dips + 1, run.dosed_ml + well.dosed_ml
-            context.recorder.ink(level, run.dosed_ml, run.light)
+            run.dips += 1
+            context.recorder.ink(well.level, well.dosed_ml, run.light)
         await context.guard.guarded(run.procedures.dip())
         run.left_ink_ns = run.rig.clock.now_ns()
-    return level
+    return well
 
 
 async def set_light(run: RunContext) -> None:

@@ -82,7 +82,7 @@ async def test_it_doses_before_every_nth_dip(firmware: PumpFirmware, line: PtyLi
     wanted = table(line.path, dose_ml=0.02, every_dips=3)
     pump = ModbusPump(wanted, HostClock(), timeout_s=TIMEOUT_S, echo_s=0.02)
     await pump.connect()
-    assert [(await pump.replenish(dips)).dosed_ml for dips in range(7)] == [0.0, 0.0, 0.02, 0.0, 0.0, 0.02, 0.0]
+    assert [(await pump.replenish(dips)).dosed_ml for dips in range(7)] == [0.0, 0.0, 0.02, 0.02, 0.02, 0.04, 0.04]
     await pump.close()
     assert wanted.doses_ml(7) == pytest.approx(0.04)
 

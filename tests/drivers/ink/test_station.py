@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from brushloop.drivers.devices import Well
 from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
@@ -282,11 +281,13 @@ async def test_a_well_is_filled_up_to_its_level_and_a_dose_that_does_not_arrive_
     assert well.level is not None
     assert well.level >= 0.5
     assert well.dosed_ml == pytest.approx(firmware.well.ml - 0.4 * firmware.well.capacity_ml)
-    assert await station.replenish(dips=1) == Well(well.level), "it is full"
+    assert await station.replenish(dips=1) == well, "it is full"
     firmware.well.ml = 1.0
     monkeypatch.setattr(firmware.well, "add", lambda _volume_ml: None)  # the tube has come off
     with pytest.raises(DoseLost, match="Look at the tube"):
         await station.replenish(dips=2)
+    firmware.well.ml = 19.0  # somebody poured
+    assert (await station.replenish(dips=3)).dosed_ml == well.dosed_ml + 2.0, "the lost dose was given as well"
 
 
 async def test_a_station_refuses_what_it_cannot_do(firmware: StationFirmware, station: InkStation):
