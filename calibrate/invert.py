@@ -2,7 +2,7 @@
 
 Each press is recovered from its coverage of the millimetre field, with its interval. The recovered (H, alpha) is the
 press for which this brush makes this mark. It measures the actual press only as well as the model describes the brush:
-the model's error is told from what was commanded, and added.
+the error of the model is estimated from the commanded values of other conditions, and widens each interval.
 """
 
 from __future__ import annotations

@@ -79,8 +79,8 @@ class Refit:
     radius_mm: float
     length_mm: float
     prior: Prior | None = None
-    start: tuple[float, ...] | None = None
-    """Parameters of the fit to all presses, where the descent begins; None searches from the prior."""
+    start: Floats | None = None
+    """Parameters (17,) of the fit to all presses, where the descent begins; None searches from the prior."""
 
     @classmethod
     def of(
@@ -96,7 +96,7 @@ class Refit:
         rows = inked_rows([stroke.ink for stroke in strokes], grid.px_mm)
         inks = (to_pixels(np.asarray(stroke.ink[rows], np.float32)) / 255.0 for stroke in strokes)
         cut = tuple(replace(stroke, ink=ink) for stroke, ink in zip(strokes, inks, strict=True))
-        values = None if start is None else tuple(start.values.tolist())
+        values = None if start is None else start.values
         return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior, values)
 
     @property
@@ -110,8 +110,7 @@ class Refit:
 
 def refit(job: Refit) -> Arrays:
     """The numbers of the fitted brush."""
-    start = None if job.start is None else np.array(job.start)
-    press = fit_presses(job.strokes, job.grid, job.radius_mm, job.length_mm, prior=job.prior, start=start)
+    press = fit_presses(job.strokes, job.grid, job.radius_mm, job.length_mm, prior=job.prior, start=job.start)
     return {"values": press.values, "edges": press.edges, "ends": press.ends}
 
 

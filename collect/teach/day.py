@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,7 +177,7 @@ class Day:
             raise CannotTeach("the arm was left where it is.", "Try this step again once it may move.")
 
 
-class Step:
+class Step(ABC):
     """One step of the first day."""
 
     name: ClassVar[StepName]
@@ -187,14 +188,14 @@ class Step:
     observes: ClassVar[tuple[str, ...]] = ()
     """Beginnings of fields and kinds of touches that are forgotten when it is taught again."""
 
+    @abstractmethod
     async def teach(self, day: Day) -> None:
         """Ask, measure and keep. Raises `WentBack`, `LeftOff`, `CannotTeach` and what the devices raise."""
-        raise NotImplementedError
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""
         return {}
 
+    @abstractmethod
     def summary(self, notebook: Notebook) -> str:
         """What was taught, in a few words."""
-        raise NotImplementedError

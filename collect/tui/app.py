@@ -86,11 +86,11 @@ class OperatorApp(PlainApp):
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
         if self._browser is not None:
-            make = partial(partial, self._browser.engine, preview=self._pictures.camera_shown)
+            engine, preview = self._browser.engine, self._pictures.camera_shown
             root = self._browser.paths.root
             start = StartScreen(
                 self._browser,
-                lambda session_id: self._begin(make(session_id)),
+                lambda session_id: self._begin(partial(engine, session_id, preview=preview)),
                 lambda session_id: self._review(root / session_id),
                 self.run_command,
             )

@@ -11,6 +11,7 @@ import contextlib
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -42,7 +43,7 @@ class DoseLost(DeviceError):
     """A dose was given, and the well does not show it."""
 
 
-class InkTable(BaseModel, frozen=True, extra="forbid"):
+class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
     """The table `[ink.device]` of `rig.toml` for one kind of ink device: the engine asks it for everything."""
 
     kind: str
@@ -51,9 +52,9 @@ class InkTable(BaseModel, frozen=True, extra="forbid"):
     dose_ml: Annotated[float, Field(gt=0.0, le=2.0)]
     """Size of one dose."""
 
+    @abstractmethod
     def device(self, clock: Clock) -> Ink:
         """The driver, not yet connected."""
-        raise NotImplementedError
 
     def doses_ml(self, dips: int) -> float | None:
         """Ink that so many dips cost where the device counts dips; None where a gauge or a person decides."""
