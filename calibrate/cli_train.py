@@ -51,7 +51,7 @@ def tune(
 
 def _train(config: TrainConfig, folder: Path, tuning: TuningFiles | None = None) -> None:
     """Train in the folder, and write the generator's card and the page."""
-    from brushloop.calibrate.pages.training import write_training
+    from brushloop.calibrate.training import write_training
     from brushloop.model.generator.train import run_training
 
     with shown() as progress:
