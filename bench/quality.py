@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness import BenchError, Result, at_most, rounds_of
-from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.board.view import see_board
 from brushloop.collect.quality.checks import check_capture, patch_is_blank
 from brushloop.collect.quality.verdict import Failure
 from brushloop.collect.rig.config import PaperConfig

@@ -16,13 +16,10 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.artefact import made_by, put_to_use
-from brushloop.calibrate.board.detect import BoardView, find_board
-from brushloop.calibrate.board.intrinsics import RMS_LIMIT_PX, read_lens
-from brushloop.calibrate.board.lens import Floats, Gray, rms
-from brushloop.calibrate.board.pix2len import local_scale
-from brushloop.calibrate.board.spec import describe
-from brushloop.calibrate.board.view import board_of, paper_mm, rig_of, see_board_and_lens
-from brushloop.calibrate.calibration import FITTED, Calibration
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.lens import FITTED, RMS_LIMIT_PX, Floats, Gray, read_lens, rms
+from brushloop.calibrate.board.pix2len import local_scale, paper_mm, see_board_and_lens
+from brushloop.calibrate.board.spec import BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import (
     BLUE,
@@ -37,7 +34,8 @@ from brushloop.calibrate.report import (
     source_point,
     write_page,
 )
-from brushloop.calibrate.stroke.params import Params
+from brushloop.calibrate.session import Calibration, board_of, rig_of
+from brushloop.calibrate.stroke import Params
 from brushloop.sessions.messages import decode_gray
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, counted, unseen
@@ -107,24 +105,14 @@ def calibrate_session(request: CalibrateRequest, progress: Progress = unseen) ->
     *earlier, (last_ns, still) = stills
     image = decode_gray(still, where)
     view, plane = see_board_and_lens(image, spec, known, where, rig.sheet_mm)
-    low, high = plane.interval_mm_per_px
     calibration = Calibration(
+        **plane.model_dump(),
         session_id=recording.header.session_id,
         source=recording.header.source,
         recording_sha256=recording.sha256,
         software=made_by(),
-        image_to_paper=tuple(plane.image_to_paper.ravel().tolist()),  # pyright: ignore[reportArgumentType]
-        mm_per_px=plane.mm_per_px,
-        mm_per_px_low=low,
-        mm_per_px_high=high,
-        rms_px=plane.rms_px,
-        corners=plane.corners,
-        corners_dropped=len(plane.dropped),
         preprocess=dataclasses.asdict(Params()),
-        lens=plane.lens if known else plane.lens.model_copy(update={"source": FITTED}),
-        middle_px=plane.middle_px,
         board=spec,
-        flags=plane.flags,
         still_sha256=hashlib.sha256(still).hexdigest(),
     )
     looked_at = counted(earlier, "earlier photographs of the board compared", len(earlier), progress)

@@ -193,9 +193,9 @@ def intrinsics(
     """Fit the lens, and say what each photograph contributes, which were dropped, and what else to photograph."""
     import hashlib
 
-    from brushloop.calibrate.board.detect import BoardView, find_board
-    from brushloop.calibrate.board.intrinsics import fit_lens
-    from brushloop.calibrate.board.spec import describe
+    from brushloop.calibrate.board.detect import find_board
+    from brushloop.calibrate.board.lens import fit_lens
+    from brushloop.calibrate.board.spec import BoardView, describe
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import MAX_PHOTOGRAPH_BYTES, read_bounded, read_gray
     from brushloop.sessions.terminal import counted, shown

@@ -157,7 +157,7 @@ def _cropper(recording: Recording) -> Callable[[Capture], Cropped]:
     # Photographs are exported without the libraries that crops need.
     from brushloop.calibrate.presses import crop
     from brushloop.calibrate.session import calibration_of
-    from brushloop.calibrate.stroke.params import PX_PER_MM
+    from brushloop.calibrate.stroke import PX_PER_MM
 
     calibration = calibration_of(recording, next(recording.stroke_records()))
 

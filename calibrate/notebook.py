@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import Alignment, Field, Tone, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Series, samples, verdicts
@@ -26,7 +25,7 @@ from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit, FitRequest, FitResult, fit_presses
 from brushloop.calibrate.presses import Refused, crop, read_presses
 from brushloop.calibrate.remote import local_path
-from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.calibrate.session import Calibration, OpenSession, open_session
 from brushloop.calibrate.validate.command import Request, ValidationOutput, check
 from brushloop.calibrate.validate.command import validate as run_validation
 from brushloop.model.ccdbsm import Brush

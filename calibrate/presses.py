@@ -12,7 +12,6 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import (
     KEYS,
     Alignment,
@@ -28,9 +27,9 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.pool import Scheduler, threads
-from brushloop.calibrate.session import OpenSession
+from brushloop.calibrate.session import Calibration, OpenSession
 from brushloop.calibrate.store import Arrays, key_of
-from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask
 from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded, write_whole
+from brushloop.calibrate.session import Calibration
 from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]

@@ -1,26 +1,57 @@
-"""A session opened for calculations; how it is calibrated, and which calibration it uses."""
+"""A session opened for calculations: its rig, the calibration in use, and its store of finished work."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from brushloop.calibrate.artefact import current, load_artefact
+from pydantic import BaseModel, ValidationError
+
+from brushloop.calibrate.artefact import Artefact, current, load_artefact
 from brushloop.calibrate.board.lens import Lens
-from brushloop.calibrate.board.view import rig_of
-from brushloop.calibrate.calibration import Calibration
-from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError, invalid
+from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.store import FOLDER as FINISHED
 from brushloop.calibrate.store import Store
+from brushloop.calibrate.stroke import Params
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Header, Stroke
 
 Kind = Literal["press", "drag"]
+EFFECTIVE = "rig.effective.json"
+"""The configuration in effect: rig.toml, with the changes that the environment made."""
 OTHER_KIND = {
     "press": "holds drags, which `fit --drags` and `validate` take: this needs presses",
     "drag": "holds presses, which `fit` takes without --drags: this needs drags",
 }
+
+
+class Calibration(Plane, Artefact):
+    """The paper plane in a session's photographs, the recording it comes from and the software. Never changed.
+
+    Equal inputs give an equal file.
+    """
+
+    schema_version: Literal[3] = 3
+    session_id: str
+    source: str
+    """`loopback rig` or `real capture`, as the recording says."""
+    recording_sha256: str
+    software: str
+    preprocess: dict[str, float]
+    """Values of `Params`."""
+    board: BoardSpec
+    still_sha256: str
+    """sha256 of the encoded photograph of the board that this was measured on."""
+
+    @property
+    def params(self) -> Params:
+        """The parameters by which strokes are found in the session's photographs."""
+        return Params(**self.preprocess)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,3 +120,51 @@ def lens_in_use(folder: Path) -> Lens | None:
     path = current(folder)
     lens = None if path is None else load_artefact(path, Calibration).lens
     return lens if lens is not None else rig_of(folder).lens
+
+
+class _Paper(BaseModel):
+    size_mm: tuple[float, float] | None = None
+
+
+class _Camera(BaseModel):
+    optics: Lens | None = None
+
+
+class RigView(BaseModel):
+    """What a session recorded of the board, the sheet that lies on it, and the lens; None if nothing."""
+
+    board: BoardSpec | None = None
+    paper: _Paper | None = None
+    camera: _Camera | None = None
+
+    @property
+    def sheet_mm(self) -> tuple[float, float] | None:
+        """Width and height of the sheet."""
+        return None if self.paper is None else self.paper.size_mm
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens that the session was collected with."""
+        return None if self.camera is None else self.camera.optics
+
+
+def rig_of(session: Recording | Path) -> RigView:
+    """The rig of a recording, or of the folder of a session that may still be open. Raises `CalibrationError`."""
+    inside = isinstance(session, Recording)
+    where = f"{session.path} {EFFECTIVE}" if inside else str(session / EFFECTIVE)
+    data = session.attachment(EFFECTIVE) if inside else read_bounded(session / EFFECTIVE)
+    try:
+        return RigView.model_validate(json.loads(data))
+    except ValidationError as error:
+        raise invalid(where, error) from None
+    except (ValueError, RecursionError):
+        raise CalibrationError(where, "holds no board") from None
+
+
+def board_of(session: Recording | Path) -> BoardSpec:
+    """The board of a session's rig. Raises `CalibrationError` where the session names none."""
+    board = rig_of(session).board
+    if board is None:
+        where = session.path if isinstance(session, Recording) else session
+        raise CalibrationError(f"{where} {EFFECTIVE}", "holds no board")
+    return board

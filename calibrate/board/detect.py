@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import Floats, Gray
-from brushloop.calibrate.board.pix2len import apply
-from brushloop.calibrate.board.spec import Board, BoardSpec, Checkerboard, charuco_board
+from brushloop.calibrate.board.lens import Floats, Gray, apply
+from brushloop.calibrate.board.spec import Board, BoardSpec, BoardView, Checkerboard, charuco_board
 from brushloop.calibrate.errors import CalibrationError
 
 MIN_CORNERS = 8
@@ -50,23 +48,6 @@ LEAST_EDGE_CONTRAST = 0.4
 """Least contrast, as a share of the median: less is a shadow, a fold, or the edge of a sheet on the board."""
 LEAST_SEEN = 0.6
 MOST_WALK_PX = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class BoardView:
-    """One photograph of a board."""
-
-    name: str
-    size_px: tuple[int, int]
-    """Width and height of the photograph."""
-    pixels: Floats
-    """(n, 2) corners in the photograph."""
-    board_mm: Floats
-    """(n, 2) the same corners on the board: x right, y down, from its upper left corner."""
-    ids: NDArray[np.int64]
-    """(n,) number of each corner, row by row."""
-    flags: tuple[str, ...] = ()
-    """Problems with the photograph, although corners were found."""
 
 
 def find_board(image: Gray, board: Board, name: str, expected: int | None = None) -> BoardView:

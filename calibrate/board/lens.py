@@ -1,18 +1,53 @@
-"""A lens: remove its distortion from pixels and photographs, and add it again (OpenCV's five-parameter model)."""
+"""A lens (OpenCV's five-parameter model) and its distortion; and the fit of a lens to photographs of a board.
+
+A fit says what each photograph contributes, which ones do not fit, and what else to photograph.
+"""
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.artefact import Artefact, Frozen, load_artefact, made_by
+from brushloop.calibrate.board.spec import BoardView
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stats import student_95
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+FITTED = "k1 fitted on the board"
+"""Source of a lens where no lens file was given and none was needed."""
+Ways = NDArray[np.int64]
+LEAST_VIEWS = 4
+GOOD_VIEWS = 10
+EARNED_WAYS = 6
+"""Least number of orientations of the board for an interval: with fewer, leaving one out changes the lens too much."""
+MOST_LEFT_OUT = 12
+"""Most groups of orientations that are left out in turn: more do not improve the estimate of the spread."""
+OUTLIER_MEDIANS = 3.0
+"""A view whose residual exceeds the median by this factor is dropped and named."""
+LEAST_OUTLIER_PX = 0.4
+RMS_LIMIT_PX = 0.5
+"""Above this a pre-flight check warns: a flat, sharp, still board gives 0.1 to 0.3 px."""
+GRID = (3, 3)
+"""Columns and rows of the image on which coverage is judged."""
+GRID_WORDS = (
+    ("upper left", "upper middle", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower middle", "lower right"),
+)
+LEAST_SLANT_DEG = 15.0
+"""Boards seen face on determine only the ratio of focal length and distance."""
+SAME_SHARE = 0.0015
+"""Share of the image's longer side below which two corners differ only by noise: 1 px of 640."""
+DISTINCT_DEG = 5.0
+"""Boards turned by less count as one orientation: parallel planes determine a focal length no better than one does."""
 ROUNDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
 
 
@@ -20,7 +55,7 @@ class Lens(Frozen):
     """Camera matrix and distortion of one camera at one focus and one image size, in files as in calculations."""
 
     source: str = ""
-    """`lens file <hash>`, or `k1 fitted on the board` where no lens file was given and none was needed."""
+    """`lens file <hash>`, or `FITTED`."""
     size_px: tuple[int, int]
     """Width and height of the photographs that it applies to."""
     matrix: tuple[float, float, float, float]
@@ -91,4 +126,260 @@ def unknown_lens(size_px: tuple[int, int]) -> Lens:
     width, height = size_px
     focal = float(max(size_px))
     matrix = (focal, focal, (width - 1) / 2, (height - 1) / 2)
-    return Lens(size_px=size_px, matrix=matrix, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+    return Lens(source=FITTED, size_px=size_px, matrix=matrix, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+
+
+def apply(homography: Floats, points: Floats) -> Floats:
+    """Map (n, 2) points through a (3, 3) homography."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
+    """Fit the (3, 3) homography from (n, 2) to (n, 2) points. Raises `CalibrationError` if they lie on a line."""
+    found, _ = cv2.findHomography(pixels, paper_mm, 0)
+    if found is None or not np.all(np.isfinite(found)):  # pyright: ignore[reportUnnecessaryComparison]
+        raise CalibrationError(where, "the board's corners lie on a line, which does not determine a plane")
+    return np.asarray(found, np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """A lens, and how each board was held in front of it."""
+
+    lens: Lens
+    rms_px: float
+    residuals_px: Floats
+    """(views,) root mean square of each."""
+    normals: Floats
+    """(views, 3) unit normals of the boards, toward the camera."""
+
+
+def solve(views: Sequence[BoardView], where: str) -> Solved:
+    """Fit a lens by `cv2.calibrateCamera` (k1, k2, p1, p2, k3). Raises `CalibrationError` if none fits the views."""
+    size = views[0].size_px
+    objects = [np.column_stack([view.board_mm, np.zeros(len(view.board_mm))]).astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
+    try:
+        rms, matrix, distortion, turns, _, _, _, per_view = cv2.calibrateCameraExtended(
+            objects, pixels, size, np.zeros((3, 3)), np.zeros(5)
+        )
+    except cv2.error as error:
+        raise CalibrationError(where, f"no lens explains these views: {error.err}") from None
+    normals = np.stack([np.asarray(cv2.Rodrigues(turn)[0], np.float64)[:, 2] for turn in turns])
+    normals = np.asarray(np.where(normals[:, 2:] < 0.0, -normals, normals), np.float64)
+    return Solved(Lens.of_opencv(matrix, distortion, size), float(rms), np.ravel(per_view).astype(np.float64), normals)
+
+
+class LensFile(Artefact):
+    """A lens, its uncertainty, how well it explains each photograph, and where these come from."""
+
+    lens: Lens
+    focal_se_px: tuple[float, float] | None
+    """Standard errors of fx and fy, by leaving out each orientation of the board; None with too few orientations."""
+    ways: int
+    """Number of orientations of the board."""
+    rms_px: float
+    """Root mean square residual over all corners of the kept views."""
+    residuals_px: dict[str, float]
+    """Residual of each kept view, by name."""
+    dropped: dict[str, float]
+    """Views left out as outliers, with their residuals."""
+    unusable: dict[str, str]
+    """Photographs that show no board, or nothing new, and the reason."""
+    slants_deg: dict[str, float]
+    """Angle of each kept board from face on."""
+    guidance: tuple[str, ...]
+    """What else to photograph; empty where the coverage is good."""
+    warnings: tuple[str, ...]
+    """What a pre-flight check must show."""
+    schema_version: Literal[4] = 4
+    software: str
+    photographs: dict[str, str]
+    """Name of every photograph that was given, and the sha256 of its bytes."""
+    board: str
+    """Description: kind, size in squares or corners, mm."""
+
+    @property
+    def focal_reach_px(self) -> tuple[float, float] | None:
+        """Half widths of the 95 % intervals of fx and fy: for noise in these views, not for a curved board."""
+        if self.focal_se_px is None:
+            return None
+        reach = student_95(min(self.ways, MOST_LEFT_OUT) - 1)
+        return reach * self.focal_se_px[0], reach * self.focal_se_px[1]
+
+    def lines(self) -> list[str]:
+        """What the command prints: every photograph, the lens, and what to do."""
+        fx, fy, cx, cy = self.lens.matrix
+        reach = self.focal_reach_px
+        across, along = ("", "") if reach is None else (f" +- {reach[0]:.2f}", f" +- {reach[1]:.2f}")
+        return [
+            *(
+                f"{name}: {px:.3f} px, slanted by {self.slants_deg[name]:.0f} deg"
+                for name, px in self.residuals_px.items()
+            ),
+            *(f"{name}: {px:.3f} px, dropped: it does not fit the others" for name, px in self.dropped.items()),
+            *(f"{name}: {why}" for name, why in self.unusable.items()),
+            f"fx {fx:.2f}{across} px, fy {fy:.2f}{along} px{'' if reach is None else ' (95 %)'}, "
+            f"centre {cx:.1f}, {cy:.1f} px, k1 {self.lens.distortion[0]:+.4f}",
+            f"residual {self.rms_px:.3f} px over {len(self.residuals_px)} views, the board held in {self.ways} ways",
+            *(f"warning: {warning}" for warning in self.warnings),
+            *(f"to do: {advice}" for advice in self.guidance),
+        ]
+
+
+def read_lens(path: Path) -> Lens:
+    """Read a lens file written by `camera intrinsics`. Raises `CalibrationError`."""
+    file = load_artefact(path, LensFile)
+    return file.lens.model_copy(update={"source": f"lens file {file.digest}"})
+
+
+def fit_lens(
+    views: Sequence[BoardView],
+    board: str,
+    photographs: Mapping[str, str],
+    unusable: Mapping[str, str],
+) -> LensFile:
+    """Fit a lens by Zhang's method to the views that fit together; `unusable` says why other photographs have no view.
+
+    `board` describes the board, `photographs` are names and sha256 of all that were given. Raises `CalibrationError`
+    for fewer than `LEAST_VIEWS` views that differ, and for photographs of several sizes.
+    """
+    seen, left_out = distinct_views(views)
+    left_out = {**unusable, **left_out}
+    useless = [f"{name}: {why}" for name, why in left_out.items()]
+    where = f"{len(views) + len(unusable)} photographs"
+    _one_size(seen, where)
+    kept, dropped = list(seen), dict[str, float]()
+    while True:
+        if len(kept) < LEAST_VIEWS:
+            out = f", dropped: {', '.join(sorted(dropped))}" if dropped else ""
+            problem = f"{len(kept)} usable views of the board, at least {LEAST_VIEWS} needed{out}"
+            raise CalibrationError(where, "; ".join([problem, *useless]))
+        solved = solve(kept, where)
+        residuals = solved.residuals_px
+        worst = int(np.argmax(residuals))
+        # The median of the others: one bad view of four would raise the median of all and be kept.
+        others = float(np.median(np.delete(residuals, worst)))
+        if residuals[worst] <= max(LEAST_OUTLIER_PX, OUTLIER_MEDIANS * others):
+            break
+        dropped[kept[worst].name] = float(residuals[worst])
+        del kept[worst]
+    ways = held(solved.normals)
+    fewest = min(int(ways.max()), int(held(nominal_normals(kept)).max())) + 1
+    if fewest < LEAST_VIEWS:
+        problem = f"{len(kept)} usable views, but the board is held in {fewest} ways, at least {LEAST_VIEWS} needed"
+        raise CalibrationError(where, "; ".join([f"{problem}: slant it to other sides", *useless]))
+    slants = {v.name: float(s) for v, s in zip(kept, np.degrees(np.arccos(solved.normals[:, 2])), strict=True)}
+    warnings = [f"{view.name}: {flag}" for view in kept for flag in view.flags]
+    if solved.rms_px > RMS_LIMIT_PX:
+        exceeds = f"residual {solved.rms_px:.2f} px exceeds {RMS_LIMIT_PX:g} px"
+        warnings.insert(0, f"{exceeds}: is the board flat, sharp and still, and every photograph of one camera?")
+    return LensFile(
+        lens=solved.lens,
+        focal_se_px=_focal(kept, ways, where),
+        ways=int(ways.max()) + 1,
+        rms_px=solved.rms_px,
+        residuals_px={view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
+        dropped=dropped,
+        unusable=left_out,
+        slants_deg=slants,
+        guidance=guidance(kept, list(slants.values()), int(ways.max()) + 1),
+        warnings=tuple(warnings),
+        software=made_by(),
+        photographs=dict(photographs),
+        board=board,
+    )
+
+
+def _one_size(views: Sequence[BoardView], where: str) -> None:
+    sizes: dict[tuple[int, int], list[str]] = {}
+    for view in views:
+        sizes.setdefault(view.size_px, []).append(view.name)
+    if len(sizes) > 1:
+        problem = "; ".join(f"{w} x {h} px: {', '.join(names)}" for (w, h), names in sorted(sizes.items()))
+        raise CalibrationError(where, f"have several sizes, so they are of two cameras or settings ({problem})")
+
+
+def _focal(views: Sequence[BoardView], ways: Ways, where: str) -> tuple[float, float] | None:
+    """Standard errors of fx and fy, by leaving out each orientation of the board (jackknife).
+
+    Views of one orientation have similar errors, so they are left out together. None with too few orientations.
+    """
+    if ways.max() + 1 < EARNED_WAYS:
+        return None
+    count = min(int(ways.max()) + 1, MOST_LEFT_OUT)
+    left_out = (ways % count).tolist()
+    without = [solve([v for v, out in zip(views, left_out, strict=True) if out != k], where) for k in range(count)]
+    focal = np.array([solved.lens.matrix[:2] for solved in without])
+    spread = np.sqrt((count - 1) / count * ((focal - focal.mean(axis=0)) ** 2).sum(axis=0))
+    return float(spread[0]), float(spread[1])
+
+
+def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int = EARNED_WAYS) -> tuple[str, ...]:
+    """Instructions for further photographs: what these views, in `ways` orientations of the board, do not cover."""
+    wanted: list[str] = []
+    if len(views) < GOOD_VIEWS:
+        left = GOOD_VIEWS - len(views)
+        wanted.append(f"take {left} more photograph{'s' * (left > 1)} ({len(views)} used, {GOOD_VIEWS} are good)")
+    width, height = views[0].size_px
+    places = np.concatenate([view.pixels for view in views])
+    counts, _, _ = np.histogram2d(places[:, 1], places[:, 0], bins=(GRID[1], GRID[0]), range=((0, height), (0, width)))
+    empty = [GRID_WORDS[r][c] for r in range(GRID[1]) for c in range(GRID[0]) if counts[r, c] == 0]
+    if ways < EARNED_WAYS:
+        left = EARNED_WAYS - ways
+        more = f"{left} more way{'s' * (left > 1)} ({ways} so far)"
+        wanted.append(f"hold the board in {more}: {EARNED_WAYS} are needed before an error can be stated")
+    if empty:
+        wanted.append(f"bring the board into the {', '.join(empty)} of the image: no corner was seen there")
+    slanted = sum(slant >= LEAST_SLANT_DEG for slant in slants_deg)
+    if slanted < min(4, LEAST_VIEWS):
+        wanted.append(
+            f"slant the board by {LEAST_SLANT_DEG:.0f} to 45 deg in at least 4 photographs ({slanted} so far)"
+        )
+    return tuple(wanted)
+
+
+def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
+    """The views that show the board in a new place, and for every other view the one that it repeats."""
+    kept, again = list[BoardView](), dict[str, str]()
+    for view in views:
+        twin = next((one for one in kept if _same(one, view)), None)
+        if twin is None:
+            kept.append(view)
+        else:
+            again[view.name] = f"shows the board where {twin.name} does: they count once"
+    return kept, again
+
+
+def held(normals: Floats) -> Ways:
+    """(n,) index of each board's orientation, from the (n, 3) unit normals of the boards."""
+    first, ways = list[Floats](), list[int]()
+    for normal in normals:
+        near = [k for k, one in enumerate(first) if float(normal @ one) > np.cos(np.radians(DISTINCT_DEG))]
+        ways.append(near[0] if near else len(first))
+        if not near:
+            first.append(normal)
+    return np.array(ways, np.int64)
+
+
+def nominal_normals(views: Sequence[BoardView]) -> Floats:
+    """(n, 3) unit normals of the boards, for an undistorted lens whose focal length is one image width.
+
+    They are rough, but a lens that was wrongly fitted to boards of one orientation cannot make them differ.
+    """
+    rays = np.linalg.inv(unknown_lens(views[0].size_px).camera)
+    normals = list[Floats]()
+    for view in views:
+        across, along, _ = (rays @ homography(view.board_mm, view.pixels, view.name)).T
+        normal = np.cross(across, along)
+        normals.append(normal / (np.linalg.norm(normal) * (-1.0 if normal[2] < 0.0 else 1.0)))
+    return np.array(normals)
+
+
+def _same(one: BoardView, other: BoardView) -> bool:
+    shared, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
+    if one.size_px != other.size_px or 2 * len(shared) < min(len(one.ids), len(other.ids)):
+        return False
+    apart = np.linalg.norm(one.pixels[here] - other.pixels[there], axis=1)
+    return bool(np.median(apart) < SAME_SHARE * max(one.size_px))

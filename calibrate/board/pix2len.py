@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from brushloop.calibrate.board.lens import Floats, Lens, rms
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.lens import Floats, Gray, Lens, apply, homography, rms, unknown_lens
+from brushloop.calibrate.board.spec import BoardSpec, BoardView
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import student_95
 
@@ -25,20 +29,19 @@ SOFT_PX = 0.5
 STEP_PX = 0.5
 LAGS = 2
 """Distance in squares over which corner errors may be correlated."""
-
-
-def apply(homography: Floats, points: Floats) -> Floats:
-    """Map (n, 2) points through a (3, 3) homography."""
-    mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return mapped[:, :2] / mapped[:, 2:]
-
-
-def homography(pixels: Floats, paper_mm: Floats, where: str) -> Floats:
-    """Fit the (3, 3) homography from (n, 2) to (n, 2) points. Raises `CalibrationError` if they lie on a line."""
-    found, _ = cv2.findHomography(pixels, paper_mm, 0)
-    if found is None or not np.all(np.isfinite(found)):  # pyright: ignore[reportUnnecessaryComparison]
-        raise CalibrationError(where, "the board's corners lie on a line, which does not determine a plane")
-    return np.asarray(found, np.float64)
+VISIBLE_PX = 0.5
+"""A lens that distorts the board by more (root mean square) needs a lens file: one flat view cannot calibrate it."""
+REMAINING_PX = 1.5
+"""Distortion left by the lens file: more means another camera; less is a small change of focus, which k1 describes."""
+DISTORTED_SHARE = 0.85
+"""Share of squared residuals that one radial term explains: 0.7 for a board curled lengthwise, more for a lens."""
+NO_LENS_FILE = (
+    "the lens bends straight lines: calibrate it with `brushloop camera intrinsics`, then name the lens file as "
+    "camera.lens_file in rig.toml, or with --lens"
+)
+OTHER_LENS = "distortion remains after the lens was corrected: the lens file is of another camera, or of another focus"
+Matrix: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+"""A homography, row by row."""
 
 
 def local_scale(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
@@ -53,40 +56,102 @@ def _area(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
     return abs(float(across[0] * along[1] - across[1] * along[0]))
 
 
-@dataclass(frozen=True, slots=True)
-class Plane:
+class Plane(Frozen):
     """The paper plane as a camera sees it, and the lens that it was seen through."""
 
-    lens: Lens
-    """The lens, with the radial terms of this view."""
-    image_to_paper: Floats
-    """(3, 3) homography: pixels of the undistorted photograph (centres on integers) to mm in the paper frame."""
+    image_to_paper: Matrix
+    """Homography: pixels (centres on integers) of the undistorted photograph to mm in the paper frame."""
     mm_per_px: float
-    """pix2len in the middle of the corners, for the photograph as taken (with distortion)."""
-    interval_mm_per_px: tuple[float, float]
+    """pix2len in the middle of the corners that were seen, for the photograph as taken (with distortion)."""
+    mm_per_px_low: float
+    mm_per_px_high: float
     """95 % interval: propagates the noise of corners, but does not include errors of the printed board."""
     rms_px: float
-    distortion_px: float
-    """Distortion that the given lens does not describe: root mean square of the part that this view's terms explain."""
-    middle_px: tuple[float, float]
-    """Pixel at which pix2len holds, in the photograph as taken."""
     corners: int
-    dropped: tuple[int, ...]
-    """Indices of corners that do not lie in the plane of the others."""
+    corners_dropped: int
+    """Outliers: seen, but not on the plane of the others."""
+    lens: Lens
+    """Lens by which photographs are undistorted first, with the radial terms of this view."""
+    middle_px: tuple[float, float]
+    """Pixel at which `mm_per_px` holds, in the photograph as it was taken."""
     flags: tuple[str, ...] = ()
     """Problems with the photograph, although the board was found: partly hidden, saturated."""
+    distortion_px: float = Field(default=0.0, exclude=True)
+    """Distortion that the lens given to the fit does not describe: root mean square of the part that this view's terms
+    explain. It is not written to files."""
 
-    def scale_at(self, pixel: Floats) -> float:
-        """mm per pixel of the photograph as taken, at one of its pixels (2,)."""
-        return local_scale(self.to_paper, pixel)
+    @property
+    def homography(self) -> Floats:
+        """`image_to_paper` as (3, 3)."""
+        return np.array(self.image_to_paper).reshape(3, 3)
 
     def to_paper(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of the photograph as it was taken -> mm in the paper frame."""
-        return apply(self.image_to_paper, self.lens.undistorted(pixels))
+        return apply(self.homography, self.lens.undistorted(pixels))
 
     def to_image(self, paper_mm: Floats) -> Floats:
         """(n, 2) mm in the paper frame -> pixels of the photograph as it was taken."""
-        return self.lens.distorted(apply(np.asarray(np.linalg.inv(self.image_to_paper), np.float64), paper_mm))
+        return self.lens.distorted(apply(np.asarray(np.linalg.inv(self.homography), np.float64), paper_mm))
+
+
+def see_board(image: Gray, spec: BoardSpec, where: str = "camera", lens: Lens | None = None) -> Plane:
+    """Fit the paper plane in an undistorted photograph, or in one seen through a known lens, which is not refitted.
+
+    Raises `CalibrationError`; if the lens distorts, the message says what to do about it.
+    """
+    view, through = _find(image, spec, where, lens)
+    corners_mm = paper_mm(view, spec)
+    try:
+        plane = fit_plane(view.pixels, corners_mm, through, where, radial_terms=0)
+    except CalibrationError as error:
+        if distorted_share(view.pixels, corners_mm, through, where) > DISTORTED_SHARE:
+            raise CalibrationError(where, f"{error.what}; {NO_LENS_FILE if lens is None else OTHER_LENS}") from None
+        raise
+    return plane.model_copy(update={"flags": view.flags})
+
+
+def see_board_and_lens(
+    image: Gray, spec: BoardSpec, lens: Lens | None, where: str, sheet_mm: tuple[float, float] | None = None
+) -> tuple[BoardView, Plane]:
+    """The corners in a photograph as it was taken; and the paper plane, fitted to them together with the lens's k1.
+
+    A sheet of `sheet_mm` may lie on the board. Raises `CalibrationError`, also for a lens that distorts more than is
+    known.
+    """
+    view, through = _find(image, spec, where, lens, sheet_mm)
+    plane = fit_plane(view.pixels, paper_mm(view, spec), through, where)
+    if plane.distortion_px > (VISIBLE_PX if lens is None else REMAINING_PX):
+        advice = NO_LENS_FILE if lens is None else OTHER_LENS
+        raise CalibrationError(where, f"the board is bent by {plane.distortion_px:.1f} px: if it lies flat, {advice}")
+    return view, plane.model_copy(update={"flags": view.flags})
+
+
+def paper_mm(view: BoardView, spec: BoardSpec) -> Floats:
+    """(n, 2) corners of a view in the paper frame."""
+    depth_mm = spec.squares[1] * spec.square_mm
+    # The board counts y downward from its upper left corner; the paper frame counts it upward.
+    flip = np.array([1.0, -1.0])
+    return np.array([spec.origin_mm[0], spec.origin_mm[1] + depth_mm]) + flip * view.board_mm
+
+
+def corners_beside(spec: BoardSpec, sheet_mm: tuple[float, float]) -> int:
+    """Number of corners at least half a square outside a sheet that lies at the origin of the paper frame."""
+    (columns, rows), side, (x_mm, y_mm) = spec.squares, spec.square_mm, spec.origin_mm
+    across = x_mm + side * np.arange(1, columns)
+    along = y_mm + side * np.arange(1, rows)
+    gap_mm = 0.5 * side
+    clear_x = (across <= -gap_mm) | (across >= sheet_mm[0] + gap_mm)
+    clear_y = (along <= -gap_mm) | (along >= sheet_mm[1] + gap_mm)
+    return int((clear_x[:, None] | clear_y[None, :]).sum())
+
+
+def _find(
+    image: Gray, spec: BoardSpec, where: str, lens: Lens | None, sheet_mm: tuple[float, float] | None = None
+) -> tuple[BoardView, Lens]:
+    if lens is not None:
+        lens.check_size(image, where)
+    view = find_board(image, spec, where, None if sheet_mm is None else corners_beside(spec, sheet_mm))
+    return view, lens or unknown_lens(view.size_px)
 
 
 def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_terms: int = RADIAL_TERMS) -> Plane:
@@ -131,15 +196,16 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     flat = apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted
     flat_rms_px = rms(flat)
     return Plane(
-        refined,
-        image_to_paper,
-        float(np.exp(scale)),
-        (float(np.exp(scale - reach)), float(np.exp(scale + reach))),
-        rms_px,
-        float(np.sqrt(max(flat_rms_px**2 - rms_px**2, 0.0))),
-        (float(middle[0]), float(middle[1])),
-        int(kept.sum()),
-        tuple(int(k) for k in dropped),
+        image_to_paper=cast("Matrix", tuple(image_to_paper.ravel().tolist())),
+        mm_per_px=float(np.exp(scale)),
+        mm_per_px_low=float(np.exp(scale - reach)),
+        mm_per_px_high=float(np.exp(scale + reach)),
+        rms_px=rms_px,
+        corners=int(kept.sum()),
+        corners_dropped=int((~kept).sum()),
+        lens=refined,
+        middle_px=(float(middle[0]), float(middle[1])),
+        distortion_px=float(np.sqrt(max(flat_rms_px**2 - rms_px**2, 0.0))),
     )
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import Frozen
@@ -53,6 +55,23 @@ class Checkerboard(Frozen):
 
 
 Board = Checkerboard | BoardSpec
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """One photograph of a board."""
+
+    name: str
+    size_px: tuple[int, int]
+    """Width and height of the photograph."""
+    pixels: NDArray[np.float64]
+    """(n, 2) corners in the photograph."""
+    board_mm: NDArray[np.float64]
+    """(n, 2) the same corners on the board: x right, y down, from its upper left corner."""
+    ids: NDArray[np.int64]
+    """(n,) number of each corner, row by row."""
+    flags: tuple[str, ...] = ()
+    """Problems with the photograph, although corners were found."""
 
 
 def size_mm(board: Board) -> tuple[float, float]:

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
+from brushloop.calibrate.session import Calibration
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.preprocess import Prepared, Steps, prepare, preprocess
 from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
 from brushloop.model.ccdbsm import Brush
@@ -135,7 +135,7 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
     travels, the photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used,
     `SessionDamaged` for a picture that cannot be read.
     """
-    stroke, image, params = capture.stroke, capture.image(), Params.of(calibration)
+    stroke, image, params = capture.stroke, capture.image(), Params() if calibration is None else calibration.params
     if calibration is not None and stroke.anchor_mm is not None:
         window, (left_mm, top_mm) = view.window_mm(stroke.anchor_mm), view.anchor_mm
         if stroke.kind == "drag" and stroke.cell_mm is not None:
@@ -199,7 +199,7 @@ def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
         raise CaptureRefused(capture.stroke.stroke_id, "has no paper cell")
     raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
     whole = {"join_mm": math.hypot(*cell_mm[2:]), "speck_share": SPECK_SHARE}
-    return prepare(raster, None, capture.where, Params(**(calibration.preprocess | whole)))
+    return prepare(raster, None, capture.where, replace(calibration.params, **whole))
 
 
 def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import Line, fit_line
-from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
 from brushloop.calibrate.stroke.preprocess import (
     Measured,
     components,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.params import Gray, Mask, Soft
+from brushloop.calibrate.stroke import Gray, Mask, Soft
 from brushloop.calibrate.stroke.preprocess import light_surface, parts_near, touches_edge
 
 DARK_SHARE = 0.6

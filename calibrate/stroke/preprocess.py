@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.params import PX_PER_MM, Floats, Gray, Mask, Params, Soft
+from brushloop.calibrate.stroke import PX_PER_MM, Floats, Gray, Mask, Params, Soft
 
 LIGHT_ROUNDS = 5
 PAPER_ABOVE = 0.85

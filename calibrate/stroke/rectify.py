@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol, cast
+from typing import cast
 
 import cv2
 import numpy as np
 
-from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.params import PX_PER_MM, Floats, Gray
+from brushloop.calibrate.stroke import PX_PER_MM, Floats, Gray
 
 MAX_RASTER_PX = 8192
 KNOTS = 8
 """Pixels between computed points of the distortion map; it changes slowly and is interpolated in between."""
-
-
-class SeenPlane(Protocol):
-    """Mapping from points on the paper to a photograph."""
-
-    def to_image(self, paper_mm: Floats) -> Floats:
-        """Map (n, 2) mm in the paper frame to (n, 2) pixels of the photograph as it was taken."""
-        ...
 
 
 def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]) -> Gray:
@@ -75,23 +67,15 @@ def on_raster(point_px: tuple[float, float], px_per_mm: tuple[float, float]) -> 
     return point_px[0] * PX_PER_MM / px_per_mm[0], point_px[1] * PX_PER_MM / px_per_mm[1]
 
 
-def rectify_by(image: Gray, calibration: Calibration, window_mm: tuple[float, float, float, float], where: str) -> Gray:
-    """Rectify a window of the paper frame to 20 px/mm by a calibration.
-
-    Raises `CaptureRefused` if the photograph's size differs from the calibration's.
-    """
-    height, width = image.shape
-    if (width, height) != calibration.lens.size_px:
-        wanted = "{} x {}".format(*calibration.lens.size_px)
-        raise CaptureRefused(where, f"is {width} x {height} px, the calibration is for {wanted} px")
-    return rectify_distorted(image, calibration, window_mm)
-
-
-def rectify_distorted(image: Gray, plane: SeenPlane, window_mm: tuple[float, float, float, float]) -> Gray:
+def rectify_by(image: Gray, plane: Plane, window_mm: tuple[float, float, float, float], where: str) -> Gray:
     """Rectify the window (x, y, width, height in the paper frame) to 20 px/mm, as `rectify` does.
 
-    The photograph is as it was taken; the lens distortion is removed here.
+    The photograph is as it was taken; the lens distortion is removed here. Raises `CaptureRefused` if its size is not
+    that of the photograph that the plane was seen in.
     """
+    if image.shape[::-1] != plane.lens.size_px:
+        is_px, seen_px = ("{} x {} px".format(*size) for size in (image.shape[::-1], plane.lens.size_px))
+        raise CaptureRefused(where, f"is {is_px}, the calibration is for {seen_px}")
     x, y, width, height = window_mm
     columns, rows = round(width * PX_PER_MM), round(height * PX_PER_MM)
     across, along = np.arange(0, columns + KNOTS, KNOTS), np.arange(0, rows + KNOTS, KNOTS)

@@ -15,11 +15,11 @@ from typing import ClassVar
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import Alignment, Key, Tone, brush_of
 from brushloop.calibrate.loop import LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
 from brushloop.calibrate.scores import Cell, Row, Scores, Stat, find_stat, statistics
+from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stats import CEILING, Floats, ceiling_values
 from brushloop.calibrate.validate.models import (
     ANOTHER,

@@ -20,7 +20,7 @@ from brushloop.calibrate.presses import Refused
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.store import key_of
-from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress

@@ -13,13 +13,12 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, prepare_cell, to_tone
 from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_3, Polarity, similarity
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
 from brushloop.calibrate.report import Sealed, load_sealed
-from brushloop.calibrate.session import open_session
+from brushloop.calibrate.session import Calibration, open_session
 from brushloop.calibrate.stats import Summary, others_of, summarise
 from brushloop.calibrate.writing.record import FigureRecord, PlanRecord, Round, as_points
 from brushloop.model.characters.plan import Phase, phase_map

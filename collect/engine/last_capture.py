@@ -9,7 +9,7 @@ import numpy as np
 
 from brushloop.calibrate.compare.place import SIZE_PX, Field, Tone, captured_mm
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.quality.verdict import Verdict
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brushloop.calibrate.board.pix2len import Plane
-    from brushloop.calibrate.stroke.params import Gray
+    from brushloop.calibrate.stroke import Gray
 
 FIELD = Field()
 FINE = 8
@@ -81,7 +81,7 @@ def cell_raster(image: Gray, plane: Plane, patch: Patch) -> tuple[Gray, tuple[fl
     its pixels."""
     x, y, _, height = window = FIELD.window_mm(patch.anchor_mm)
     left, top = FIELD.anchor_mm
-    raster = rectify(image, plane.image_to_paper, window)
+    raster = rectify(image, plane.homography, window)
     top_of_cell = y + height - (patch.y_mm + patch.size_y_mm)
     cell_px = (
         round((patch.x_mm - x) * PX_PER_MM),

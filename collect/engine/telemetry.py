@@ -14,7 +14,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from brushloop.calibrate.stroke.params import Gray
+from brushloop.calibrate.stroke import Gray
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.quality.measure import blur_px
 from brushloop.collect.rig.optics import gray

@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import Floats
-from brushloop.calibrate.board.pix2len import apply, local_scale
-from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.board.lens import Floats, apply
+from brushloop.calibrate.board.pix2len import local_scale, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import RigConfig
@@ -38,7 +37,7 @@ def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gr
     """
     first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
     try:
-        return first, second, see_board(second, config.board).image_to_paper
+        return first, second, see_board(second, config.board).homography
     except CalibrationError as error:
         raise StepError(f"the board is not seen: {error.what}") from None
 

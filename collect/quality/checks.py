@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.quality import measure
 from brushloop.collect.quality.ink import Ink, Point, Rect, around, mm2, on_sheet, take, tell_apart
@@ -89,9 +89,9 @@ def check_drawing(
     frame = check_frame(image, plane, limits)
     if not frame.passed:
         return frame
-    inked = take(image, plane.image_to_paper, patch.rect_mm, Params()).inked(limits.ink_gate)
+    inked = take(image, plane.homography, patch.rect_mm, Params()).inked(limits.ink_gate)
     if previous is not None:
-        inked = inked & ~take(previous, plane.image_to_paper, patch.rect_mm, Params()).inked(limits.ink_gate)
+        inked = inked & ~take(previous, plane.homography, patch.rect_mm, Params()).inked(limits.ink_gate)
     edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
     return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), depth_mm, limits)))
 
@@ -103,7 +103,7 @@ def patch_is_blank(
 
     `sheet_mm` (width, height) excludes the sheet's edge and what lies beyond it.
     """
-    window = take(image, plane.image_to_paper, on_sheet(patch.rect_mm, sheet_mm), Params())
+    window = take(image, plane.homography, on_sheet(patch.rect_mm, sheet_mm), Params())
     hidden_mm2 = mm2(~window.in_view)
     if hidden_mm2 > 0.0:
         return unseen(patch.index, hidden_mm2, limits)
@@ -134,7 +134,7 @@ class _Press:
 
     def ink(self, margin_mm: float) -> Ink:
         """The ink in the patch and a margin around it: the stroke's own, other new ink, and old ink."""
-        window, to_paper = self.around(margin_mm), self.plane.image_to_paper
+        window, to_paper = self.around(margin_mm), self.plane.homography
         now = take(self.image, to_paper, window, Params())
         before = None if self.previous is None else take(self.previous, to_paper, window, Params())
         return tell_apart(now, before, self.cell_mm, self.anchor_mm, self.limits.ink_gate)
@@ -207,7 +207,7 @@ def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits
 
 def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
     """No reflection in the patch; `window` includes enough paper around it to measure the light."""
-    spots = measure.glare(rectify(image, plane.image_to_paper, window), limits.glare_share)
+    spots = measure.glare(rectify(image, plane.homography, window), limits.glare_share)
     scale = measure.BRIGHT_PX_PER_MM
     left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
     rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from brushloop.calibrate.board.lens import Floats
-from brushloop.calibrate.board.pix2len import apply
-from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Params, Soft
+from brushloop.calibrate.board.lens import Floats, apply
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params, Soft
 from brushloop.calibrate.stroke.preprocess import flatten
 from brushloop.calibrate.stroke.rectify import rectify
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import Floats
-from brushloop.calibrate.board.pix2len import Plane, apply
-from brushloop.calibrate.stroke.params import PX_PER_MM, Gray, Mask, Soft
+from brushloop.calibrate.board.lens import Floats, apply
+from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Soft
 from brushloop.collect.quality.ink import Ink, Point
 
 Floats32 = NDArray[np.float32]
@@ -76,7 +76,7 @@ def _slope(smooth: Floats32, kernel: Floats32) -> Floats32:
 
 def edge_mm(points_mm: Floats, plane: Plane, shape: tuple[int, ...]) -> float:
     """Distance of the outermost of (n, 2) points of the paper from the edge of the frame; negative beyond it."""
-    pixels = apply(np.asarray(np.linalg.inv(plane.image_to_paper), np.float64), points_mm)
+    pixels = apply(np.asarray(np.linalg.inv(plane.homography), np.float64), points_mm)
     most = np.array([shape[1], shape[0]]) - 1.0
     return float(min(pixels.min(), (most - pixels).min()) * plane.mm_per_px)
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from rich.table import Table
 from rich.text import Text
 
-from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_devices import ForceConfig

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.intrinsics import read_lens
+from brushloop.calibrate.board.lens import read_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config_devices import CameraConfig

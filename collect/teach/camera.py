@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.detect import BoardView, find_board
-from brushloop.calibrate.board.intrinsics import (
+from brushloop.calibrate.board.detect import find_board
+from brushloop.calibrate.board.lens import (
     GOOD_VIEWS,
     LensFile,
     distinct_views,
@@ -24,7 +24,7 @@ from brushloop.calibrate.board.intrinsics import (
     held,
     nominal_normals,
 )
-from brushloop.calibrate.board.spec import BoardSpec, describe
+from brushloop.calibrate.board.spec import BoardSpec, BoardView, describe
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
 from brushloop.collect.errors import CannotTeach

@@ -9,7 +9,7 @@ from collections import defaultdict
 import numpy as np
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.intrinsics import read_lens
+from brushloop.calibrate.board.lens import read_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from brushloop.calibrate.board.detect import BoardView
-from brushloop.calibrate.board.pix2len import apply, homography
-from brushloop.calibrate.board.spec import BoardSpec, size_mm
-from brushloop.calibrate.board.view import paper_mm
+from brushloop.calibrate.board.lens import apply, homography
+from brushloop.calibrate.board.pix2len import paper_mm
+from brushloop.calibrate.board.spec import BoardSpec, BoardView, size_mm
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 

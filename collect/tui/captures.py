@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.board.view import board_of, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit
-from brushloop.calibrate.session import lens_in_use
+from brushloop.calibrate.session import board_of, lens_in_use
 from brushloop.calibrate.waits import unlike, waits_of
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
-from brushloop.calibrate.board.intrinsics import LensFile
-from brushloop.calibrate.board.lens import Lens, unknown_lens
+from brushloop.calibrate.board.lens import Lens, LensFile, unknown_lens
+from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.board.spec import BoardSpec
-from brushloop.calibrate.calibration import Calibration
+from brushloop.calibrate.session import Calibration
+
+
+def flat_plane(size_px: tuple[int, int], mm_per_px: tuple[float, float]) -> Plane:
+    """The plane seen straight from above by a camera of this (width, height); the origin is the lower left corner."""
+    x_mm, y_mm = mm_per_px
+    scale = math.sqrt(x_mm * y_mm)
+    return Plane(
+        # Pixel centres on integers: pixel (0, 0) is the middle of the first square.
+        image_to_paper=(x_mm, 0.0, 0.5 * x_mm, 0.0, -y_mm, (size_px[1] - 0.5) * y_mm, 0.0, 0.0, 1.0),
+        mm_per_px=scale,
+        mm_per_px_low=scale,
+        mm_per_px_high=scale,
+        rms_px=0.0,
+        corners=24,
+        corners_dropped=0,
+        lens=unknown_lens(size_px),
+        middle_px=(0.0, 0.0),
+    )
+
 
 CALIBRATION = Calibration(
+    **flat_plane((1000, 800), (0.1, 0.1)).model_dump(),
     session_id="test",
     source="loopback rig",
     recording_sha256="",
     software="",
-    # Pixel centres on integers: pixel (0, 0) is the middle of the first 0.1 mm.
-    image_to_paper=(0.1, 0.0, 0.05, 0.0, -0.1, 79.95, 0.0, 0.0, 1.0),
-    mm_per_px=0.1,
-    mm_per_px_low=0.1,
-    mm_per_px_high=0.1,
-    rms_px=0.0,
-    corners=24,
-    corners_dropped=0,
     preprocess={},
-    lens=unknown_lens((1000, 800)),
-    middle_px=(0.0, 0.0),
     board=BoardSpec(squares=(5, 7), square_mm=40.0, marker_mm=20.0, origin_mm=(0.0, 0.0)),
     still_sha256="",
 )

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.artefact import HASH_CHARS, current, load_artefact, put_to_use
+from brushloop.calibrate.board.lens import FITTED
 from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
-from brushloop.calibrate.calibration import FITTED, Calibration
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.session import calibration_of
+from brushloop.calibrate.session import Calibration, calibration_of
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.scene import Scene
@@ -135,7 +135,7 @@ def test_an_artefact_is_named_after_its_contents(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("no json", ": Invalid JSON"),
-        ('{"image_to_paper": 1}', "session_id: Field required"),
+        ('{"session_id": "s"}', "image_to_paper: Field required"),
         (CALIBRATION.model_dump_json().replace('"schema_version":3', '"schema_version":4'), "schema_version: Input"),
     ],
     ids=["words", "half", "of later"],

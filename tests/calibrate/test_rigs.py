@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.intrinsics import fit_lens
-from brushloop.calibrate.board.lens import Lens, unknown_lens
-from brushloop.calibrate.board.pix2len import Plane, fit_plane
-from brushloop.calibrate.board.view import paper_mm
-from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.board.lens import Lens, fit_lens, unknown_lens
+from brushloop.calibrate.board.pix2len import Plane, fit_plane, paper_mm
+from brushloop.calibrate.stroke import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
-from brushloop.calibrate.stroke.rectify import rectify_distorted
+from brushloop.calibrate.stroke.rectify import rectify_by
 from brushloop.drivers.sim.config import Table
 from brushloop.drivers.sim.scene import Optics
 from tests.calibrate.simulated_rigs import (
@@ -45,8 +43,7 @@ def draws(rig: int, count: int, seed: int = 0) -> list[tuple[float, bool]]:
     for shot in boards(rig, count, seed):
         plane = plane_of(shot)
         truth = true_scale(shot, plane.middle_px)
-        low, high = plane.interval_mm_per_px
-        aimed.append((plane.mm_per_px / truth - 1.0, low <= truth <= high))
+        aimed.append((plane.mm_per_px / truth - 1.0, plane.mm_per_px_low <= truth <= plane.mm_per_px_high))
     return aimed
 
 
@@ -61,7 +58,7 @@ def strokes(rig: int, presses: int) -> tuple[list[float], float]:
 
 def overlap(shot: Shot, plane: Plane, anchor: tuple[float, float]) -> float:
     window = heading_free_window(anchor)
-    raster = rectify_distorted(shot.image, plane, window)
+    raster = rectify_by(shot.image, plane, window, "rig")
     at = ((anchor[0] - window[0]) * PX_PER_MM, (window[1] + window[3] - anchor[1]) * PX_PER_MM)
     mask = prepare(raster, at, "rig", Params()).mask
     truth = true_mask(shot, window, PX_PER_MM)

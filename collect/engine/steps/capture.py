@@ -8,10 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stroke.params import Gray
+from brushloop.calibrate.stroke import Gray
 from brushloop.calibrate.waits import limit_s, unlike, waits_of
 from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of
 from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted

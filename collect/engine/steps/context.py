@@ -7,8 +7,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.engine.force_guard import ForceGuard
 from brushloop.collect.engine.progress import Progress
@@ -24,7 +23,7 @@ from brushloop.drivers.host import finished
 from brushloop.sessions.store import Attempt, SessionStore
 
 if TYPE_CHECKING:
-    from brushloop.calibrate.stroke.params import Gray
+    from brushloop.calibrate.stroke import Gray
 
 _R = TypeVar("_R")
 

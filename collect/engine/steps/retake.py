@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brushloop.calibrate.stroke.params import Gray
+from brushloop.calibrate.stroke import Gray
 from brushloop.collect.engine.steps.context import RunContext
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.quality.verdict import Verdict
@@ -61,7 +61,7 @@ def _cut_out(run: RunContext, image: Gray, patch: Patch) -> Gray:
     assert plane is not None
     x_mm, y_mm, size_x_mm, size_y_mm = patch.rect_mm
     corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm)])
-    seen = corners @ np.linalg.inv(plane.image_to_paper).T
+    seen = corners @ np.linalg.inv(plane.homography).T
     px = seen[:, :2] / seen[:, 2:]
     (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
     m = PICTURE_MARGIN_PX

@@ -13,9 +13,8 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.board.detect import BoardView, find_board
-from brushloop.calibrate.board.intrinsics import LensFile, guidance
-from brushloop.calibrate.board.intrinsics import fit_lens as fit
-from brushloop.calibrate.board.lens import Lens
+from brushloop.calibrate.board.lens import Lens, LensFile, guidance
+from brushloop.calibrate.board.lens import fit_lens as fit
 from brushloop.calibrate.board.spec import BoardSpec, Checkerboard, charuco_board
 from brushloop.calibrate.errors import CalibrationError
 

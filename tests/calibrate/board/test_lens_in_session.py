@@ -15,15 +15,14 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.intrinsics import fit_lens, read_lens
-from brushloop.calibrate.board.lens import Lens
-from brushloop.calibrate.board.view import see_board
+from brushloop.calibrate.board.lens import FITTED, Lens, fit_lens, read_lens
+from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
-from brushloop.calibrate.calibration import FITTED, Calibration
 from brushloop.calibrate.compare.place import Field, prepare_press
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.session import Calibration
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.tui.captures import Review
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Stroke

@@ -12,10 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from pydantic import ValidationError
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import unknown_lens
-from brushloop.calibrate.board.pix2len import Plane, apply, distorted_share, fit_plane, local_scale
+from brushloop.calibrate.board.lens import apply, unknown_lens
+from brushloop.calibrate.board.pix2len import DISTORTED_SHARE, Plane, distorted_share, fit_plane, local_scale, paper_mm
 from brushloop.calibrate.board.spec import MM_PER_INCH, Board, BoardSpec, Checkerboard, charuco_board, drawn, write_pdf
-from brushloop.calibrate.board.view import DISTORTED_SHARE, paper_mm
 from brushloop.calibrate.errors import CalibrationError
 
 SPEC = BoardSpec(squares=(7, 5), square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_50", origin_mm=(-10.0, 5.0))
@@ -45,10 +44,9 @@ def test_the_plane_is_found_to_hundredths_of_a_millimetre_and_its_scale_lies_in_
     pixels, paper, truth = seen
     plane = flat(pixels, paper)
     assert plane.corners == 24
-    assert apply(plane.image_to_paper, PLACES) == pytest.approx(apply(truth, PLACES), abs=0.02)
-    low, high = plane.interval_mm_per_px
-    assert low < plane.mm_per_px < high
-    assert high - low < 1e-3 * plane.mm_per_px
+    assert apply(plane.homography, PLACES) == pytest.approx(apply(truth, PLACES), abs=0.02)
+    assert plane.mm_per_px_low < plane.mm_per_px < plane.mm_per_px_high
+    assert plane.mm_per_px_high - plane.mm_per_px_low < 1e-3 * plane.mm_per_px
     assert plane.mm_per_px == pytest.approx(local_scale(lambda at: apply(truth, at), pixels.mean(axis=0)), rel=5e-4)
 
 
@@ -57,8 +55,8 @@ def test_a_misnamed_corner_is_dropped_and_corners_on_no_plane_are_refused(seen) 
     misnamed = pixels.copy()
     misnamed[3] += (7.0, -5.0)
     plane = flat(misnamed, paper)
-    assert (plane.corners, plane.dropped) == (23, (3,))
-    assert apply(plane.image_to_paper, PLACES) == pytest.approx(apply(truth, PLACES), abs=0.03)
+    assert (plane.corners, plane.corners_dropped) == (23, 1)
+    assert apply(plane.homography, PLACES) == pytest.approx(apply(truth, PLACES), abs=0.03)
     with pytest.raises(CalibrationError, match="residual"):
         flat(pixels + np.random.default_rng(1).normal(0, 4, pixels.shape), paper)
 

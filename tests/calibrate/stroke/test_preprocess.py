@@ -8,7 +8,7 @@ import pytest
 
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stats import fit_line
-from brushloop.calibrate.stroke.params import PX_PER_MM, Params
+from brushloop.calibrate.stroke import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import measure, prepare
 from brushloop.calibrate.stroke.rectify import rectify, rescale
 

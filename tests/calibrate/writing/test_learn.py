@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from brushloop.calibrate.calibration import Calibration
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.writing.learn import MOST_MM, learned, missed, reach_of
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.calibrate.writing.report import write_written

@@ -23,7 +23,7 @@ from tests.waiting import wait_until
 if TYPE_CHECKING:
     from conftest import Lab
 
-    from brushloop.calibrate.stroke.params import Gray
+    from brushloop.calibrate.stroke import Gray
     from brushloop.collect.engine.engine import Engine
     from brushloop.collect.engine.snapshot import Snapshot
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.stroke.params import PX_PER_MM
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.quality.ink import Ink, Window
 from brushloop.collect.quality.measure import measure_mark
 from brushloop.collect.rig.config_touch import QualityConfig

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from bench.brushes import DATA as SHARED
-from brushloop.calibrate.board.lens import unknown_lens
-from brushloop.calibrate.board.pix2len import Plane
 from brushloop.collect.quality.checks import check_capture
 from brushloop.collect.quality.verdict import Failure, Verdict
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
+from tests.calibrate.given import flat_plane
 
 DATA = SHARED / "frida_bigbrush_tilt_16x20"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the folder of real photographs is not here")
@@ -41,21 +40,9 @@ def judge(folder: Path, row: dict[str, str], limits: QualityConfig) -> Verdict:
     assert image is not None
     x_mm, y_mm = 1.0 / float(row["px_per_mm_x"]), 1.0 / float(row["px_per_mm_y"])
     size_x_mm, size_y_mm = image.shape[1] * x_mm, image.shape[0] * y_mm
-    to_paper = np.array([[x_mm, 0.0, 0.5 * x_mm], [0.0, -y_mm, size_y_mm - 0.5 * y_mm], [0.0, 0.0, 1.0]])
-    scale = float(np.sqrt(x_mm * y_mm))
     return check_capture(
         image.astype(np.uint8),
-        Plane(
-            unknown_lens((image.shape[1], image.shape[0])),
-            to_paper,
-            scale,
-            (scale, scale),
-            rms_px=0.0,
-            distortion_px=0.0,
-            middle_px=(0.0, 0.0),
-            corners=0,
-            dropped=(),
-        ),
+        flat_plane((image.shape[1], image.shape[0]), (x_mm, y_mm)),
         Patch(0, 0.0, 0.0, size_x_mm, size_y_mm),
         depth_mm=max(float(row.get("depth_mid_mm_nominal") or DEPTH_MM), 1.0),
         limits=limits,

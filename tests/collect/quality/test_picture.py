@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane
 from brushloop.collect.quality.checks import check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.quality.measure import blur_px, glare, paper_level
 from brushloop.collect.quality.verdict import Failure, Family
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
+from tests.calibrate.given import flat_plane
 
 LIMITS = QualityConfig()
 PX = 8.0
@@ -29,8 +29,7 @@ Gray = NDArray[np.uint8]
 def plane(height_px: int = 480) -> Plane:
     """8 px/mm, the paper's lower left corner at the picture's."""
     step = 1.0 / PX
-    to_paper = np.array([[step, 0.0, 0.5 * step], [0.0, -step, height_px * step - 0.5 * step], [0.0, 0.0, 1.0]])
-    return Plane(unknown_lens((640, height_px)), to_paper, step, (step, step), 0.0, 0.0, (0.0, 0.0), 0, ())
+    return flat_plane((640, height_px), (step, step))
 
 
 def paper(*, seed: int = 0) -> Gray:
