@@ -34,8 +34,7 @@ from bench.brushes import (
 )
 from bench.harness import BenchError, Result, at_most, brushloop, machine, rounds_of
 from bench.prior import BRISTLE
-from brushloop.calibrate.compare.place import Field
-from brushloop.calibrate.compare.score import TABLE_2
+from brushloop.calibrate.compare.place import TABLE_2, Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit

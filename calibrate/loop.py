@@ -16,8 +16,18 @@ import numpy as np
 
 from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Image, Key, Tone, brush_of, simulated
-from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_1
+from brushloop.calibrate.compare.place import (
+    KEYS,
+    ROBOT_WRITING,
+    TABLE_1,
+    Alignment,
+    Field,
+    Image,
+    Key,
+    Tone,
+    brush_of,
+    simulated,
+)
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded

@@ -6,9 +6,10 @@ is prepared side by side and kept. A crop is the raster itself, too large to be 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator
 from contextlib import nullcontext
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -21,21 +22,22 @@ from brushloop.calibrate.compare.place import (
     captured_mm,
     captured_normalised,
     covered,
-    prepare_press,
-    rectified,
     to_pixels,
 )
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.pool import Scheduler, threads
 from brushloop.calibrate.session import Calibration, OpenSession
 from brushloop.calibrate.store import Arrays, key_of
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask
-from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
+from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure, prepare
+from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Condition, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
+SPECK_SHARE = 0.002
+"""Smallest share of a figure's ink that counts; lower than for a press, because a figure may have dots."""
 Refused = tuple[str, str]
 """(stroke, reason) of a capture that cannot be used: it is listed, never dropped in silence."""
 
@@ -172,5 +174,80 @@ def crop(capture: Capture, calibration: Calibration | None) -> tuple[Gray, Mask,
 
     The ink of a press is its largest connected ink, as everywhere; that of a stroke that travels is all in its cell.
     """
-    raster, steps = rectified(capture, calibration, Field())
-    return raster, steps.ink if capture.stroke.kind == "drag" else steps.prepared.mask, steps.prepared
+    raster, prepared = rectified(capture, calibration, Field())
+    return raster, prepared.ink if capture.stroke.kind == "drag" else prepared.mask, prepared
+
+
+def rectified(capture: Capture, calibration: Calibration | None, view: Field) -> tuple[Gray, Prepared]:
+    """The surroundings of a stroke at 20 px/mm, (h, w) gray, and what was found in them.
+
+    A press is cropped to the field around its zero-touch point, a stroke that travels to its paper cell. A press in an
+    imported photograph keeps the surroundings that the light is estimated from; without that point, or of a stroke that
+    travels, the photograph is rescaled whole. Raises `CaptureRefused` for a capture that cannot be used,
+    `SessionDamaged` for a picture that cannot be read.
+    """
+    stroke, image, params = capture.stroke, capture.image(), Params() if calibration is None else calibration.params
+    if calibration is not None and stroke.anchor_mm is not None:
+        window, (left_mm, top_mm) = view.window_mm(stroke.anchor_mm), view.anchor_mm
+        if stroke.kind == "drag" and stroke.cell_mm is not None:
+            window = x_mm, y_mm, _, tall_mm = stroke.cell_mm
+            left_mm, top_mm = stroke.anchor_mm[0] - x_mm, y_mm + tall_mm - stroke.anchor_mm[1]
+        raster = rectify_by(image, calibration, window, capture.where)
+        cell_px = None if stroke.cell_mm is None else on_window(stroke.cell_mm, window)
+        anchor = (left_mm * PX_PER_MM, top_mm * PX_PER_MM)
+        return raster, prepare(raster, anchor, capture.where, params, cell_px)
+    if stroke.px_per_mm is None:
+        raise CaptureRefused(stroke.stroke_id, "has neither a calibration nor a scale of its own")
+    anchor_px = stroke.anchor_px
+    if anchor_px is not None and stroke.kind == "press":
+        around, (left_mm, top_mm) = 0.5 * params.background_mm, view.anchor_mm
+        right_mm, bottom_mm = view.side_mm - left_mm, view.side_mm - top_mm
+        reach_mm = (left_mm + around, top_mm + around, right_mm + around, bottom_mm + around)
+        image, anchor_px = cut_out(image, anchor_px, stroke.px_per_mm, reach_mm, capture.where)
+    raster = rescale(image, stroke.px_per_mm, capture.where)
+    anchor = None if anchor_px is None else on_raster(anchor_px, stroke.px_per_mm)
+    return raster, prepare(raster, anchor, capture.where, params)
+
+
+def prepare_press(capture: Capture, calibration: Calibration | None, view: Field) -> Prepared:
+    """Rectify a stroke to the millimetre field. Raises as `rectified` does."""
+    stroke = capture.stroke
+    if capture.bad:
+        raise CaptureRefused(stroke.stroke_id, capture.bad)
+    _, prepared = rectified(capture, calibration, view)
+    if calibration is not None and stroke.anchor_mm is not None:
+        return prepared
+    if prepared.anchor_px is None:
+        raise CaptureRefused(stroke.stroke_id, "has no anchor (start_x_px, start_y_px): it cannot be laid on a model")
+    return _cropped(prepared, prepared.anchor_px, view)
+
+
+def _cropped(prepared: Prepared, anchor_px: tuple[float, float], view: Field) -> Prepared:
+    """Crop a raster to the field around its anchor; `cut` is set where ink is left out.
+
+    Raises `CaptureRefused` if none of the stroke lies in the field.
+    """
+    side, (height, width) = round(view.side_mm * PX_PER_MM), prepared.mask.shape
+    left, top = (
+        min(max(round(at - away_mm * PX_PER_MM), -side), most)
+        for at, away_mm, most in zip(anchor_px, view.anchor_mm, (width, height), strict=True)
+    )
+    window = slice(top + side, top + 2 * side), slice(left + side, left + 2 * side)
+    mask, soft = (np.pad(part, side)[window] for part in (prepared.mask, prepared.soft))
+    if not mask.any():
+        raise CaptureRefused("anchor", "lies so far from the stroke that none of it is in the field")
+    cut = prepared.cut or bool(np.count_nonzero(mask) < np.count_nonzero(prepared.mask))
+    return replace(prepared, mask=mask, soft=soft, anchor_px=(anchor_px[0] - left, anchor_px[1] - top), cut=cut)
+
+
+def prepare_cell(capture: Capture, calibration: Calibration) -> Prepared:
+    """Rectify a whole paper cell: all ink in it belongs to its figure, however far apart the strokes are.
+
+    Raises `CaptureRefused` for a stroke without a cell, or without ink in it.
+    """
+    cell_mm = capture.stroke.cell_mm
+    if cell_mm is None:
+        raise CaptureRefused(capture.stroke.stroke_id, "has no paper cell")
+    raster = rectify_by(capture.image(), calibration, cell_mm, capture.where)
+    whole = {"join_mm": math.hypot(*cell_mm[2:]), "speck_share": SPECK_SHARE}
+    return prepare(raster, None, capture.where, replace(calibration.params, **whole))

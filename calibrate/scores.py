@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, to_pixels
-from brushloop.calibrate.compare.score import similarity
+from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, similarity, to_pixels
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import source_label

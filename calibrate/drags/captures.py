@@ -31,7 +31,7 @@ from brushloop.calibrate.stroke.preprocess import (
     fill_holes,
     measure,
     outline,
-    preprocess,
+    prepare,
     touches_edge,
 )
 from brushloop.calibrate.stroke.rectify import on_raster, rescale
@@ -242,17 +242,17 @@ def _grid(commands: Sequence[tuple[float, ...] | None], mm_per_px: float) -> tup
 def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Floats, Floats]) -> Drag:
     """Find a drag, all parts of it, and measure its connected part. It is cut if any part is.
 
-    Raises `CaptureRefused` as `preprocess` does.
+    Raises `CaptureRefused` as `prepare` does.
     """
     stroke = capture.stroke
     assert stroke.px_per_mm is not None  # as an import has
     raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
     anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
-    steps = preprocess(raster, anchor, capture.where, PARAMS)
-    mask = steps.prepared.mask
+    prepared = prepare(raster, anchor, capture.where, PARAMS)
+    mask = prepared.mask
     wide = replace(PARAMS, join_mm=max(PARAMS.join_mm, JOIN_MM))
-    whole = fill_holes(components(steps.ink, anchor, wide).mask, PARAMS)
-    glare = tuple(flag for flag in steps.prepared.flags if flag.startswith("glare"))
+    whole = fill_holes(components(prepared.ink, anchor, wide)[0], PARAMS)
+    glare = tuple(flag for flag in prepared.flags if flag.startswith("glare"))
     named = {"depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
     return Drag(
         stroke.stroke_id,

@@ -10,8 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import SIZE_PX, Alignment, draw_loop, to_pixels
-from brushloop.calibrate.compare.score import similarity
+from brushloop.calibrate.compare.place import SIZE_PX, Alignment, draw_loop, similarity, to_pixels
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell, inked_rows
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.prior import Prior

@@ -5,6 +5,7 @@ All later steps work on `Prepared`: a binary mask and soft ink at 20 px/mm, with
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -38,39 +39,14 @@ class Prepared:
     """(h, w), True where ink."""
     soft: Soft
     """(h, w) ink from 0 to 1, zero away from the stroke."""
+    ink: Mask
+    """(h, w), True where darker than the threshold: the stroke, specks and neighbours."""
     anchor_px: tuple[float, float] | None
     """The zero-touch point: (x, y), pixel j covers [j, j + 1)."""
-    threshold: float
-    """Reflectance below which a pixel counts as ink."""
     cut: bool
     """Whether the stroke reaches the edge of its photograph or cell; length and area are then lower bounds."""
     flags: tuple[str, ...] = ()
     """Defects of the capture, although a stroke was found."""
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """Threshold between ink and paper in one capture."""
-
-    darkest: float
-    """Highest reflectance within the darkest `GATE_MM2` of the capture."""
-    threshold: float
-    """Threshold by Otsu's method, on 256 levels."""
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Every intermediate result of the preprocessing, for inspection."""
-
-    window: tuple[slice, slice]
-    """Rows and columns of the raster that show the paper cell; nothing outside is used."""
-    reflectance: Soft
-    """(h, w), 1 is paper."""
-    level: Level
-    ink: Mask
-    """(h, w), True where darker than the threshold: the stroke, specks and neighbours."""
-    chosen: Chosen
-    prepared: Prepared
 
 
 def flatten(raster: Gray, params: Params) -> Soft:
@@ -126,45 +102,29 @@ def prepare(
 
     Raises `CaptureRefused` if the raster is blank or nothing is left after cleaning.
     """
-    return preprocess(raster, anchor_px, where, params, cell_px).prepared
-
-
-def preprocess(
-    raster: Gray,
-    anchor_px: tuple[float, float] | None,
-    where: str,
-    params: Params,
-    cell_px: tuple[int, int, int, int] | None = None,
-) -> Steps:
-    """Find the stroke as `prepare` does, and return all intermediate results."""
     window = _cell_window(raster, cell_px, where)
     # Only the cell: neighbours' ink and the table's edge would distort the estimated lighting.
     reflectance = np.ones(raster.shape, np.float32)
     reflectance[window] = flatten(raster[window], params)
-    level = _find_level(reflectance[window], where, params)
-    ink = to_levels(reflectance) <= round(255.0 * level.threshold)
-    chosen = components(ink, anchor_px, params)
-    if not chosen.mask.any():
+    _check_contrast(reflectance[window], where, params)
+    otsu, _ = cv2.threshold(to_levels(reflectance[window]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    ink = to_levels(reflectance) <= round(otsu)
+    stroke, others_mm2 = components(ink, anchor_px, params)
+    if not stroke.any():
         raise CaptureRefused(where, "holds no stroke after specks and neighbours were removed")
-    mask = fill_holes(chosen.mask, params)
-    soft = _soft_ink(reflectance, chosen.mask)
-    flags = _flags(raster[window], mask[window], chosen)
-    prepared = Prepared(mask, soft, anchor_px, level.threshold, touches_edge(mask[window]), flags)
-    return Steps(window, reflectance, level, ink, chosen, prepared)
+    mask = fill_holes(stroke, params)
+    flags = _flags(raster[window], mask[window], others_mm2)
+    return Prepared(mask, _soft_ink(reflectance, stroke), ink, anchor_px, touches_edge(mask[window]), flags)
 
 
-def _find_level(reflectance: Soft, where: str, params: Params) -> Level:
-    """Check the contrast, then find Otsu's threshold. Raises `CaptureRefused` if the contrast is too low."""
+def _check_contrast(reflectance: Soft, where: str, params: Params) -> None:
+    """Raise `CaptureRefused` if the contrast is too low."""
     # The darkest GATE_MM2 is an area rather than a share, so that the picture's size does not matter.
     pixels = reflectance.ravel()
     kth = min(round(GATE_MM2 * PX_PER_MM**2), pixels.size - 1)
-    darkest = float(np.partition(pixels, kth)[kth])
-    if 1.0 - darkest < params.contrast_gate:
-        raise CaptureRefused(
-            where, f"is blank: darkest ink {1.0 - darkest:.2f} below paper, gate {params.contrast_gate}"
-        )
-    otsu, _ = cv2.threshold(to_levels(reflectance), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    return Level(darkest, otsu / 255.0)
+    contrast = 1.0 - float(np.partition(pixels, kth)[kth])
+    if contrast < params.contrast_gate:
+        raise CaptureRefused(where, f"is blank: darkest ink {contrast:.2f} below paper, gate {params.contrast_gate}")
 
 
 def to_levels(reflectance: Soft) -> Gray:
@@ -180,7 +140,7 @@ def _soft_ink(reflectance: Soft, mask: Mask) -> Soft:
     return np.where(near, soft, 0.0).astype(np.float32)
 
 
-def _flags(raster: Gray, mask: Mask, chosen: Chosen) -> tuple[str, ...]:
+def _flags(raster: Gray, mask: Mask, others_mm2: Sequence[float]) -> tuple[str, ...]:
     """Defects of a capture that can still be used."""
     flags: list[str] = []
     saturated = float(np.count_nonzero(raster >= SATURATED)) / raster.size
@@ -188,7 +148,7 @@ def _flags(raster: Gray, mask: Mask, chosen: Chosen) -> tuple[str, ...]:
         flags.append(f"saturated: {100 * saturated:.0f} % of the pixels are white, the light cannot be judged")
     if touches_edge(mask):
         flags.append("cut: the stroke reaches the edge of its photograph or cell")
-    others = [area for area in chosen.others_mm2 if area >= OTHER_MM2]
+    others = [area for area in others_mm2 if area >= OTHER_MM2]
     if others:
         flags.append(f"others: {len(others)} more strokes of {sum(others):.0f} mm2 in the crop")
     shrink = 16
@@ -215,25 +175,14 @@ def touches_edge(mask: Mask) -> bool:
     return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """The stroke among the components, and what was left out."""
-
-    mask: Mask
-    parts: int
-    specks: int
-    others_mm2: tuple[float, ...]
-    """Areas of components that are not specks and belong to other strokes."""
-
-
-def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> Chosen:
-    """Select the stroke: the main component, and parts close to it that are not specks.
+def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params) -> tuple[Mask, list[float]]:
+    """The stroke, (h, w): the main component, and parts close to it that are not specks; and the areas of others, mm2.
 
     The main component is the largest; with an anchor, the largest of those that come within `join_mm` of it, if any.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)
     if count <= 1:
-        return Chosen(np.zeros_like(ink), 0, 0, ())
+        return np.zeros_like(ink), []
     areas = np.asarray(stats[1:, cv2.CC_STAT_AREA], np.int64)
     candidates = np.arange(1, count)
     if anchor_px is not None:
@@ -242,10 +191,9 @@ def components(ink: Mask, anchor_px: tuple[float, float] | None, params: Params)
         candidates = near if near.size else candidates
     main = int(candidates[np.argmax(areas[candidates - 1])])
     others = [k for k in range(1, count) if k != main and areas[k - 1] >= params.speck_share * areas[main - 1]]
-    specks = count - 2 - len(others)
     near = parts_near(labels, main, others, params.join_mm * PX_PER_MM)
-    foreign = tuple(float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in near)
-    return Chosen(np.isin(labels, [main, *near]), 1 + len(near), specks, foreign)
+    others_mm2 = [float(areas[label - 1]) / PX_PER_MM**2 for label in others if label not in near]
+    return np.isin(labels, [main, *near]), others_mm2
 
 
 def parts_near(labels: cv2.typing.MatLike, main: int, others: list[int], reach_px: float) -> list[int]:

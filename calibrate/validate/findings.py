@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-from brushloop.calibrate.compare.place import Key
-from brushloop.calibrate.compare.score import ORDER
+from brushloop.calibrate.compare.place import ORDER, Key
 from brushloop.calibrate.report import Point, brush_and_size, source_point
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
 from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT, PRESSES

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.artefact import FOLDER
-from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Tone
-from brushloop.calibrate.compare.score import TABLE_3
+from brushloop.calibrate.compare.place import KEYS, TABLE_3, Alignment, Image, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.brush import FOLDER as FITS

@@ -13,8 +13,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Pixels, Tone, brush_of, images_of, levels_of
-from brushloop.calibrate.compare.score import similarity
+from brushloop.calibrate.compare.place import (
+    KEYS,
+    Alignment,
+    Field,
+    Pixels,
+    Tone,
+    brush_of,
+    images_of,
+    levels_of,
+    similarity,
+)
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.captures import Pressed, grid_of
 from brushloop.calibrate.fit.heldout import MAX_FOLDS, Refit, RefittedBezier, leave_out, refit_bezier, refits

@@ -12,8 +12,7 @@ from typing import ClassVar, NamedTuple
 
 from rich.table import Table
 
-from brushloop.calibrate.compare.place import Alignment, Key, Tone
-from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_1, TABLE_2, Polarity, Printed
+from brushloop.calibrate.compare.place import ROBOT_WRITING, TABLE_1, TABLE_2, Alignment, Key, Polarity, Printed, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop import AGAIN
 from brushloop.calibrate.scores import MEASURES, Stat

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import FINE, Field, Image, averaged, brush_of, prepare_press
+from brushloop.calibrate.compare.place import FINE, Field, Image, averaged, brush_of
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.presses import Refused
+from brushloop.calibrate.presses import Refused, prepare_press
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.store import key_of

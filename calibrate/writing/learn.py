@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
-from brushloop.calibrate.compare.place import SIZE_PX, Image, prepare_cell
+from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.presses import prepare_cell
 from brushloop.calibrate.report import Written
 from brushloop.calibrate.session import Calibration, open_session
 from brushloop.calibrate.stroke import PX_PER_MM

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from brushloop.calibrate.artefact import made_by
-from brushloop.calibrate.compare.place import Alignment, Image, Tone
-from brushloop.calibrate.compare.score import Polarity
+from brushloop.calibrate.compare.place import Alignment, Image, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import (
     Written,

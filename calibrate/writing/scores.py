@@ -13,10 +13,20 @@ import cv2
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import SIZE_PX, Alignment, Image, Tone, prepare_cell, to_tone
-from brushloop.calibrate.compare.score import ROBOT_WRITING, TABLE_3, Polarity, similarity
+from brushloop.calibrate.compare.place import (
+    ROBOT_WRITING,
+    SIZE_PX,
+    TABLE_3,
+    Alignment,
+    Image,
+    Polarity,
+    Tone,
+    similarity,
+    to_tone,
+)
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
+from brushloop.calibrate.presses import prepare_cell
 from brushloop.calibrate.report import Sealed, load_sealed
 from brushloop.calibrate.session import Calibration, open_session
 from brushloop.calibrate.stats import Summary, others_of, summarise

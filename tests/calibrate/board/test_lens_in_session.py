@@ -19,8 +19,9 @@ from brushloop.calibrate.board.lens import FITTED, Lens, fit_lens, read_lens
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
-from brushloop.calibrate.compare.place import Field, prepare_press
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.tui.captures import Review

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from brushloop.calibrate.compare.place import Alignment
-from brushloop.calibrate.compare.score import BEST_SHIFT_PX, Polarity, best_shift, similarity
+from brushloop.calibrate.compare.place import BEST_SHIFT_PX, Alignment, Polarity, best_shift, similarity
 from brushloop.model.similarity import binary_scores, csim, ssim
 
 NORMAL = Alignment.SIZE_NORMALISED

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.score import TABLE_1
+from brushloop.calibrate.compare.place import TABLE_1
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.validate import tables
 from brushloop.calibrate.validate.report import Report, load_report

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import Alignment, Tone
-from brushloop.calibrate.compare.score import Polarity
+from brushloop.calibrate.compare.place import Alignment, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, load_plan
 from brushloop.calibrate.writing.scores import (
