@@ -19,8 +19,8 @@ import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
 import brushloop.collect.cli_rig
 import brushloop.sessions.cli
-import brushloop.twin.cli
-from brushloop.calibrate.path_or_command import PathOrCommand
+import brushloop.twin
+from brushloop.calibrate.cli import PathOrCommand
 from brushloop.sessions.terminal import plain, say
 
 EXIT_CODES = {
@@ -105,9 +105,9 @@ app.command("doctor")(brushloop.collect.cli.doctor)
 app.add_typer(brushloop.collect.cli_rig.app, name="rig")
 app.add_typer(brushloop.calibrate.cli.app, name="calibrate")
 app.add_typer(brushloop.calibrate.cli.camera, name="camera")
-app.add_typer(brushloop.calibrate.validate.cli.app, name="validate")
+app.add_typer(brushloop.calibrate.validate.cli.app, name="validate", cls=PathOrCommand)
 app.command("fit")(brushloop.calibrate.cli.fit)
-app.command("twin")(brushloop.twin.cli.twin)
+app.command("twin")(brushloop.twin.twin)
 app.command("invert")(brushloop.calibrate.cli.invert)
 loop = typer.Typer(
     cls=PathOrCommand,

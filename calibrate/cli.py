@@ -6,12 +6,12 @@ Heavy imports wait until a command runs.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
@@ -21,6 +21,19 @@ LEFT_OUT = 3
 """Exit code of an export that left strokes out."""
 DRAG_MM_PER_PX = 0.4
 """Scale of the images that drags are fitted to."""
+
+
+class PathOrCommand(TyperGroup):
+    """A group that runs its first command unless its first argument is the name of another one.
+
+    `./diff` is then a path, `diff` the command of that name.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the first command's name before anything that is not a command's name."""
+        if not args or (args[0] not in self.commands and args[0] != "--help"):
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
 
 
 def calibrate(

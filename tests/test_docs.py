@@ -19,7 +19,7 @@ import typer
 
 import brushloop.__main__
 from bench import pictures
-from brushloop.calibrate.path_or_command import PathOrCommand
+from brushloop.calibrate.cli import PathOrCommand
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.drivers.sim.brush.spec import load_brush
 from tests.blocks import DOCUMENTS, ROOT, Block, blocks_of

@@ -1,4 +1,8 @@
-"""Fit of a twin to the presses of a session: shape, intervals, spread, and scores on cells left out."""
+"""Fit of a twin to the presses of a session: shape, intervals, spread, and scores on cells left out; and its file.
+
+`brushloop sim --brush twin.toml` presses with the file, and the command prints it. The camera's noise comes from stills
+of one view: what differs between two of them where nothing was drawn.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +13,27 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import count
+from itertools import count, pairwise
 from typing import ClassVar
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
 from brushloop.calibrate.store import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, Images, Vector, draw, place_at, with_values
 from brushloop.twin.search import (
     COARSE_MM,
     FEWEST_REPEATS,
     FINE_MM,
-    Found,
+    Solution,
     Spread,
     Target,
     choose_individual,
@@ -56,6 +64,13 @@ MARGIN_MM = 0.8
 and other presses differ."""
 LEAST_MISPLACED_MM = 1.6
 """The limit of the quality checks by default: a smaller one is not needed."""
+STILLS = 8
+"""Stills that are compared, each with the next one."""
+TO_SD = 1.4826
+"""Standard deviation of normally distributed values over their median absolute deviation."""
+JPEG_QUALITY = 95
+PAPER_GRAY = 215
+TRIED = np.arange(0.0, 12.1, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,27 +159,27 @@ def fit_twin(
     target = Target(BrushSpec(radius_mm=radius_mm, length_mm=length_mm, seed=0), tuple(cells), grid, means)
     parts = parts_of(target.cells)
     searches = _Searches(pool, store, progress, (1 + len(parts)) * (2 + len(COARSE_MM) + 1))
-    found = searches.coarse(target)
+    solution = searches.coarse(target)
     groups = {cell: np.array([press.ink for press in group]) for cell, group in cells.items()}
     repeats = {cell: ink for cell, ink in groups.items() if len(ink) >= FEWEST_REPEATS}
     spread: Spread | None = None
     if repeats:
-        spread = fit_spread(target.brush(found), place_at(found.point), repeats, grid, pool)
+        spread = fit_spread(target.brush(solution), place_at(solution.point), repeats, grid, pool)
         # hairs that stray make every mark wider and its ends fainter: the shape is fitted to the captures with them
         target = replace(target, base=with_values(target.base, SPREAD, spread.point))
-    found = searches.fine(target, found)
-    variance = np.diagonal(covariance(target, found, pool))
-    spec = target.brush(found)
+    solution = searches.fine(target, solution)
+    variance = np.diagonal(covariance(target, solution, pool))
+    spec = target.brush(solution)
     if spread is not None:
-        spread = fit_spread(spec, place_at(found.point), repeats, grid, pool, spread.point)
+        spread = fit_spread(spec, place_at(solution.point), repeats, grid, pool, spread.point)
     predicted, points = list[Predicted](), list[Vector]()
     for part in parts:
         others = target.only([k for k in range(len(cells)) if k not in part])
-        there = searches.fine(others, searches.coarse(others))
-        points.append(there.point)
-        predicted += _predicted(cells, [target.cells[k] for k in part], there, target)
+        without = searches.fine(others, searches.coarse(others))
+        points.append(without.point)
+        predicted += _predicted(cells, [target.cells[k] for k in part], without, target)
     errors = WIDER * np.sqrt(variance + of_parts(points))
-    estimates = [Estimate.of(*one) for one in zip(SHAPE, found.point, errors, strict=False)]
+    estimates = [Estimate.of(*one) for one in zip(SHAPE, solution.point, errors, strict=False)]
     if spread is not None:
         spec = with_values(spec, SPREAD, spread.point)
         estimates += [Estimate.of(*one) for one in zip(SPREAD, spread.point, spread.error, strict=True)]
@@ -183,30 +198,32 @@ class _Searches:
     """Passes of all searches."""
     _done: Iterator[int] = field(default_factory=lambda: count(1))
 
-    def coarse(self, target: Target) -> Found:
-        found = self._pass(choose_individual, target, start())
+    def coarse(self, target: Target) -> Solution:
+        solution = self._pass(choose_individual, target, start())
         for blur_mm in COARSE_MM:
-            found = self._pass(search, target, found, blur_mm)
-        return found
+            solution = self._pass(search, target, solution, blur_mm)
+        return solution
 
-    def fine(self, target: Target, found: Found) -> Found:
-        return self._pass(search, target, self._pass(choose_individual, target, found), FINE_MM)
+    def fine(self, target: Target, solution: Solution) -> Solution:
+        return self._pass(search, target, self._pass(choose_individual, target, solution), FINE_MM)
 
-    def _pass(self, work: Callable[..., Found], target: Target, found: Found, *blur_mm: float) -> Found:
+    def _pass(self, work: Callable[..., Solution], target: Target, solution: Solution, *blur_mm: float) -> Solution:
         place = target.grid.x_mm, target.grid.y_mm, target.mean
-        key = key_of("twin", made_by(), blur_mm, target.base, target.cells, *place, found.seed, found.point)
+        key = key_of("twin", made_by(), blur_mm, target.base, target.cells, *place, solution.seed, solution.point)
         if self.store is not None and (kept := self.store.get(key)) is not None:
-            result = Found(kept["point"], int(kept["seed"]))
+            result = Solution(kept["point"], int(kept["seed"]))
         else:
-            result = work(target, found, self.pool, *blur_mm)
+            result = work(target, solution, self.pool, *blur_mm)
             if self.store is not None:
                 self.store.put(key, {"point": result.point, "seed": np.array(result.seed)})
         self.progress("twin: passes of the search", next(self._done), self.total)
         return result
 
 
-def _predicted(cells: dict[Cell, list[Pressed]], held: list[Cell], there: Found, target: Target) -> Iterator[Predicted]:
-    """Yield the cells `held` as predicted by the twin found without them, and by a Bezier refitted to the others."""
+def _predicted(
+    cells: dict[Cell, list[Pressed]], held: list[Cell], there: Solution, target: Target
+) -> Iterator[Predicted]:
+    """Yield the cells `held` as predicted by the twin solution without them, and by a Bezier refitted to the others."""
     drawn = draw(target.brush(there), place_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
     others = [press for cell, group in cells.items() if cell not in held for press in group]
     bezier = None
@@ -245,3 +262,89 @@ def _head_mm(image: Images, grid: Grid) -> float | None:
         return None
     left, right = grid.x_mm[columns[0]] - 0.5 * grid.px_mm, grid.x_mm[columns[-1]] + 0.5 * grid.px_mm
     return float(-left if abs(left) < abs(right) else right)
+
+
+def twin_toml(twin: Twin, session_id: str, noise_gray: float | None) -> str:
+    """The text of `twin.toml`: every constant of the brush, and what is known of it as a comment.
+
+    `noise_gray` is that of the camera, None where it was not measured.
+    """
+    return "\n".join(_lines(twin, session_id, noise_gray)) + "\n"
+
+
+def _lines(twin: Twin, session_id: str, noise_gray: float | None) -> Iterator[str]:
+    plain = "".join(char if char.isprintable() and char not in '"\\' else "?" for char in session_id)
+    yield f"# Made by `brushloop twin` ({made_by()}); press with it: brushloop sim --brush FILE."
+    yield "# Everything that it presses is simulated. Intervals hold about 95 %: docs/loopback-brush.md."
+    yield f'name = "simulated bristle bundle (twin of {plain[:60]}, simulated)"'
+    if noise_gray is None:
+        yield "# The camera's noise was not measured: no two stills show the same view."
+    else:
+        yield ""
+        yield "[camera]"
+        yield f"noise = {noise_gray:.2f}    # gray levels, from pairs of stills"
+    if twin.head is not None:
+        yield ""
+        yield "[quality]"
+        yield f"head_mm = {twin.head.head_mm:g}    # where its marks begin behind the point of touch, in the middle"
+        yield f"misplaced_mm = {twin.head.misplaced_mm:g}    # the farthest from there, and a margin"
+    yield ""
+    yield "[brush]"
+    yield f"radius_mm = {twin.spec.radius_mm:g}    # as recorded with the session"
+    yield f"length_mm = {twin.spec.length_mm:g}    # as recorded with the session"
+    yield f"seed = {twin.spec.seed}    # of the individuals tried, the one nearest to the captures"
+    for one in twin.estimates:
+        known = f"{one.low:.4g} to {one.high:.4g}" if one.determined else "not determined by these presses"
+        unit = f"{one.constant.unit}; " if one.constant.unit else ""
+        yield f"{one.constant.name} = {one.value:.6g}    # {unit}{known}; default {one.constant.default:.4g}"
+    for row in twin.held_out:
+        scores = f"CSIM {row.csim:.2f} %, SSIM {row.ssim:.2f} %, n = {row.n}"
+        yield f"# a third of the cells left out in turn: {row.model}: {scores}"
+    if twin.spread is None:
+        yield "# No cell has three captures: how presses differ is left as in the default brush."
+    else:
+        yield (
+            f"# two presses of a cell: CSIM {twin.spread.captured_percent:.2f} % captured, "
+            f"{twin.spread.twin_percent:.2f} % from the twin"
+        )
+
+
+def noise_gray(recording: Recording) -> float | None:
+    """The noise of a session's camera in gray levels, from its first stills; None for imports, or a single still.
+
+    An import may hold one picture from each of several views.
+    """
+    if recording.header.source.imported:
+        return None
+    stills: list[NDArray[np.uint8]] = []
+    for capture in recording.captures():
+        with contextlib.suppress(SessionDamaged):
+            stills.append(capture.image())
+        if len(stills) == STILLS:
+            break
+    return noise_of(stills)
+
+
+def noise_of(stills: Sequence[NDArray[np.uint8]]) -> float | None:
+    """Standard deviation in gray levels that the simulated camera needs to be as noisy; None if no two show one view.
+
+    Each pixel's difference between two stills (h, w) has the noise of both; places where ink was added are left out.
+    The simulated camera compresses its pictures, which takes away part of the noise: the value is the one that leaves
+    as much after compression.
+    """
+    apart = [_difference(a, b) for a, b in pairwise(stills) if a.shape == b.shape]
+    return float(np.interp(np.median(apart), [_left_after_jpeg(sd) for sd in TRIED], TRIED)) if apart else None
+
+
+def _difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    moved = a.astype(np.float32) - b.astype(np.float32)
+    # a median of whole gray levels is coarse: the mean of what lies within a few levels is not
+    near = moved[np.abs(moved) <= max(4.0 * TO_SD * float(np.median(np.abs(moved))), 4.0)]
+    return float(near.std()) / np.sqrt(2.0)
+
+
+def _left_after_jpeg(sd: float) -> float:
+    rng = np.random.default_rng(0)
+    flat = np.clip(PAPER_GRAY + rng.normal(0.0, sd, (128, 128)), 0, 255).astype(np.uint8)
+    coded = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    return float(np.std(np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.float64)))

@@ -95,9 +95,9 @@ class Target:
     mean: Images
     """(cells, len(y_mm), len(x_mm)) mean ink of each cell's captures."""
 
-    def brush(self, found: Found) -> BrushSpec:
+    def brush(self, solution: Solution) -> BrushSpec:
         """The brush of a search."""
-        return brush_at(found.point, replace(self.base, seed=found.seed))
+        return brush_at(solution.point, replace(self.base, seed=solution.seed))
 
     def only(self, kept: Sequence[int]) -> Target:
         """The same with some of the cells."""
@@ -105,22 +105,22 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """The state of a search: the point, and the seed of the individual."""
+class Solution:
+    """Where a search stands: the point, and the seed of the individual."""
 
     point: Vector
     seed: int
 
 
-def start() -> Found:
+def start() -> Solution:
     """The default brush, but with a trail faint enough for the search to see whether there is more of it or less."""
     scales = [one.scales(STARTS.get(one.name, one.default)) for one in SHAPE]
-    return Found(np.array([*scales, *HERE]), INDIVIDUALS[0])
+    return Solution(np.array([*scales, *HERE]), INDIVIDUALS[0])
 
 
 def off(target: Target, seed: int, blur_mm: float, point: Vector) -> Vector:
     """Residuals: differences of blurred pixels between brush and captures over `IMAGE_SD`, then those of the prior."""
-    drawn = draw(still(target.brush(Found(point, seed))), place_at(point), target.cells, target.grid)[:, 0]
+    drawn = draw(still(target.brush(Solution(point, seed))), place_at(point), target.cells, target.grid)[:, 0]
     apart = blurred(drawn - target.mean, blur_mm, target.grid)
     return np.concatenate([apart.ravel() / IMAGE_SD, point / PRIOR_SD])
 
@@ -132,22 +132,22 @@ def blurred(images: Images, blur_mm: float, grid: Grid) -> NDArray[np.float64]:
     return np.asarray(soft, np.float64)
 
 
-def search(target: Target, found: Found, workers: Executor, blur_mm: float) -> Found:
+def search(target: Target, solution: Solution, workers: Executor, blur_mm: float) -> Solution:
     """One pass, starting from `found`."""
     from scipy.optimize import least_squares  # slow to import
 
     low, high = search_bounds()
-    began = np.clip(found.point, low + NEAR_BOUND, high - NEAR_BOUND)
+    began = np.clip(solution.point, low + NEAR_BOUND, high - NEAR_BOUND)
     reached = [began]
 
     def evaluate(moved: Vector) -> Vector:
-        return off(target, found.seed, blur_mm, began + moved)
+        return off(target, solution.seed, blur_mm, began + moved)
 
     def slopes(moved: Vector) -> NDArray[np.float64]:
         reached.append(began + moved)
         if len(reached) > STEPS + 1:
             raise _EnoughSteps
-        at_point = partial(off, target, found.seed, blur_mm)
+        at_point = partial(off, target, solution.seed, blur_mm)
         return derivatives(at_point, reached[-1], high, workers)
 
     # the search is for the way from where it began, because the minimiser's first step is as long as its start is far
@@ -164,7 +164,7 @@ def search(target: Target, found: Found, workers: Executor, blur_mm: float) -> F
             gtol=None,
         )
         reached.append(began + np.asarray(best.x, np.float64))
-    return Found(reached[-1], found.seed)
+    return Solution(reached[-1], solution.seed)
 
 
 class _EnoughSteps(Exception):
@@ -180,24 +180,24 @@ def derivatives(
     return np.column_stack([(one - here) / by for one, by in zip(there, steps, strict=True)])
 
 
-def choose_individual(target: Target, found: Found, workers: Executor) -> Found:
-    """The seed whose hairs, with the constants found, come nearest to the captures."""
-    residuals = partial(off, target, blur_mm=FINE_MM, point=found.point)
+def choose_individual(target: Target, solution: Solution, workers: Executor) -> Solution:
+    """The seed whose hairs, with these constants, come nearest to the captures."""
+    residuals = partial(off, target, blur_mm=FINE_MM, point=solution.point)
     squares = [float(one @ one) for one in workers.map(residuals, INDIVIDUALS, chunksize=4)]
-    return Found(found.point, INDIVIDUALS[int(np.argmin(squares))])
+    return Solution(solution.point, INDIVIDUALS[int(np.argmin(squares))])
 
 
-def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.float64]:
+def covariance(target: Target, solution: Solution, workers: Executor) -> NDArray[np.float64]:
     """Covariance (constants, constants) of the point in scales, clustered by cell.
 
     The sandwich of a least-squares fit: what each cell asks to be changed, the model's own errors included, spreads
     over the cells. The prior counts as one more observation of each constant.
     """
     _, high = search_bounds()
-    evaluate = partial(off, target, found.seed, FINE_MM)
-    jacobian = derivatives(evaluate, found.point, high, workers)
-    residual = evaluate(found.point)
-    count, constants = len(target.cells), len(found.point)
+    evaluate = partial(off, target, solution.seed, FINE_MM)
+    jacobian = derivatives(evaluate, solution.point, high, workers)
+    residual = evaluate(solution.point)
+    count, constants = len(target.cells), len(solution.point)
     of_cells = jacobian[:-constants].reshape(count, -1, constants)
     pulls = np.einsum("cij,ci->cj", of_cells, residual[:-constants].reshape(count, -1))
     pulls -= pulls.mean(axis=0)
@@ -207,7 +207,7 @@ def covariance(target: Target, found: Found, workers: Executor) -> NDArray[np.fl
 
 
 def of_parts(points: Sequence[Vector]) -> Vector | float:
-    """Variance (constants,) of the point, from the points (parts, constants) found with one part of the cells left out.
+    """Variance (constants,) of the point, from the points (parts, constants) where one part of the cells is left out.
 
     The jackknife of groups. It includes what `covariance` cannot know: that another individual was chosen, or that the
     search ended elsewhere.

@@ -8,13 +8,10 @@ from typing import Annotated
 import typer
 
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.path_or_command import PathOrCommand
 from brushloop.sessions.terminal import say
 
-app = typer.Typer(
-    cls=PathOrCommand,
-    help="Compare every stroke model with every captured stroke (`brushloop validate SESSION...`).",
-)
+app = typer.Typer(help="Compare every stroke model with every captured stroke (`brushloop validate SESSION...`).")
+"""Mounted as a `PathOrCommand`."""
 
 
 @app.command("sessions")

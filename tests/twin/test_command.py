@@ -20,9 +20,8 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.heldout import HeldOut
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead, load_brush
 from brushloop.twin.brush import SHAPE
-from brushloop.twin.file import noise_of, twin_toml
-from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, workers
-from brushloop.twin.search import Found
+from brushloop.twin.run import PARTS, Estimate, Twin, TwinStopped, noise_of, twin_toml, workers
+from brushloop.twin.search import Solution
 from tests.photographed import imported_presses
 from tests.twin.test_search import Serial
 from tests.waiting import wait_until
@@ -56,7 +55,7 @@ def test_a_session_gets_a_twin_and_a_run_that_was_broken_off_goes_on(
 ) -> None:
     out, searched = tmp_path / "twin.toml", list[float]()
 
-    def counted(_target: object, found: Found, _workers: Executor, blur_mm: float) -> Found:
+    def counted(_target: object, found: Solution, _workers: Executor, blur_mm: float) -> Solution:
         if len(searched) == 2 and not cut:
             cut.append(True)
             raise PowerCut

@@ -21,7 +21,7 @@ from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
 from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, mechanics, with_values
 from brushloop.twin.run import LEAST_MISPLACED_MM, Estimate, fit_twin, sound_head
 from brushloop.twin.search import (
-    Found,
+    Solution,
     Target,
     agreement,
     choose_individual,
@@ -146,7 +146,7 @@ def test_presses_that_differ_more_give_a_wider_spread_of_that_kind(name: str, va
 def test_the_shape_is_found_with_hairs_that_stray_as_those_of_the_captures(monkeypatch: pytest.MonkeyPatch) -> None:
     strays: list[tuple[float, float]] = []
 
-    def counted(target: Target, found: Found, _workers: Executor, blur_mm: float) -> Found:
+    def counted(target: Target, found: Solution, _workers: Executor, blur_mm: float) -> Solution:
         strays.append((blur_mm, target.base.strand_mm))
         return found  # how a search finds its way is tested above
 
