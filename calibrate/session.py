@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ValidationError
+from pydantic import AliasPath, BaseModel, Field, ValidationError
 
 from brushloop.calibrate.artefact import Artefact, current, load_artefact
 from brushloop.calibrate.board.lens import Lens
@@ -122,30 +122,14 @@ def lens_in_use(folder: Path) -> Lens | None:
     return lens if lens is not None else rig_of(folder).lens
 
 
-class _Paper(BaseModel):
-    size_mm: tuple[float, float] | None = None
-
-
-class _Camera(BaseModel):
-    optics: Lens | None = None
-
-
 class RigView(BaseModel):
-    """What a session recorded of the board, the sheet that lies on it, and the lens; None if nothing."""
+    """What a session recorded of the rig; None if nothing."""
 
     board: BoardSpec | None = None
-    paper: _Paper | None = None
-    camera: _Camera | None = None
-
-    @property
-    def sheet_mm(self) -> tuple[float, float] | None:
-        """Width and height of the sheet."""
-        return None if self.paper is None else self.paper.size_mm
-
-    @property
-    def lens(self) -> Lens | None:
-        """The lens that the session was collected with."""
-        return None if self.camera is None else self.camera.optics
+    sheet_mm: tuple[float, float] | None = Field(default=None, validation_alias=AliasPath("paper", "size_mm"))
+    """Width and height of the sheet that lies on the board."""
+    lens: Lens | None = Field(default=None, validation_alias=AliasPath("camera", "optics"))
+    """The lens that the session was collected with."""
 
 
 def rig_of(session: Recording | Path) -> RigView:

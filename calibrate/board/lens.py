@@ -98,22 +98,13 @@ class Lens(Frozen):
     def distorted(self, pixels: Floats) -> Floats:
         """(n, 2) pixels of the undistorted photograph -> where they lie in the photograph as it was taken."""
         focal, centre = np.array(self.matrix[:2]), np.array(self.matrix[2:])
-        return distort((pixels - centre) / focal, self.coefficients) * focal + centre
+        rays = np.column_stack([(pixels - centre) / focal, np.ones(len(pixels))])
+        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.camera, self.coefficients)
+        return np.asarray(bent, np.float64).reshape(-1, 2)
 
     def undistort(self, image: Gray) -> Gray:
         """The photograph as a lens without distortion would have taken it, same size and camera matrix."""
         return cast("Gray", cv2.undistort(image, self.camera, self.coefficients))
-
-
-def distort(rays: Floats, distortion: Floats) -> Floats:
-    """Distort (n, 2) points at distance 1 by Brown's model as OpenCV defines it; `distortion` is k1, k2, p1, p2, k3."""
-    k1, k2, p1, p2, k3 = distortion
-    x, y = rays[:, 0], rays[:, 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    across = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    along = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return np.column_stack([across, along])
 
 
 def rms(residuals: Floats) -> float:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from brushloop.calibrate.artefact import Frozen
@@ -46,14 +46,10 @@ Matrix: TypeAlias = tuple[float, float, float, float, float, float, float, float
 
 def local_scale(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
     """mm per pixel at a pixel (2,): the square root of the area that the pixel covers on the paper."""
-    return float(np.sqrt(_area(to_paper, pixel))) / (2.0 * STEP_PX)
-
-
-def _area(to_paper: Callable[[Floats], Floats], pixel: Floats) -> float:
     around = pixel + STEP_PX * np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     left, right, up, down = to_paper(around)
     across, along = right - left, down - up
-    return abs(float(across[0] * along[1] - across[1] * along[0]))
+    return math.sqrt(abs(float(across[0] * along[1] - across[1] * along[0]))) / (2.0 * STEP_PX)
 
 
 class Plane(Frozen):
@@ -166,20 +162,16 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     from scipy.optimize import least_squares  # slow to import
 
     model = _Model.of(lens, paper_mm, radial_terms)
-    start = model.start(pixels, paper_mm, where)
-
-    def residuals(theta: Floats, kept: NDArray[np.bool_]) -> Floats:
-        return (model.project(theta, paper_mm[kept]) - pixels[kept]).ravel()
-
-    everything = np.ones(len(pixels), np.bool_)
-    soft = least_squares(residuals, start, args=(everything,), loss="cauchy", f_scale=SOFT_PX, x_scale="jac")
-    away = np.linalg.norm(residuals(soft.x, everything).reshape(-1, 2), axis=1)
+    start, corners = model.start(pixels, paper_mm, where), (pixels, paper_mm)
+    soft = least_squares(model.residuals, start, args=corners, loss="cauchy", f_scale=SOFT_PX, x_scale="jac")
+    away = np.linalg.norm(model.residuals(soft.x, *corners).reshape(-1, 2), axis=1)
     kept = away <= max(LEAST_OUTLIER_PX, OUTLIER_SIGMAS * float(np.median(away)))
-    dropped = np.flatnonzero(~kept)
-    if len(dropped) > MOST_OUTLIERS * len(pixels):
-        raise CalibrationError(where, f"{len(dropped)} of {len(pixels)} board corners do not lie on one plane")
-    fitted = least_squares(residuals, soft.x, args=(kept,), x_scale="jac", method="lm")
-    left = residuals(fitted.x, kept)
+    dropped = int((~kept).sum())
+    if dropped > MOST_OUTLIERS * len(pixels):
+        raise CalibrationError(where, f"{dropped} of {len(pixels)} board corners do not lie on one plane")
+    corners = pixels[kept], paper_mm[kept]
+    fitted = least_squares(model.residuals, soft.x, args=corners, x_scale="jac", method="lm")
+    left = model.residuals(fitted.x, *corners)
     rms_px = float(np.sqrt(2.0 * np.mean(left**2)))
     if rms_px > WORST_RMS_PX:
         raise CalibrationError(where, f"board residual {rms_px:.2f} px exceeds {WORST_RMS_PX} px: is it this board?")
@@ -193,8 +185,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
     reach = student_95(free) * spread
     refined, image_to_paper = model.parts(fitted.x)
     undistorted = lens.undistorted(pixels[kept])
-    flat = apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted
-    flat_rms_px = rms(flat)
+    flat_rms_px = rms(apply(homography(paper_mm[kept], undistorted, where), paper_mm[kept]) - undistorted)
     return Plane(
         image_to_paper=cast("Matrix", tuple(image_to_paper.ravel().tolist())),
         mm_per_px=float(np.exp(scale)),
@@ -202,7 +193,7 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
         mm_per_px_high=float(np.exp(scale + reach)),
         rms_px=rms_px,
         corners=int(kept.sum()),
-        corners_dropped=int((~kept).sum()),
+        corners_dropped=dropped,
         lens=refined,
         middle_px=(float(middle[0]), float(middle[1])),
         distortion_px=float(np.sqrt(max(flat_rms_px**2 - rms_px**2, 0.0))),
@@ -211,16 +202,12 @@ def fit_plane(pixels: Floats, paper_mm: Floats, lens: Lens, where: str, radial_t
 
 def distorted_share(pixels: Floats, paper_mm: Floats, lens: Lens, where: str) -> float:
     """Share of a flat board's squared residuals with this lens that refitting k1 would explain; outliers included."""
-
     from scipy.optimize import least_squares
 
     def cost(radial_terms: int) -> float:
         model = _Model.of(lens, paper_mm, radial_terms)
-
-        def residuals(theta: Floats) -> Floats:
-            return (model.project(theta, paper_mm) - pixels).ravel()
-
-        return float(least_squares(residuals, model.start(pixels, paper_mm, where), x_scale="jac").cost)
+        start = model.start(pixels, paper_mm, where)
+        return float(least_squares(model.residuals, start, args=(pixels, paper_mm), x_scale="jac").cost)
 
     flat = cost(0)
     return 1.0 - cost(1) / flat if flat > 0.0 else 0.0
@@ -244,64 +231,47 @@ def _spread(pull: Floats, left: Floats, paper_mm: Floats, variance: float) -> fl
     return float(np.sqrt(variance * max(correlated, float((pull**2).sum()))))
 
 
-def _steps(theta: Floats) -> list[Floats]:
-    return list(np.diag(1e-5 * np.maximum(np.abs(theta), 1e-2)))
-
-
 @dataclass(frozen=True, slots=True)
 class _Model:
     """Plane to photograph with parameters of similar size: paper in board lengths, pixels in focal lengths."""
 
     lens: Lens
-    middle_mm: Floats
-    length_mm: float
+    from_unit: Floats
+    """(3, 3): from board lengths, counted from the middle of the corners, to mm."""
     radial_terms: int
 
     @classmethod
     def of(cls, lens: Lens, paper_mm: Floats, radial_terms: int) -> _Model:
         """Make a model scaled to the board's corners."""
-        return cls(lens, paper_mm.mean(axis=0), float(np.ptp(paper_mm, axis=0).max()), radial_terms)
+        (x, y), length = paper_mm.mean(axis=0), np.ptp(paper_mm, axis=0).max()
+        return cls(lens, np.array([[length, 0.0, x], [0.0, length, y], [0.0, 0.0, 1.0]]), radial_terms)
 
     def start(self, pixels: Floats, paper_mm: Floats, where: str) -> Floats:
-        undistorted = self.lens.undistorted(pixels)
-        paper_to_rays = self._rays() @ homography(paper_mm, undistorted, where) @ self._from_unit()
-        return np.concatenate(
-            [(paper_to_rays / paper_to_rays[2, 2]).ravel()[:8], self.lens.distortion[: self.radial_terms]]
-        )
+        paper_to_image = homography(paper_mm, self.lens.undistorted(pixels), where)
+        unit_to_rays = np.linalg.inv(self.lens.camera) @ paper_to_image @ self.from_unit
+        return np.append((unit_to_rays / unit_to_rays[2, 2]).ravel()[:8], self.lens.distortion[: self.radial_terms])
 
-    def project(self, theta: Floats, paper_mm: Floats) -> Floats:
-        lens, paper_to_rays = self._lens(theta), self._matrix(theta)
-        unit = (paper_mm - self.middle_mm) / self.length_mm
-        return lens.distorted(apply(np.linalg.inv(self._rays()) @ paper_to_rays, unit))
+    def parts(self, theta: Floats) -> tuple[Lens, Floats]:
+        """The lens, and the homography from undistorted pixels to mm."""
+        distortion = (*theta[8:].tolist(), *self.lens.distortion[self.radial_terms :])
+        unit_to_image = self.lens.camera @ np.append(theta[:8], 1.0).reshape(3, 3)
+        image_to_paper = self.from_unit @ np.linalg.inv(unit_to_image)
+        lens = self.lens.model_copy(update={"distortion": distortion})
+        return lens, np.asarray(image_to_paper / image_to_paper[2, 2], np.float64)
+
+    def residuals(self, theta: Floats, pixels: Floats, paper_mm: Floats) -> Floats:
+        """(2 n,) px by which the (n, 2) corners of the plane miss those of the photograph as taken."""
+        lens, image_to_paper = self.parts(theta)
+        straight = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), paper_mm)
+        return (lens.distorted(straight) - pixels).ravel()
 
     def log_scale(self, theta: Floats, pixel: Floats) -> float:
         """Logarithm of mm per px of the photograph as taken, at a pixel."""
         lens, image_to_paper = self.parts(theta)
-        area = _area(lambda at: apply(image_to_paper, lens.undistorted(at)), pixel)
-        return 0.5 * float(np.log(area / (2.0 * STEP_PX) ** 2))
+        return math.log(local_scale(lambda at: apply(image_to_paper, lens.undistorted(at)), pixel))
 
     def slope(self, theta: Floats, pixel: Floats) -> Floats:
         """Derivative of `log_scale` with respect to each parameter, by central differences."""
-        steps = _steps(theta)
-        change = [self.log_scale(theta + d, pixel) - self.log_scale(theta - d, pixel) for d in steps]
-        return np.array(change) / (2.0 * np.diag(np.array(steps)))
-
-    def parts(self, theta: Floats) -> tuple[Lens, Floats]:
-        """The lens, and the homography from undistorted pixels to mm."""
-        paper_to_image = np.linalg.inv(self._rays()) @ self._matrix(theta) @ np.linalg.inv(self._from_unit())
-        image_to_paper = np.linalg.inv(paper_to_image)
-        return self._lens(theta), np.asarray(image_to_paper / image_to_paper[2, 2], np.float64)
-
-    def _lens(self, theta: Floats) -> Lens:
-        distortion = (*theta[8:].tolist(), *self.lens.distortion[self.radial_terms :])
-        return self.lens.model_copy(update={"distortion": distortion})
-
-    def _matrix(self, theta: Floats) -> Floats:
-        return np.append(theta[:8], 1.0).reshape(3, 3)
-
-    def _rays(self) -> Floats:
-        return np.asarray(np.linalg.inv(self.lens.camera), np.float64)
-
-    def _from_unit(self) -> Floats:
-        s, (x, y) = self.length_mm, self.middle_mm
-        return np.array([[s, 0.0, x], [0.0, s, y], [0.0, 0.0, 1.0]])
+        steps = np.diag(1e-5 * np.maximum(np.abs(theta), 1e-2))
+        change = [self.log_scale(theta + step, pixel) - self.log_scale(theta - step, pixel) for step in steps]
+        return np.array(change) / (2.0 * np.diag(steps))
