@@ -34,17 +34,23 @@ from typing import ClassVar
 
 
 class DeviceError(Exception):
-    """A device failed: `condition` is the physical state it leaves, `remedy` what the operator must do."""
+    """A device failed: `condition` is the physical state it leaves, `remedy` what the operator must do.
+
+    A class whose errors all leave the same state, or need the same remedy, says so once.
+    """
 
     exit_code: ClassVar[int] = 4
+    condition: str = ""
+    remedy: str = ""
 
     def __init__(self, device: str, op: str, what: str, *, condition: str = "", remedy: str = "") -> None:
         self.device = device
         self.op = op
         self.what = what
-        self.condition = condition
-        self.remedy = remedy
-        super().__init__(" ".join(part for part in (f"{device}: {op}: {what}.", condition, remedy) if part))
+        self.condition = condition or self.condition
+        self.remedy = remedy or self.remedy
+        parts = (f"{device}: {op}: {what}.", self.condition, self.remedy)
+        super().__init__(" ".join(part for part in parts if part))
 
 
 class NotConnected(DeviceError):
@@ -73,10 +79,11 @@ class Stale(DeviceTimeout):
 class Stuck(DeviceError):
     """A sensor sends the same values again and again: it no longer measures."""
 
+    remedy = "Switch the sensor's board off and on, and check its wiring."
+
     def __init__(self, device: str, alike_ms: float, samples: int) -> None:
-        self.alike_ms = alike_ms
         what = f"the sensor is stuck: {samples} samples in {alike_ms:.0f} ms were exactly alike, without any noise"
-        super().__init__(device, "latest", what, remedy="Switch the sensor's board off and on, and check its wiring.")
+        super().__init__(device, "latest", what)
 
 
 class ProtocolViolation(DeviceError, ValueError):
@@ -85,6 +92,8 @@ class ProtocolViolation(DeviceError, ValueError):
 
 class WrongGeneration(DeviceError):
     """The cabinet answers, but runs the older AUBOPE software."""
+
+    remedy = "It needs the ARCS software; ask the maker for the upgrade."
 
 
 class RpcError(DeviceError):
@@ -99,21 +108,15 @@ class RpcError(DeviceError):
 class LimitExceeded(DeviceError, ValueError):
     """A target lies outside the configured limits; nothing has moved."""
 
+    condition = "Nothing has moved."
+
     def __init__(
         self, device: str, field: str, value: float, low: float, high: float, unit: str, *, remedy: str = ""
     ) -> None:
         self.field = field
         self.value = value
-        self.low = low
-        self.high = high
-        self.unit = unit
-        super().__init__(
-            device,
-            "check",
-            f"{field} = {value:.3f} {unit} is outside [{low:.3f}, {high:.3f}] {unit}",
-            condition="Nothing has moved.",
-            remedy=remedy,
-        )
+        what = f"{field} = {value:.3f} {unit} is outside [{low:.3f}, {high:.3f}] {unit}"
+        super().__init__(device, "check", what, remedy=remedy)
 
 
 class MotionError(DeviceError):
@@ -123,13 +126,17 @@ class MotionError(DeviceError):
 class MotionRefused(MotionError):
     """The controller refused the command; `code` is its return code."""
 
+    condition = "The arm has not moved."
+
     def __init__(self, device: str, op: str, code: int, name: str, remedy: str) -> None:
         self.code = code
-        super().__init__(device, op, f"refused with {code} ({name})", condition="The arm has not moved.", remedy=remedy)
+        super().__init__(device, op, f"refused with {code} ({name})", remedy=remedy)
 
 
 class MotionFailed(MotionError):
     """The command was accepted but the arm did not arrive within tolerance and time."""
+
+    condition = "A stop was sent to the arm."
 
 
 class RobotNotSafe(MotionError):
@@ -143,61 +150,42 @@ class RobotNotSafe(MotionError):
 class NotPowered(MotionError):
     """The arm has no power, or its brakes are on, although it was enabled."""
 
+    condition = "It has not moved."
+    remedy = "Find out who switched it off, and why. Enabling the arm again powers it and releases its brakes."
+
     def __init__(self, device: str, op: str) -> None:
-        super().__init__(
-            device,
-            op,
-            "robot mode is not Running: the arm was switched off",
-            condition="It has not moved.",
-            remedy="Find out who switched it off, and why. Enabling the arm again powers it and releases its brakes.",
-        )
+        super().__init__(device, op, "robot mode is not Running: the arm was switched off")
 
 
 class ArmMoved(MotionError):
     """The arm is not where it was left but `off_mm` and `off_deg` away; `moving` is True if it still moves."""
 
+    condition = "Another client or a person moved it; nothing was sent to it."
+    remedy = "Nothing may stand in the way of the brush: the first motion is back along the tool axis."
+
     def __init__(self, device: str, op: str, off_mm: float, off_deg: float, *, moving: bool = False) -> None:
         self.off_mm = off_mm
         self.off_deg = off_deg
         self.moving = moving
-        super().__init__(
-            device,
-            op,
-            "the arm is moving, and not from here"
-            if moving
-            else f"the arm is {off_mm:.1f} mm and {off_deg:.1f} deg from where it was left",
-            condition="Another client or a person moved it; nothing was sent to it.",
-            remedy="Wait until it rests, and close the other client."
-            if moving
-            else "Nothing may stand in the way of the brush: the first motion is back along the tool axis.",
-        )
+        what = f"the arm is {off_mm:.1f} mm and {off_deg:.1f} deg from where it was left"
+        if moving:
+            what = "the arm is moving, and not from here"
+        remedy = "Wait until it rests, and close the other client." if moving else ""
+        super().__init__(device, op, what, remedy=remedy)
 
 
 class PathDisturbed(MotionError):
     """The controller held lines that are not ours, or the tip left the path of ours; the arm was stopped."""
 
-    def __init__(self, device: str, op: str, what: str) -> None:
-        super().__init__(
-            device,
-            op,
-            what,
-            condition="Another client of the controller, or a person at the pendant, interfered; a stop was sent.",
-            remedy="Close the other client: a script, another program, a second brushloop.",
-        )
+    condition = "Another client of the controller, or a person at the pendant, interfered; a stop was sent."
+    remedy = "Close the other client: a script, another program, a second brushloop."
 
 
 class SettingsChanged(MotionError):
-    """Settings of the controller have changed; `changes` gives each as found and as it was set."""
+    """Settings of the controller have changed; the message gives each as found and as it was set."""
 
-    def __init__(self, device: str, op: str, changes: tuple[str, ...]) -> None:
-        self.changes = changes
-        super().__init__(
-            device,
-            op,
-            "; ".join(changes),
-            condition="Nothing was sent to the arm; the tip may be elsewhere than reported.",
-            remedy="Find out who changed it, the pendant or another client. Enabling the arm again restores it.",
-        )
+    condition = "Nothing was sent to the arm; the tip may be elsewhere than reported."
+    remedy = "Find out who changed it, the pendant or another client. Enabling the arm again restores it."
 
 
 TICK_S, TICKS = 0.1, 100

@@ -51,8 +51,8 @@ FIRST = (
 DEVICES = (
     "tests/contract",
     "tests/drivers/arcs",
-    "tests/drivers/force",
-    "tests/drivers/ink",
+    "tests/drivers/test_force.py",
+    "tests/drivers/test_ink_",
     "tests/drivers/sim/faults",
 )
 """Tests that mostly wait for a device."""

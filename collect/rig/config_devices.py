@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from brushloop.calibrate.board.lens import Lens
 from brushloop.collect.rig.config_file import Config, Finite, Positive, Range
 from brushloop.drivers.camera import Locked
-from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
 MOST_STALE_MS = 100.0

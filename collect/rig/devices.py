@@ -19,9 +19,6 @@ from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
 from brushloop.drivers.host import Claimed, Clock, claimed
 from brushloop.drivers.limits import Limits
 
-FORCE_CONNECT_S = 10.0
-"""Time to open the bus, even through a gateway, and get a first round."""
-
 
 @dataclass(frozen=True, slots=True)
 class Rig:
@@ -87,7 +84,6 @@ def make_force(config: ForceConfig, clock: Clock) -> SriM8123:
         host=config.host,
         port=config.port,
         stale_after_ms=config.stale_ms,
-        connect_timeout_s=FORCE_CONNECT_S,
     )
     return SriM8123(options, clock)
 

@@ -19,7 +19,7 @@ from brushloop.collect.teach.guide import Question, Target
 from brushloop.collect.teach.sheet_fit import corners_of
 from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import ForceSample
-from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.ink.port import InkTable
 from brushloop.drivers.ink.pump import ModbusPumpConfig
 from brushloop.drivers.ink.station import InkStationConfig

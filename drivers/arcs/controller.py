@@ -125,15 +125,12 @@ def refusal(code: int) -> tuple[str, str]:
 class WrongOperationalMode(MotionError):
     """A program may not move the arm in this operational mode; `mode` is the controller's name for it."""
 
+    condition = "Nothing was set or powered."
+    remedy = "Turn it to Automatic on the pendant; no software here does that."
+
     def __init__(self, device: str, op: str, mode: str) -> None:
         self.mode = mode
-        super().__init__(
-            device,
-            op,
-            f"operational mode is {mode}",
-            condition="Nothing was set or powered.",
-            remedy="Turn it to Automatic on the pendant; no software here does that.",
-        )
+        super().__init__(device, op, f"operational mode is {mode}")
 
 
 class QueueFull(MotionRefused):
@@ -143,15 +140,11 @@ class QueueFull(MotionRefused):
 class OutOfReach(MotionFailed):
     """The controller accepted a target and could not plan a path to it; `code` is the number of its message."""
 
+    remedy = "Bring the target within reach: move the sheet or turn the brush, then teach again."
+
     def __init__(self, device: str, op: str, code: int, name: str) -> None:
         self.code = code
-        super().__init__(
-            device,
-            op,
-            f"the controller reports {code} ({name})",
-            condition="A stop was sent to the arm.",
-            remedy="Bring the target within reach: move the sheet or turn the brush, then teach again.",
-        )
+        super().__init__(device, op, f"the controller reports {code} ({name})")
 
 
 NOT_RUNNING = -1

@@ -132,7 +132,6 @@ def _not_arrived(what: str) -> MotionFailed:
         DEVICE,
         "moveLine",
         what,
-        condition="A stop was sent to the arm.",
         remedy="Check on the pendant whether the target is within reach, and that no other client stops the arm.",
     )
 
@@ -280,7 +279,6 @@ def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
         DEVICE,
         "follow",
         f"{why}, after {sent} of {legs} points were sent",
-        condition="A stop was sent to the arm.",
     )
 
 
@@ -412,6 +410,5 @@ def _not_begun(why: str) -> MotionFailed:
         DEVICE,
         "sequence",
         f"{why}; the brush must not go down before its lift is queued",
-        condition="A stop was sent to the arm.",
         remedy="Close other clients of the controller. See docs/decisions.md.",
     )

@@ -129,13 +129,13 @@ def configured(options: ArcsOptions) -> Settings:
 
 def require_same(op: str, wanted: Settings, current: Settings) -> None:
     """Raise `SettingsChanged` naming every setting in `wanted` that was found different."""
-    changes = tuple(
+    changes = [
         f"{setting.name} is {_in_words(setting, current[setting.name])}, not {_in_words(setting, wanted[setting.name])}"
         for setting in SETTINGS
         if setting.name in wanted and not _same(setting, wanted[setting.name], current[setting.name])
-    )
+    ]
     if changes:
-        raise SettingsChanged(DEVICE, op, changes)
+        raise SettingsChanged(DEVICE, op, "; ".join(changes))
 
 
 def _same(setting: Setting, wanted: Value, current: Value) -> bool:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from brushloop.drivers.errors import ProtocolViolation
-from brushloop.drivers.force.rounds import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
+from brushloop.drivers.force.sri_m8123 import BUS_OFF, COMMAND_ID, LOOPBACK_CHANNEL, START, STOP, Wrench, encode_round
 from brushloop.drivers.server import LoopbackServer
 
 BUS_ERROR = 0x04

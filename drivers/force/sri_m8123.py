@@ -1,8 +1,18 @@
 """A six-axis force sensor on a Sunrise SRI M8123B2 board, over python-can.
 
-The frame format is from public third-party code, not from the maker's manual; no board has confirmed it yet.
-The sensor needs a CAN adapter and a bus of its own: the arm's internal bus is never touched. A thread owns the bus from
-open to shutdown and turns its frames into wrenches.
+The frame format is from public third-party code, not from the maker's manual; no board has confirmed it yet: three
+frames per round, two float32 each, low byte first.
+
+| id | direction | bytes |
+|---|---|---|
+| 0x080 | to the board | 02 starts the stream, 00 stops it |
+| 0x291 | from the board | Fx, Fy in N |
+| 0x292 | from the board | Fz in N, Mx in Nm |
+| 0x293 | from the board | My, Mz in Nm |
+
+The frames carry no counter: only their order and timing show which three belong together. The sensor needs a CAN
+adapter and a bus of its own: the arm's internal bus is never touched. A thread owns the bus from open to shutdown and
+turns its frames into wrenches.
 """
 
 from __future__ import annotations
@@ -11,6 +21,7 @@ import asyncio
 import contextlib
 import logging
 import statistics
+import struct
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -28,30 +39,106 @@ from brushloop.drivers.errors import (
     Stuck,
     too_busy,
 )
-from brushloop.drivers.force.rounds import (
-    BITRATE,
-    BUS_OFF,
-    COMMAND_ID,
-    LOOPBACK_CHANNEL,
-    START,
-    STOP,
-    RoundAssembler,
-    Wrench,
-)
 from brushloop.drivers.host import Clock
 
 if TYPE_CHECKING:
     import can
 
+Wrench = tuple[float, float, float, float, float, float]
+"""Fx, Fy, Fz in N and Mx, My, Mz in Nm, in the sensor's frame."""
+
+LOOPBACK_CHANNEL = "loopback-force-board"
+"""The loopback rig's bus on a socketcand gateway. Longer than the 15 characters that a network interface's name may
+have, so no gateway to a real bus can serve it."""
+
+COMMAND_ID = 0x080
+START = b"\x02"
+STOP = b"\x00"
+FIRST_ID = 0x291
+BITRATE = 1_000_000
+BUS_OFF = 0x40
+"""Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
+_PAIR = struct.Struct("<2f")
+ROUND_S = 0.005
+"""Longest time from the first to the third frame of a round. It must be shorter than the sensor's period: otherwise two
+rounds that each lost frames can pass for one."""
+MEASURABLE: Wrench = (1000.0, 1000.0, 1000.0, 100.0, 100.0, 100.0)
+"""Values beyond what the sensor can measure are refused like NaN."""
+
+
+def encode_round(wrench: Wrench) -> tuple[tuple[int, bytes], ...]:
+    """The three frames of a round, as (id, bytes)."""
+    return tuple((FIRST_ID + place, _PAIR.pack(*wrench[2 * place : 2 * place + 2])) for place in range(3))
+
+
+class RoundAssembler:
+    """Turns frames into wrenches; incomplete and implausible rounds are dropped and counted."""
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+        self._began_s: float | None = None
+        self._last_place = -1
+        self._spoiled = True  # until a round begins; joining in mid-round is not a fault
+        self.torn = 0
+        self.refused = 0
+
+    def feed(self, can_id: int, data: bytes, at_s: float) -> Wrench | None:
+        """Take a frame received at `at_s`; return the wrench that it completes, else None."""
+        place = can_id - FIRST_ID
+        if not 0 <= place < 3:
+            return None
+        late = self._began_s is not None and not abs(at_s - self._began_s) <= ROUND_S
+        if place == 0 or place <= self._last_place or late:  # a new round, even if its first frame was lost
+            if self._values:
+                self._tear()
+            self._began_s, self._spoiled = at_s, False
+        self._last_place = place
+        if self._spoiled:
+            return None
+        if len(self._values) != 2 * place or len(data) != _PAIR.size:
+            self._tear()
+            self._spoiled = True
+            return None
+        self._values += _PAIR.unpack(data)
+        if place < 2:
+            return None
+        fx, fy, fz, mx, my, mz = self._values
+        self._values = []
+        wrench = (fx, fy, fz, mx, my, mz)
+        # Written so that NaN fails the check.
+        if not all(abs(value) <= limit for value, limit in zip(wrench, MEASURABLE, strict=True)):
+            self.refused += 1
+            return None
+        return wrench
+
+    def _tear(self) -> None:
+        self.torn += 1
+        self._values = []
+
+
+DEVICE = "force"
+AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+CONNECT_S = 10.0
+"""Time to open the bus, even through a gateway, and get a first round."""
 RECEIVE_S = 0.05
 RATE_WINDOW = 200
 SILENT_S = 1.0
 """A board that streamed and then sends nothing for this long is lost: a gateway that goes away gives no notice."""
+STUCK_MS, STUCK_ROUNDS = 100.0, 10
+"""Rounds that are equal to the last bit in all six values, so many and for so long, mean a stuck sensor. Fewer may be
+equal by chance, on a sensor that is slow or coarse."""
+STILL_N, STILL_NM = 0.05, 0.01
+"""The largest standard deviation, in each axis, at which the sensor counts as still."""
+MIN_BIAS_ROUNDS = 10
+MAX_BIAS_S = 60.0
+MORE_BIAS_S = 1.0
+"""Extra averaging time if too few rounds arrived."""
+NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class SriOptions:
-    """Which bus the board is on, and which samples to accept."""
+    """Which bus the board is on, and how old a sample may be."""
 
     interface: str = "socketcan"
     channel: str = "can0"
@@ -60,18 +147,6 @@ class SriOptions:
     """Address of a CAN gateway, for the interface `socketcand`."""
     port: int | None = None
     stale_after_ms: float = 100.0
-    stuck_after_ms: float = 100.0
-    """Time over which rounds that are equal to the last bit in all six values mean a stuck sensor."""
-    connect_timeout_s: float = 2.0
-    round_ms: float = 5.0
-    """Longest time from the first to the third frame of a round. It must be shorter than the sensor's period:
-    otherwise two rounds that each lost frames can pass for one."""
-    max_n: float = 1000.0
-    max_nm: float = 100.0
-    """Values beyond what the sensor can measure are refused like NaN."""
-    still_n: float = 0.05
-    still_nm: float = 0.01
-    """The largest standard deviation, in each axis, at which the sensor counts as still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,41 +163,30 @@ class ForceHealth:
     bus_errors: int
 
 
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Why the stream ended and what to do about it."""
-
-    what: str
-    remedy: str
+Round = tuple[Stamp, Wrench]
 
 
 class RoundStream:
     """Starts the sensor, reads it until `stop`, and stops it again. Use one for each connection."""
 
-    def __init__(
-        self,
-        options: SriOptions,
-        clock: Clock,
-        *,
-        on_round: Callable[[Stamp, Wrench], None],
-        on_loss: Callable[[], None],
-    ) -> None:
+    def __init__(self, options: SriOptions, clock: Clock, on_round: Callable[[Round | None], None]) -> None:
+        """`on_round` gets each round, and None once the stream has ended by itself; in the reader's thread."""
         self._options = options
-        self._assembler = RoundAssembler(round_ms=options.round_ms, max_n=options.max_n, max_nm=options.max_nm)
+        self._name = f"{options.interface} {options.channel}"
+        self._assembler = RoundAssembler()
         self._clock = clock
         self._on_round = on_round
-        self._on_loss = on_loss
         self._closing = threading.Event()
         self._arrivals_ns: deque[int] = deque(maxlen=RATE_WINDOW)
         self._rounds = self._bus_errors = 0
-        self.newest: tuple[Stamp, Wrench] | None = None
+        self.newest: Round | None = None
         self.alike = 0
         """Number of newest rounds in a row that exactly equal the one before; a strain gauge is never that still."""
         self.alike_since_ns = 0
         """Time at which the first round equal to the newest arrived."""
-        self.loss: Loss | None = None
-        self.channel_info = ""
-        self.virtual = False
+        self.loss: tuple[str, str] | None = None
+        """Why the stream ended, and what to do about it."""
+        self.identity = Identity(DEVICE, "SRI M8123B2", "", False)
         self.collecting: list[Wrench] | None = None
         """Collects every round while an average is taken."""
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
@@ -141,8 +205,7 @@ class RoundStream:
         arrivals_ns = self._arrivals_ns.copy()
         span_ns = arrivals_ns[-1] - arrivals_ns[0] if len(arrivals_ns) > 1 else 0
         rate_hz = (len(arrivals_ns) - 1) * 1e9 / span_ns if span_ns else 0.0
-        parts = self._assembler
-        return ForceHealth(rate_hz, self._rounds, parts.torn, parts.refused, self._bus_errors)
+        return ForceHealth(rate_hz, self._rounds, self._assembler.torn, self._assembler.refused, self._bus_errors)
 
     def _run(self) -> None:
         try:
@@ -154,7 +217,7 @@ class RoundStream:
             self._lose(f"cannot open {self._name}: {error}", "Check the adapter and that its interface is up.")
             return
         try:
-            self.channel_info, self.virtual = str(bus.channel_info), _is_virtual(self._options)
+            self.identity = self._identity(bus)
             bus.send(command(START), timeout=1.0)
             heard, quiet_s = False, 0.0
             while self.loss is None and not self._closing.is_set():
@@ -188,6 +251,12 @@ class RoundStream:
         gateway: dict[str, Any] = {} if options.host is None else {"host": options.host, "port": options.port}
         return can.Bus(options.channel, options.interface, ignore_config=True, bitrate=options.bitrate, **gateway)
 
+    def _identity(self, bus: can.BusABC) -> Identity:
+        """The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus."""
+        interface, channel = self._options.interface, self._options.channel
+        simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
+        return Identity(DEVICE, f"SRI M8123B2 on {bus.channel_info}", "", simulated)
+
     def _take(self, message: can.Message) -> None:
         if message.is_error_frame:
             self._bus_errors += 1
@@ -211,11 +280,7 @@ class RoundStream:
         self.newest = (stamp, wrench)
         if (collecting := self.collecting) is not None:
             collecting.append(wrench)
-        self._on_round(stamp, wrench)
-
-    @property
-    def _name(self) -> str:
-        return f"{self._options.interface} {self._options.channel}"
+        self._on_round(self.newest)
 
     def _lose_bus(self, what: str) -> None:
         self._lose(
@@ -225,8 +290,8 @@ class RoundStream:
         )
 
     def _lose(self, what: str, remedy: str) -> None:
-        self.loss = Loss(what, remedy)
-        self._on_loss()
+        self.loss = (what, remedy)
+        self._on_round(None)
 
 
 def command(data: bytes) -> can.Message:
@@ -234,21 +299,6 @@ def command(data: bytes) -> can.Message:
     import can
 
     return can.Message(arbitration_id=COMMAND_ID, is_extended_id=False, data=data)
-
-
-def _is_virtual(options: SriOptions) -> bool:
-    return options.interface == "virtual" or (options.interface == "socketcand" and options.channel == LOOPBACK_CHANNEL)
-
-
-DEVICE = "force"
-AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-MIN_BIAS_ROUNDS = 10
-MIN_ALIKE_ROUNDS = 10
-"""Fewer rounds may be equal by chance, on a sensor that is slow or coarse."""
-MAX_BIAS_S = 60.0
-MORE_BIAS_S = 1.0
-"""Extra averaging time if too few rounds arrived."""
-NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SriM8123:
@@ -269,49 +319,36 @@ class SriM8123:
         After a failure the board is stopped and nothing is left open. A bias does not survive.
         """
         await self.close()
-        options = self._options
         loop, begun = asyncio.get_running_loop(), asyncio.Event()
         self.bias_wrench = NO_BIAS
 
-        def on_round(stamp: Stamp, wrench: Wrench) -> None:
-            if not begun.is_set() or self._listener is not None:
-                in_loop(lambda: deliver(stamp, wrench))
+        def on_round(latest: Round | None) -> None:
+            if latest is None or not begun.is_set() or self._listener is not None:
+                with contextlib.suppress(RuntimeError):  # the loop ended before the stream was closed
+                    loop.call_soon_threadsafe(deliver, latest)
 
-        def in_loop(call: Callable[[], object]) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop ended before the stream was closed
-                loop.call_soon_threadsafe(call)
-
-        def deliver(stamp: Stamp, wrench: Wrench) -> None:
+        def deliver(latest: Round | None) -> None:
             begun.set()
-            if self._stream is stream and self._listener is not None:
-                self._listener(self._sample(stamp, wrench))
+            if latest is not None and self._stream is stream and self._listener is not None:
+                self._listener(self._sample(*latest))
 
-        stream = RoundStream(
-            options,
-            self._clock,
-            on_round=on_round,
-            on_loss=lambda: in_loop(begun.set),
-        )
+        stream = RoundStream(self._options, self._clock, on_round)
         self._stream = stream
         stream.start()
         try:
-            async with asyncio.timeout(options.connect_timeout_s):
+            async with asyncio.timeout(CONNECT_S):
                 await begun.wait()
             self._require("connect")
         except TimeoutError:
             health = stream.health()
             await self.close()
-            raise DeviceTimeout(
-                DEVICE,
-                "connect",
-                f"no whole round in {options.connect_timeout_s:g} s ({health.torn} torn, {health.refused} refused)",
-                remedy="Check power, wiring, termination and bit rate.",
-            ) from None
+            what = f"no whole round in {CONNECT_S:g} s ({health.torn} torn, {health.refused} refused)"
+            remedy = "Check power, wiring, termination and bit rate."
+            raise DeviceTimeout(DEVICE, "connect", what, remedy=remedy) from None
         except BaseException:
             await self.close()
             raise
-        # The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus.
-        return Identity(DEVICE, f"SRI M8123B2 on {stream.channel_info}", "", stream.virtual)
+        return stream.identity
 
     def latest_n(self) -> tuple[float, float, float]:
         """The newest force in N, less the bias; never blocks. Raises what `latest` raises."""
@@ -327,7 +364,7 @@ class SriM8123:
         if age_ms > self._options.stale_after_ms:
             raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
         alike_ms = (newest[0].host_ns - stream.alike_since_ns) / 1e6
-        if alike >= MIN_ALIKE_ROUNDS and alike_ms > self._options.stuck_after_ms:
+        if alike >= STUCK_ROUNDS and alike_ms > STUCK_MS:
             raise Stuck(DEVICE, alike_ms, alike)
         return self._sample(*newest)
 
@@ -379,7 +416,8 @@ class SriM8123:
         if self._stream is None:
             raise NotConnected(DEVICE, op, "not connected")
         if (loss := self._stream.loss) is not None:
-            raise ConnectionLost(DEVICE, op, loss.what, remedy=f"{too_busy()} {loss.remedy}".strip())
+            what, remedy = loss
+            raise ConnectionLost(DEVICE, op, what, remedy=f"{too_busy()} {remedy}".strip())
         return self._stream
 
     def _sample(self, stamp: Stamp, wrench: Wrench) -> ForceSample:
@@ -387,7 +425,7 @@ class SriM8123:
         return ForceSample(stamp, (fx, fy, fz), (mx, my, mz))
 
     def _still_mean(self, name: str, values: tuple[float, ...]) -> float:
-        limit, unit = (self._options.still_n, "N") if name.startswith("F") else (self._options.still_nm, "Nm")
+        limit, unit = (STILL_N, "N") if name.startswith("F") else (STILL_NM, "Nm")
         deviation = statistics.stdev(values)
         if deviation > limit:
             raise DeviceError(

@@ -1,4 +1,4 @@
-"""What ink devices share: their table in `rig.toml`, the serial line, its checksum, limits on doses, and errors.
+"""What ink devices share: their table in `rig.toml`, the limits on doses, errors, and the serial line.
 
 One worker thread owns the port from open to close, so that an exchange whose caller was cancelled still ends before
 the next begins: two requests at once on a half-duplex line would destroy each other.
@@ -42,6 +42,9 @@ class InkRefused(DeviceError):
 class DoseLost(DeviceError):
     """A dose was given, and the well does not show it."""
 
+    condition = "Nothing was dipped."
+    remedy = "Look at the tube, the reservoir and the gauge."
+
 
 class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
     """The table `[ink.device]` of `rig.toml` for one kind of ink device: the engine asks it for everything."""
@@ -51,6 +54,7 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
     """Device file or COM port, or what else the device is reached by."""
     dose_ml: Annotated[float, Field(gt=0.0, le=2.0)]
     """Size of one dose."""
+    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
     @abstractmethod
     def device(self, clock: Clock) -> Ink:
@@ -58,6 +62,48 @@ class InkTable(BaseModel, ABC, frozen=True, extra="forbid"):
 
     def doses_ml(self, dips: int) -> float | None:
         """Ink that so many dips cost where the device counts dips; None where a gauge or a person decides."""
+        return None
+
+
+MINUTE_NS = 60 * 10**9
+
+
+class InkDevice(ABC):
+    """An `Ink` by its table: keeps to the limit of a dose and of a minute, and adds up what it has given.
+
+    A dose that failed counts against the limits: ink may have flowed before the reply was lost.
+    """
+
+    def __init__(self, name: str, table: InkTable, clock: Clock, *, smallest_ml: float) -> None:
+        self._name, self._table, self._clock = name, table, clock
+        self._smallest_ml = smallest_ml
+        self._taken: deque[tuple[int, float]] = deque()
+        self._dosed_ml = 0.0
+
+    @abstractmethod
+    async def _give(self, volume_ml: float) -> None:
+        """Add ink to the well; returns when it is in."""
+
+    async def dose(self, volume_ml: float) -> None:
+        """Add ink to the well. Raises `LimitExceeded` before anything is sent, `InkRefused`, `DeviceError`."""
+        now_ns, most_ml, a_minute_ml = self._clock.now_ns(), self._table.dose_ml, self._table.max_per_minute_ml
+        if not math.isfinite(volume_ml) or not self._smallest_ml * (1 - 1e-9) <= volume_ml <= most_ml:
+            raise LimitExceeded(self._name, "dose", volume_ml, self._smallest_ml, most_ml, "ml")
+        while self._taken and now_ns - self._taken[0][0] >= MINUTE_NS:
+            self._taken.popleft()
+        within_ml = volume_ml + sum(ml for _, ml in self._taken)
+        if within_ml > a_minute_ml * (1 + 1e-9):
+            raise LimitExceeded(self._name, "dose per minute", within_ml, 0.0, a_minute_ml, "ml")
+        self._taken.append((now_ns, volume_ml))
+        await self._give(volume_ml)
+        self._dosed_ml += volume_ml
+
+    async def light(self) -> float | None:
+        """None: most ink devices have no light."""
+        return None
+
+    async def level(self) -> float | None:
+        """None: most ink devices have no gauge."""
         return None
 
 
@@ -72,34 +118,6 @@ def crc16(data: bytes) -> int:
         for _ in range(8):
             crc = (crc >> 1) ^ (_POLYNOMIAL if crc & 1 else 0)
     return crc
-
-
-MINUTE_NS = 60 * 10**9
-
-
-class DoseBudget:
-    """A limit per dose and one per minute, both in ml.
-
-    A dose that failed still counts: ink may have flowed before the reply was lost.
-    """
-
-    def __init__(self, device: str, *, smallest_ml: float, max_dose_ml: float, max_per_minute_ml: float) -> None:
-        self._device = device
-        self._smallest_ml = smallest_ml
-        self._max_dose_ml = max_dose_ml
-        self._max_per_minute_ml = max_per_minute_ml
-        self._given: deque[tuple[int, float]] = deque()
-
-    def take(self, volume_ml: float, now_ns: int) -> None:
-        """Count a dose at `now_ns`. Raises `LimitExceeded` without counting it."""
-        if not math.isfinite(volume_ml) or not self._smallest_ml * (1 - 1e-9) <= volume_ml <= self._max_dose_ml:
-            raise LimitExceeded(self._device, "dose", volume_ml, self._smallest_ml, self._max_dose_ml, "ml")
-        while self._given and now_ns - self._given[0][0] >= MINUTE_NS:
-            self._given.popleft()
-        within_ml = volume_ml + sum(ml for _, ml in self._given)
-        if within_ml > self._max_per_minute_ml * (1 + 1e-9):
-            raise LimitExceeded(self._device, "dose per minute", within_ml, 0.0, self._max_per_minute_ml, "ml")
-        self._given.append((now_ns, volume_ml))
 
 
 MAX_REPLY_BYTES = 4096
@@ -132,13 +150,12 @@ class SerialPort:
         self._gap_s = gap_s
         self._worker: ThreadPoolExecutor | None = None
         self._port: _Port | None = None
-        self._lost: str | None = None
         self._closing = threading.Event()
 
     async def open(self) -> None:
         """Open the port for this process alone. Raises `ConnectionLost`."""
         await self.close()
-        self._lost, self._closing = None, threading.Event()
+        self._closing = threading.Event()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"serial {self._path}")
         try:
             await asyncio.get_running_loop().run_in_executor(self._worker, self._open)
@@ -157,21 +174,20 @@ class SerialPort:
         if self._worker is None:
             raise NotConnected(self._device, op, "not connected")
         loop, closing = asyncio.get_running_loop(), self._closing
+        asking = loop.run_in_executor(self._worker, lambda: self._ask(op, request, find, timeout_s, closing))
         try:
-            received, reply = await loop.run_in_executor(
-                self._worker, lambda: self._ask(op, request, find, timeout_s, closing)
-            )
-        except ConnectionLost as error:
-            raise ConnectionLost(self._device, op, error.what, condition=condition, remedy=REPLUG) from None
+            received, reply = await asking
+        except OSError as error:  # pyserial's own error is an OSError
+            what = f"{self._path}: {error.strerror or error}"
+            raise ConnectionLost(self._device, op, what, condition=condition, remedy=REPLUG) from None
         if reply is not None:
             return reply
         if received:
-            raise ProtocolViolation(
-                self._device, op, f"no reply among {shown(received)} in {timeout_s:g} s", condition=condition
-            )
-        raise DeviceTimeout(
-            self._device, op, f"no reply in {timeout_s:g} s", condition=condition, remedy="Check power and cable."
-        )
+            start = f"{received[:48]!r}{'...' if len(received) > 48 else ''}"
+            what = f"no reply among {start} in {timeout_s:g} s"
+            raise ProtocolViolation(self._device, op, what, condition=condition)
+        what = f"no reply in {timeout_s:g} s"
+        raise DeviceTimeout(self._device, op, what, condition=condition, remedy="Check power and cable.")
 
     async def close(self) -> None:
         """Abandon a pending exchange, close the port and join the worker; may be repeated."""
@@ -186,7 +202,7 @@ class SerialPort:
 
         try:
             port = serial.Serial(self._path, self._baud, timeout=POLL_S, write_timeout=1.0, exclusive=True)
-        except (OSError, ValueError) as error:  # pyserial's own error is an OSError
+        except (OSError, ValueError) as error:
             why = f"cannot open {self._path}: {error}"
             raise ConnectionLost(self._device, "connect", why, remedy=REPLUG) from None
         self._port = cast("_Port", port)
@@ -205,34 +221,20 @@ class SerialPort:
         timeout_s: float,
         closing: threading.Event,
     ) -> tuple[bytes, T | None]:
-        if self._lost is not None:
-            raise ConnectionLost(self._device, op, self._lost)
+        """Everything received, and the reply in it. Raises `NotConnected` if the port was closed, `OSError`."""
         port = self._port
         if port is None or closing.is_set():
             raise NotConnected(self._device, op, "closed while waiting")
-        try:
-            time.sleep(self._gap_s)
-            if waiting := port.in_waiting:
-                port.read(waiting)  # late replies and noise from before this request
-            port.write(request)
-            received = b""
-            deadline_s = time.monotonic() + timeout_s
-            while time.monotonic() < deadline_s:
-                if closing.is_set():
-                    raise NotConnected(self._device, op, "closed while waiting")
-                if not (arrived := port.read(max(1, port.in_waiting))):
-                    continue
-                received += arrived
-                if (reply := find(received)) is not None:
-                    return received, reply
-                if len(received) > MAX_REPLY_BYTES:
-                    break
-            return received, None
-        except OSError as error:
-            self._lost = f"{self._path}: {error.strerror or error}"
-            raise ConnectionLost(self._device, op, self._lost) from None
-
-
-def shown(data: bytes) -> str:
-    """The first bytes of `data`, formatted for a message."""
-    return f"{data[:48]!r}{'...' if len(data) > 48 else ''}"
+        time.sleep(self._gap_s)
+        if waiting := port.in_waiting:
+            port.read(waiting)  # late replies and noise from before this request
+        port.write(request)
+        received = b""
+        deadline_s = time.monotonic() + timeout_s
+        while time.monotonic() < deadline_s and len(received) <= MAX_REPLY_BYTES:
+            if closing.is_set():
+                raise NotConnected(self._device, op, "closed while waiting")
+            received += port.read(max(1, port.in_waiting))
+            if (reply := find(received)) is not None:
+                return received, reply
+        return received, None

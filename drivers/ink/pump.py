@@ -23,12 +23,11 @@ from pydantic import Field
 from brushloop.drivers.devices import Identity, Well
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation
 from brushloop.drivers.host import Clock, finished
-from brushloop.drivers.ink.port import DoseBudget, InkRefused, InkTable, SerialPort, crc16
+from brushloop.drivers.ink.port import InkDevice, InkRefused, InkTable, SerialPort, crc16
 
 DEVICE = "pump"
 WRITE_REGISTER = 0x06
 EXCEPTION_BIT = 0x80
-WRITE_BYTES = 8
 EXCEPTION_BYTES = 5
 EXCEPTIONS = {
     1: "illegal function",
@@ -45,16 +44,6 @@ def seal(body: bytes) -> bytes:
     return body + struct.pack("<H", crc16(body))
 
 
-def unseal(frame: bytes) -> bytes:
-    """The body of a frame. Raises `ProtocolViolation` if it is too short or the CRC is wrong."""
-    if len(frame) < 4:
-        raise ProtocolViolation(DEVICE, "decode", f"{len(frame)} bytes are not a frame")
-    body = frame[:-2]
-    if seal(body) != frame:
-        raise ProtocolViolation(DEVICE, "decode", f"CRC of {frame.hex(' ')} should be {seal(body)[-2:].hex(' ')}")
-    return body
-
-
 def write_register(unit: int, register: int, value: int) -> bytes:
     """The request to write one register. Raises ValueError if a field does not fit."""
     if not (1 <= unit <= 247 and 0 <= register <= 0xFFFF and 0 <= value <= 0xFFFF):
@@ -65,15 +54,6 @@ def write_register(unit: int, register: int, value: int) -> bytes:
 def exception(unit: int, function: int, code: int) -> bytes:
     """The exception reply of a unit that refuses a request."""
     return seal(bytes([unit, function | EXCEPTION_BIT, code]))
-
-
-def read_write(frame: bytes) -> tuple[int, int, int]:
-    """(unit, register, value) of a write request or its reply. Raises `ProtocolViolation`."""
-    body = unseal(frame)
-    if len(frame) != WRITE_BYTES or body[1] != WRITE_REGISTER:
-        raise ProtocolViolation(DEVICE, "decode", f"{frame[:16].hex(' ')} does not write a register")
-    unit, _, register, value = struct.unpack(">BBHH", body)
-    return unit, register, value
 
 
 def find_reply(received: bytes, request: bytes) -> int | None:
@@ -101,6 +81,11 @@ STOP, START = 0, 1
 STOP_ATTEMPTS = 3
 MAX_RPM = 600.0
 """The speed register could hold up to 655.35."""
+REPLY_S = 0.5
+ECHO_S = 0.15
+"""How long `connect` waits for an echo: longer than eight characters and the adapter's own delay."""
+MAX_OVERRUN_S = 0.5
+"""A stop that is later than this is reported: the well got more than was asked for."""
 
 
 class ModbusPumpConfig(InkTable, frozen=True):
@@ -115,7 +100,6 @@ class ModbusPumpConfig(InkTable, frozen=True):
     dose_ml: Annotated[float, Field(gt=0.0, le=2.0)] = 0.3
     """Dose before every `every_dips`-th dip."""
     every_dips: Annotated[int, Field(ge=1, le=1000)] = 5
-    max_per_minute_ml: Annotated[float, Field(gt=0.0, le=100.0)] = 5.0
 
     def device(self, clock: Clock) -> ModbusPump:
         """The driver, not yet connected."""
@@ -126,35 +110,19 @@ class ModbusPumpConfig(InkTable, frozen=True):
         return dips // self.every_dips * self.dose_ml
 
 
-class ModbusPump:
+class ModbusPump(InkDevice):
     """`Ink` that doses by time at a fixed speed; a running pump is always stopped."""
 
-    def __init__(
-        self,
-        config: ModbusPumpConfig,
-        clock: Clock,
-        *,
-        timeout_s: float = 0.5,
-        echo_s: float = 0.15,
-        max_overrun_s: float = 0.5,
-    ) -> None:
-        """`echo_s`: how long `connect` waits for an echo, longer than eight characters and the adapter's own delay.
-
-        A stop that is more than `max_overrun_s` late is reported: the well got more than was asked for.
-        """
-        self._unit, self._rpm = config.unit, config.rpm
-        self._config, self._clock = config, clock
-        self._timeout_s, self._echo_s, self._max_overrun_s = timeout_s, echo_s, max_overrun_s
-        # 3.5 characters of 11 bits, at least 1.75 ms: the silence that ends a frame.
-        self._port = SerialPort(DEVICE, config.port, config.baud, max(0.00175, 3.5 * 11 / config.baud))
+    def __init__(self, table: ModbusPumpConfig, clock: Clock) -> None:
+        self._ml_per_s = table.ml_per_revolution * table.rpm / 60.0
         # Below a tenth of a second the time that messages take would matter more than the time pumped.
-        self._ml_per_s = config.ml_per_revolution * config.rpm / 60.0
-        least_ml, most_ml, a_minute_ml = 0.1 * self._ml_per_s, config.dose_ml, config.max_per_minute_ml
-        self._budget = DoseBudget(DEVICE, smallest_ml=least_ml, max_dose_ml=most_ml, max_per_minute_ml=a_minute_ml)
+        super().__init__(DEVICE, table, clock, smallest_ml=0.1 * self._ml_per_s)
+        self._unit, self._rpm, self._every_dips = table.unit, table.rpm, table.every_dips
+        # 3.5 characters of 11 bits, at least 1.75 ms: the silence that ends a frame.
+        self._port = SerialPort(DEVICE, table.port, table.baud, max(0.00175, 3.5 * 11 / table.baud))
         self._running = asyncio.Lock()
         self._connected = False
         self._may_run = False
-        self._dosed_ml = 0.0
 
     async def connect(self) -> Identity:
         """Open the port, check that the line does not echo, and stop the pump. `DeviceError` leaves the port closed."""
@@ -170,15 +138,12 @@ class ModbusPump:
         # A pump cannot say whether it is the loopback rig's.
         return Identity(DEVICE, f"Modbus RTU pump, unit {self._unit}", "", False)
 
-    async def dose(self, volume_ml: float) -> None:
-        """Pump for as long as `volume_ml` takes, then stop. Raises `LimitExceeded`, `InkRefused`, `DeviceError`.
+    async def _give(self, volume_ml: float) -> None:
+        """Pump for as long as `volume_ml` takes, then stop.
 
         On any error, including cancellation, the pump is stopped before the error is passed on.
         """
-        if not self._connected:
-            raise NotConnected(DEVICE, "dose", "not connected")
         async with self._running:
-            self._budget.take(volume_ml, self._clock.now_ns())
             speed = round(self._rpm * 100)
             await self._write(SPEED_REGISTER, speed, "set speed", "The pump was not started.")
             planned_s = volume_ml / self._ml_per_s
@@ -194,7 +159,7 @@ class ModbusPump:
                 raise
             ran_s = time.monotonic() - began_s
             await finished(self._halt())
-            if ran_s > planned_s + self._max_overrun_s:
+            if ran_s > planned_s + MAX_OVERRUN_S:
                 excess_ml = (ran_s - planned_s) * self._ml_per_s
                 raise DeviceError(
                     DEVICE,
@@ -203,23 +168,12 @@ class ModbusPump:
                     condition=f"About {excess_ml:.2f} ml too much is in the well; the pump is stopped.",
                     remedy="Something held the host up.",
                 )
-            self._dosed_ml += volume_ml
 
     async def replenish(self, dips: int) -> Well:
         """Dose before every `every_dips`-th dip. Raises as `dose` does."""
-        if dips % self._config.every_dips == self._config.every_dips - 1:
-            await self.dose(self._config.dose_ml)
+        if dips % self._every_dips == self._every_dips - 1:
+            await self.dose(self._table.dose_ml)
         return Well(None, self._dosed_ml)
-
-    async def light(self) -> float | None:
-        """None: a pump has no light."""
-        return None
-
-    async def level(self) -> float | None:
-        """None, because the pump has no gauge: how much is in the well is unknown."""
-        if not self._connected:
-            raise NotConnected(DEVICE, "level", "not connected")
-        return None
 
     async def close(self) -> None:
         """Stop the pump once more, then close the port. Raises `DeviceError` only if the pump may still be running."""
@@ -259,11 +213,7 @@ class ModbusPump:
     async def _write(self, register: int, value: int, op: str, condition: str) -> None:
         request = write_register(self._unit, register, value)
         code = await self._port.exchange(
-            op,
-            request,
-            lambda received: find_reply(received, request),
-            timeout_s=self._timeout_s,
-            condition=condition,
+            op, request, lambda received: find_reply(received, request), timeout_s=REPLY_S, condition=condition
         )
         if code:
             text = EXCEPTIONS.get(code, "unknown")
@@ -278,10 +228,7 @@ class ModbusPump:
         damaged = intact[:-2] + bytes(byte ^ 0xFF for byte in intact[-2:])
         try:
             await self._port.exchange(
-                "connect",
-                damaged,
-                lambda received: True if damaged in received else None,
-                timeout_s=self._echo_s,
+                "connect", damaged, lambda received: True if damaged in received else None, timeout_s=ECHO_S
             )
         except (DeviceTimeout, ProtocolViolation):
             return

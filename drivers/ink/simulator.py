@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import math
 import os
+import struct
 import tempfile
 import time
 import tty
@@ -15,17 +16,8 @@ from typing import Protocol, Self
 
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.ink import pump
-from brushloop.drivers.ink.pump import (
-    MAX_RPM,
-    RUN_REGISTER,
-    SPEED_REGISTER,
-    STOP,
-    WRITE_BYTES,
-    WRITE_REGISTER,
-    exception,
-    read_write,
-)
-from brushloop.drivers.ink.station import number_of, seal, unseal
+from brushloop.drivers.ink.pump import MAX_RPM, RUN_REGISTER, SPEED_REGISTER, STOP, WRITE_REGISTER, exception
+from brushloop.drivers.ink.station import NUMBERS, number_of, seal, unseal
 
 GARBAGE = b"\xff\x00*\n\x86\x01ok 1*0000\n"
 BYTE_S = 0.001
@@ -198,14 +190,14 @@ class StationFirmware:
         if request == self._memory[0]:
             return self._memory[1]
         try:
-            line = unseal(request)
+            number, command = unseal(request)
         except ProtocolViolation:
             return None  # the number that it carries cannot be trusted
         try:
-            text = self._obey(line.text.split(" "))
+            text = self._obey(command.split(" "))
         except ProtocolViolation:
             text = "err 2 not a number"
-        reply = seal(line.number, text)
+        reply = seal(number, text)
         self._memory = (request, reply)
         return reply
 
@@ -215,8 +207,8 @@ class StationFirmware:
 
     def mistake(self, reply: bytes) -> bytes:
         """A reply with the number of the previous request."""
-        line = unseal(reply)
-        return seal((line.number - 1) % 1000, line.text)
+        number, text = unseal(reply)
+        return seal((number - 1) % NUMBERS, text)
 
     def _obey(self, words: list[str]) -> str:
         match words:
@@ -250,6 +242,7 @@ class StationFirmware:
 
 
 FULL_SPEED = 2
+REQUEST_BYTES = 8
 
 
 class PumpFirmware:
@@ -288,23 +281,19 @@ class PumpFirmware:
 
     def take(self, buffer: bytearray) -> bytes | None:
         """Take eight bytes, the length of every known request; None if there are fewer."""
-        if len(buffer) < WRITE_BYTES:
+        if len(buffer) < REQUEST_BYTES:
             return None
-        frame = bytes(buffer[:WRITE_BYTES])
-        del buffer[:WRITE_BYTES]
+        frame = bytes(buffer[:REQUEST_BYTES])
+        del buffer[:REQUEST_BYTES]
         return frame
 
     def answer(self, request: bytes) -> bytes | None:
         """The reply; None for a wrong CRC or another unit, as Modbus requires."""
-        try:
-            unit, function, *_ = pump.unseal(request)
-        except ProtocolViolation:
-            return None
-        if unit != self.unit:
+        unit, function, register, value = struct.unpack(">BBHH", request[:-2])
+        if pump.seal(request[:-2]) != request or unit != self.unit:
             return None
         if function != WRITE_REGISTER:
             return exception(unit, function & 0x7F, 1)
-        _, register, value = read_write(request)
         self._settle()
         if register not in (SPEED_REGISTER, RUN_REGISTER):
             return exception(unit, function, 2)

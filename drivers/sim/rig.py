@@ -8,8 +8,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL, Wrench
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
 from brushloop.drivers.geometry import columns, inverse, of_angles, product
 from brushloop.drivers.ink.simulator import Instrument, PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer

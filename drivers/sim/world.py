@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.force.rounds import Wrench
+from brushloop.drivers.force.sri_m8123 import Wrench
 from brushloop.drivers.geometry import brush_pose, columns, from_wire, interpolate, lean, of_vector, product, unit
 from brushloop.drivers.ink.simulator import Well
 from brushloop.drivers.sim.brush.brush import MAX_TILT_DEG, Brush, BrushSpec

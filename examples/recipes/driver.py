@@ -1,7 +1,8 @@
 """A driver: a syringe pump that takes `DOSE 0.500` as a line of text over TCP and answers `OK`.
 
-An ink device is a table of `rig.toml` and a class with the methods of `Ink` in `drivers/devices.py`. Both go into a
-file of `drivers/ink/`, the table also into `AnyInkTable` there. Write its simulator beside it, for real wire bytes.
+An ink device is a table of `rig.toml` and a class with the methods of `Ink` in `drivers/devices.py`; `InkDevice` has
+what all of them share. Both go into a file of `drivers/ink/`, the table also into `AnyInkTable` there. Write its
+simulator beside it, for real wire bytes.
 """
 # ruff: noqa: D101, D102 - `Ink` says what each method does
 
@@ -13,41 +14,35 @@ from typing import Literal
 from brushloop.drivers.devices import Identity, Well
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.host import Clock
-from brushloop.drivers.ink.port import DoseBudget, InkTable
+from brushloop.drivers.ink.port import InkDevice, InkTable
 
 
 class SyringeTable(InkTable, frozen=True):  # `port` is HOST:PORT
     kind: Literal["syringe"] = "syringe"
     dose_ml: float = 0.2
+    max_per_minute_ml: float = 50.0
 
     def device(self, clock: Clock) -> SyringePump:
         return SyringePump(self, clock)
 
 
-class SyringePump:
+class SyringePump(InkDevice):
     def __init__(self, table: SyringeTable, clock: Clock) -> None:
-        self._table, self._clock = table, clock
-        self._budget = DoseBudget("ink", smallest_ml=0.01, max_dose_ml=2.0, max_per_minute_ml=50.0)
+        super().__init__("ink", table, clock, smallest_ml=0.01)
+        self._address = table.port.split(":")
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def connect(self) -> Identity:
-        self._streams = await asyncio.open_connection(*self._table.port.split(":"))
+        self._streams = await asyncio.open_connection(*self._address)
         return Identity("ink", await self._ask("WHO"), "", simulated=False)
 
-    async def dose(self, volume_ml: float) -> None:
-        self._budget.take(volume_ml, self._clock.now_ns())
+    async def _give(self, volume_ml: float) -> None:
         if (answer := await self._ask(f"DOSE {volume_ml:.3f}")) != "OK":
             raise ProtocolViolation("ink", "dose", f"answered {answer!r}, expected 'OK'")
 
     async def replenish(self, dips: int) -> Well:
         await self.dose(self._table.dose_ml)
-        return Well(level=None, dosed_ml=(dips + 1) * self._table.dose_ml)
-
-    async def light(self) -> None:
-        pass
-
-    async def level(self) -> None:
-        pass
+        return Well(level=None, dosed_ml=self._dosed_ml)
 
     async def close(self) -> None:
         if self._streams is not None:

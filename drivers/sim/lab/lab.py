@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs.cabinet import Cabinet
 from brushloop.drivers.sim.config import View

@@ -43,7 +43,7 @@ async def test_a_rig_in_order_is_reported_as_it_is_and_left_as_it_was(lab: Lab) 
 async def test_an_instrument_that_was_unplugged_is_reported_and_the_others_are_still_asked(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("brushloop.collect.rig.devices.FORCE_CONNECT_S", 2.0)
+    monkeypatch.setattr("brushloop.drivers.force.sri_m8123.CONNECT_S", 2.0)
     lab.rig.faults.hang(Fault(device=Device.INK, kind="deaf", count=100))
     lab.rig.faults.hang(Fault(device=Device.FORCE, kind="no-second", count=10_000))
     camera, force, ink, robot = await examine(load_rig(lab.folder / "rig.toml"), HostClock())

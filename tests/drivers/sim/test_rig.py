@@ -13,8 +13,8 @@ import pytest
 
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.devices import Stamp
-from brushloop.drivers.force.rounds import COMMAND_ID, LOOPBACK_CHANNEL, START
 from brushloop.drivers.force.simulator import FRAME_S, ForceBoard, SocketcandServer
+from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, START
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.server import LoopbackServer, NotLoopback
 from brushloop.drivers.sim import rig as rig_module

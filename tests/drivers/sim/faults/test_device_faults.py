@@ -21,8 +21,8 @@ from brushloop.drivers.errors import (
     ProtocolViolation,
     RobotNotSafe,
 )
-from brushloop.drivers.force.rounds import LOOPBACK_CHANNEL
-from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.force import sri_m8123
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, SriM8123, SriOptions
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs.server import ArcsServer
@@ -234,11 +234,10 @@ async def test_a_picture_that_comes_again_is_not_taken_for_new_even_once(rig: Lo
 
 
 @pytest.fixture
-async def sensor(rig: LoopbackRig) -> AsyncIterator[SriM8123]:
+async def sensor(rig: LoopbackRig, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[SriM8123]:
     assert rig.force is not None
-    options = SriOptions(
-        "socketcand", LOOPBACK_CHANNEL, host=HOST, port=rig.force.port, stale_after_ms=5000.0, round_ms=500.0
-    )
+    monkeypatch.setattr(sri_m8123, "ROUND_S", 0.5)  # a busy machine pauses within a round
+    options = SriOptions("socketcand", LOOPBACK_CHANNEL, host=HOST, port=rig.force.port, stale_after_ms=5000.0)
     sensor = SriM8123(options, HostClock())
     await sensor.connect()
     yield sensor
