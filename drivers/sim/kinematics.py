@@ -1,4 +1,4 @@
-"""Kinematics of the i5 from its nominal table (modified DH), the paths of its tip, and the speed along them.
+"""Kinematics of the i5 from its nominal table (modified DH), and the paths of its tip.
 
 The loopback controller answers FK and IK with it. A real arm is calibrated and differs by most of a millimetre, so the
 driver always asks the controller. Lengths are in mm, or in rad where a path is angular.
@@ -192,7 +192,7 @@ class Corner:
         """Length that the corner replaces; the curve itself is shorter."""
         return 2.0 * self.cut
 
-    @cached_property
+    @property
     def bend(self) -> float:
         """Length of the difference of the two unit directions: 0 for straight on, 2 for a reversal."""
         directions = [np.subtract(w.end.position_mm, w.start.position_mm) / w.length for w in (self.a, self.b)]
@@ -232,56 +232,3 @@ class JointLine:
     def pose(self, done: float) -> Pose:
         """Where the tip is."""
         return pose_of(forward(self.joints(done)) @ self.tool)
-
-
-@dataclass(frozen=True, slots=True)
-class Ramp:
-    """A speed profile: from `v_in` at `acc` to `speed`, then at `acc` to `v_out`; a short path does not reach `speed`.
-
-    Time is in s. `v_in` and `v_out` must be within reach of each other.
-    """
-
-    length: float
-    speed: float
-    acc: float
-    v_in: float = 0.0
-    v_out: float = 0.0
-
-    @property
-    def peak(self) -> float:
-        """The speed between the two slopes."""
-        if self.v_in >= self.speed:
-            return max(self.speed, self.v_out)
-        if not self.length:
-            return self.v_in
-        highest = math.sqrt(self.acc * self.length + 0.5 * (self.v_in * self.v_in + self.v_out * self.v_out))
-        return max(min(self.speed, highest), self.v_in, self.v_out)
-
-    @property
-    def duration_s(self) -> float:
-        """Time for the whole length."""
-        return sum(self._times())
-
-    def at(self, t: float) -> tuple[float, float]:
-        """(distance, speed) at time `t`, clamped to the ends."""
-        if t <= 0.0:
-            return 0.0, self.v_in
-        up_s, along_s, down_s = self._times()
-        if t >= up_s + along_s + down_s:
-            return self.length, self.v_out
-        peak = self.peak
-        if t < up_s:
-            slope = math.copysign(self.acc, peak - self.v_in)
-            return self.v_in * t + 0.5 * slope * t * t, self.v_in + slope * t
-        if t >= up_s + along_s:
-            left = up_s + along_s + down_s - t
-            return self.length - self.v_out * left - 0.5 * self.acc * left * left, self.v_out + self.acc * left
-        return 0.5 * (self.v_in + peak) * up_s + peak * (t - up_s), peak
-
-    def _times(self) -> tuple[float, float, float]:
-        if not self.length:
-            return 0.0, 0.0, 0.0
-        peak = self.peak
-        up_s, down_s = abs(peak - self.v_in) / self.acc, (peak - self.v_out) / self.acc
-        along = self.length - 0.5 * (self.v_in + peak) * up_s - 0.5 * (self.v_out + peak) * down_s
-        return up_s, max(along, 0.0) / peak, down_s

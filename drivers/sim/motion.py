@@ -1,8 +1,8 @@
-"""The loopback arm's motion: one path of lines and rounded corners, travelled with trapezoidal speed.
+"""The loopback arm's motion: one path of lines and rounded corners by its length, and when the arm is where on it.
 
-The path is a list of pieces. The speed at each junction is as high as the pieces' limits allow: a backward pass makes
-sure that the arm can still slow down, a forward pass that it can be that fast. The path can be held and resumed, as a
-controller does. Lengths are in mm, speeds in mm/s; in rad and rad/s where a path is angular.
+A backward pass over the path finds how fast the arm may pass each junction so that it can still slow down, a forward
+pass how fast it can be there. The path can be held and resumed, as a controller does. Lengths are in mm, speeds in
+mm/s; in rad and rad/s where a path is angular.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from brushloop.drivers.sim.kinematics import (
     Joints,
     Line,
     Matrix,
-    Ramp,
     fixed,
     forward,
     inverse,
@@ -40,10 +39,10 @@ SAME_POSE_DEG = 1e-4
 SAME_JOINT_RAD = 1e-6
 RESTS_KEPT = 64
 SHORTEST_CUT = 1e-6
+CORNER_SHARE = 0.5
+"""Share of the acceleration that the bend of a corner may need; the rest is left for the speed along it."""
 SLACK = 1e-9
 """Tolerance for rounding of speeds."""
-REST = 1e-6
-"""A speed, in mm/s or rad/s, below which the arm rests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,70 +61,65 @@ class Move:
 
         `rests` is the number of its ends at rest. T(v) = length / v + rests v / (2 acc), solved for v.
         """
-        length, speed = self.path.length, self.speed * fraction
-        fastest = min(speed, math.sqrt(2.0 * self.acc * length / rests)) if rests else speed
-        if not length or self.duration_s <= length / fastest + 0.5 * rests * fastest / self.acc:
+        speed, duration_s = self.speed * fraction, self.duration_s
+        if not duration_s:
             return speed
-        if not rests:
-            return length / self.duration_s
-        lead = self.acc * self.duration_s
-        return (lead - math.sqrt(max(lead * lead - 2.0 * rests * self.acc * length, 0.0))) / rests
+        shorter_s2 = 2.0 * rests * self.path.length / self.acc
+        return min(speed, 2.0 * self.path.length / (duration_s + math.sqrt(max(duration_s**2 - shorter_s2, 0.0))))
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A stretch of the path between two junctions at which speeds are matched.
-
-    A corner belongs to the move that it leads into, and is taken at constant speed, as the bend needs all of the
-    acceleration; after a hold the arm speeds up within it.
-    """
+    """A stretch of the whole path; a corner belongs to the move that it leads into."""
 
     move: Move
     path: Line | JointLine | Corner
-    enter: float
-    """Distance along the path at which it was begun."""
+    start: float
+    """Where it begins, along the whole path."""
     begin: float
-    """Distance along the path at which its timing begins."""
+    """Where it begins, along its own path."""
     end: float
+    """Where it ends, along its own path."""
     cap: float
     acc: float
     rests: int = 2
-    even: bool = False
+    """Number of its ends at rest."""
+
+    @property
+    def stop(self) -> float:
+        """Where it ends, along the whole path."""
+        return self.start + self.end - self.begin
 
     @property
     def corner(self) -> bool:
         """Whether it joins two lines."""
         return isinstance(self.path, Corner)
 
-    @property
-    def length(self) -> float:
-        """What is left of it."""
-        return max(self.end - self.begin, 0.0)
+    def place(self, along: float) -> float:
+        """The distance along its own path."""
+        return self.end if along >= self.stop else self.begin + along - self.start
 
-    def joints(self, done: float) -> Joints | None:
-        """The joints at a distance along its path; None where the path is not given in joints."""
-        return self.path.joints(done) if isinstance(self.path, JointLine) else None
+    def pose(self, along: float) -> Pose:
+        """Where the tip is."""
+        return self.path.pose(self.place(along))
+
+    def joints(self, along: float) -> Joints | None:
+        """The joints; None where the path is not given in joints."""
+        return self.path.joints(self.place(along)) if isinstance(self.path, JointLine) else None
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
-    """A piece and its timing."""
+class Knot:
+    """When the arm is where along the whole path, and how fast; between two knots its acceleration is constant."""
 
-    piece: Piece
-    ramp: Ramp
-    begin_s: float
-    brakes: bool = False
-    """True for a piece that brakes for a stop or hold."""
+    at_s: float
+    along: float
+    speed: float
 
-    @property
-    def end_s(self) -> float:
-        """Time at which the piece ends."""
-        return self.begin_s + self.ramp.duration_s
-
-    def at(self, now_s: float) -> tuple[float, float]:
-        """(distance along the path, speed) at `now_s`."""
-        done, speed = self.ramp.at(now_s - self.begin_s)
-        return (self.piece.end if done >= self.ramp.length else self.piece.begin + done), speed
+    def then(self, along: float, speed: float) -> Knot:
+        """The knot that follows."""
+        way = max(along - self.along, 0.0)
+        return Knot(self.at_s + (2.0 * way / (self.speed + speed) if way else 0.0), along, speed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,57 +130,31 @@ class Rest:
     pose: Pose
 
 
-def timed(pieces: Sequence[Piece], v_in: float, begin_s: float) -> list[Segment] | None:
-    """The timing of pieces that are begun with `v_in` and end at rest; None if the arm could not slow down in time."""
-    if not pieces:
-        return []
-    caps = [p.cap for p in pieces]
-    for i in (i for i, p in enumerate(pieces) if p.corner):
-        caps[i] = min(caps[max(i - 1, 0) : i + 2])
-    speeds = [0.0] * (len(pieces) + 1)
+def timetable(pieces: Sequence[Piece], start: Knot) -> list[Knot] | None:
+    """The knots from `start`, in the first piece, to a rest at the end of the last; None if the arm is too fast."""
 
-    def reach(i: int, speed: float) -> float:
-        return speed if pieces[i].even else math.sqrt(speed * speed + 2.0 * pieces[i].acc * pieces[i].length)
+    def reach(piece: Piece, speed: float) -> float:
+        way = piece.stop - max(piece.start, start.along)
+        return math.sqrt(speed * speed + 2.0 * piece.acc * way)
 
+    leaving = [0.0] * len(pieces)
     for i in range(len(pieces) - 1, 0, -1):
-        rounded = pieces[i - 1].corner or pieces[i].corner
-        speeds[i] = min(caps[i - 1], caps[i], reach(i, speeds[i + 1])) if rounded else 0.0
-    if v_in > reach(0, speeds[1]) * (1.0 + SLACK) + SLACK:
+        before, piece = pieces[i - 1 : i + 1]
+        if before.corner or piece.corner:
+            leaving[i - 1] = min(before.cap, piece.cap, reach(piece, leaving[i]))
+    if start.speed > reach(pieces[0], leaving[0]) * (1.0 + SLACK) + SLACK:
         return None
-    speeds[0] = v_in
-    segments: list[Segment] = []
-    for i, piece in enumerate(pieces):
-        speeds[i + 1] = min(speeds[i + 1], reach(i, speeds[i]))
-        cap = min(caps[i], speeds[i]) if piece.even else caps[i]
-        segments.append(Segment(piece, Ramp(piece.length, cap, piece.acc, speeds[i], speeds[i + 1]), begin_s))
-        begin_s = segments[-1].end_s
-    return segments
-
-
-def joined(before: Sequence[Piece], move: Move, fraction: float) -> list[Piece]:
-    """The pieces with a move appended, and with a corner into it where the last one may be left before its end."""
-    last = before[-1] if before else None
-    cut = 0.0
-    match last.path if last else None, move.path:
-        case Line() as a, Line() as b if last and not a.angular and not b.angular and a.fix is b.fix:
-            cut = min(last.move.blend_mm, 0.5 * a.length, 0.5 * b.length, a.length - last.enter)
-            if cut > SHORTEST_CUT:
-                corner = Corner(a, b, cut)
-                acc = min(last.acc, move.acc)
-                # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
-                limit = math.sqrt(2.0 * cut * acc / max(corner.bend, 1e-12))
-                rests = 1 - (move.blend_mm > 0.0)
-                return [
-                    *before[:-1],
-                    replace(last, end=a.length - cut),
-                    Piece(move, corner, 0.0, 0.0, corner.length, limit, acc, even=True),
-                    Piece(move, b, cut, cut, b.length, move.paced(fraction, rests), move.acc, rests),
-                ]
-        case _:
-            pass
-    rests = 2 - (move.blend_mm > 0.0)
-    path = move.path
-    return [*before, Piece(move, path, 0.0, 0.0, path.length, move.paced(fraction, rests), move.acc, rests)]
+    knots = [start]
+    for piece, limit in zip(pieces, leaving, strict=True):
+        v_in, v_out = knots[-1].speed, min(limit, reach(piece, knots[-1].speed))
+        way = piece.stop - knots[-1].along
+        highest = math.sqrt(piece.acc * way + 0.5 * (v_in * v_in + v_out * v_out))
+        peak = max(min(piece.cap, highest), v_in, v_out)
+        up, down = ((peak * peak - v * v) / (2.0 * piece.acc) for v in (v_in, v_out))
+        knots.append(knots[-1].then(knots[-1].along + up, peak))
+        knots.append(knots[-1].then(piece.stop - down, peak))
+        knots.append(knots[-1].then(piece.stop, v_out))
+    return knots
 
 
 class MotionQueue:
@@ -205,13 +173,14 @@ class MotionQueue:
         """The last known joints, from which inverse kinematics starts."""
         self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
         """The newest places and times at which the arm came to rest."""
-        self._segments: list[Segment] = []
-        self._held: list[Piece] | None = None
-        """What is left of the path between `hold` and `resume`."""
+        self.held = False
+        """True between `hold` and `resume`, even if nothing was moving."""
+        self._pieces: list[Piece] = []
+        self._knots = [Knot(-1.0, 0.0, 0.0)]
+        """From the last one passed on; the last is a rest, at the end of the path unless it is held."""
         self._solved: tuple[Pose, Joints] | None = None
         """The last pose whose joints were found, and the joints."""
         self._rest = home
-        self._rest_since_s = -1.0
         self._on_path = on_path
         self._capacity = capacity
         self._next_id = 0
@@ -223,14 +192,8 @@ class MotionQueue:
 
     @property
     def size(self) -> int:
-        """Number of moves queued, running or held; one that decelerates into a stop or a hold counts once."""
-        pieces = [s.piece for s in self._segments] if self._held is None else self._held
-        return len({piece.move.ident for piece in pieces})
-
-    @property
-    def held(self) -> bool:
-        """True between `hold` and `resume`, even if nothing was moving."""
-        return self._held is not None
+        """Number of moves queued, running or held."""
+        return len({piece.move.ident for piece in self._pieces})
 
     def add(
         self,
@@ -262,35 +225,48 @@ class MotionQueue:
         self.advance(now_s)
         target = pose_of(forward(joints) @ self.tool)
         travel_mm, turn_deg = distance(self._last(), target)
-        idle = not self._segments and not self._held
         turned = max(abs(a - b) for a, b in zip(joints, self.near, strict=True))
-        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and (not idle or turned <= SAME_JOINT_RAD):
+        same_joints = bool(self._pieces) or turned <= SAME_JOINT_RAD
+        if travel_mm <= SAME_POSE_MM and turn_deg <= SAME_POSE_DEG and same_joints:
             return False
-        last = self._last_piece()
-        start = (last.joints(last.end) if last else None) or self.near_joints(self._last())
+        last = self._pieces[-1] if self._pieces else None
+        start = (last.joints(last.stop) if last else None) or self.near_joints(self._last())
         self._append(Move(self._next_id, JointLine(start, joints, self.tool), speed_rad_s, acc_rad_s2, least_s), now_s)
         return True
 
     def advance(self, now_s: float) -> None:
         """Retire every piece that is over by `now_s`."""
-        while self._segments and self._segments[0].end_s <= now_s:
-            self._finish(self._segments.pop(0))
+        while len(self._knots) > 1 and self._knots[1].at_s <= now_s:
+            self._knots.pop(0)
+            self._retire(self._knots[0].along)
+            if self._knots[0].speed == 0.0:
+                self.rests.append(Rest(self._knots[0].at_s, self._tip(self._knots[0])))
+        self._retire(self._at(now_s).along)
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
-        """Decelerate along the path and forget the rest, held or not; a second stop changes nothing."""
+        """Decelerate along the path and forget the rest, held or not."""
         self._brake(acc_mm_s2, acc_rad_s2, now_s)
-        self._held = None
+        self.held, rest = False, self._knots[-1].along
+        self._pieces = [
+            replace(piece, move=replace(piece.move, blend_mm=0.0), end=piece.place(rest))
+            for piece in self._pieces
+            if piece.start < rest
+        ]
+        self.advance(now_s)
 
     def hold(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
         """Decelerate on the path and keep it; `exec_id` stays that of the move in which the arm comes to rest."""
-        if self._held is None:
-            self._held = self._brake(acc_mm_s2, acc_rad_s2, now_s)
+        if not self.held:
+            self._brake(acc_mm_s2, acc_rad_s2, now_s)
+            self.held = True
 
     def resume(self, now_s: float) -> None:
         """Resume the path that was held, from where the arm came to rest."""
         self.advance(now_s)
-        held, self._held = self._held, None
-        self._segments += timed(held or [], 0.0, self._end_s(now_s)) or []
+        self.held, rest = False, self._knots[-1]
+        left = [piece for piece in self._pieces if piece.stop > rest.along]
+        if left:
+            self._go_on(left, now_s)
 
     def set_fraction(self, fraction: float, now_s: float) -> None:
         """Run every move that has not begun at this share of its speed, 0 to 1.
@@ -299,38 +275,38 @@ class MotionQueue:
         """
         self.fraction = fraction
         begun = self.exec_id(now_s)
-
-        def slowed(piece: Piece) -> Piece:
-            if piece.corner or piece.move.ident == begun:
-                return piece
-            return replace(piece, cap=piece.move.paced(fraction, piece.rests))
-
-        self._held = None if self._held is None else [slowed(piece) for piece in self._held]
-        self._retime([slowed(s.piece) for s in self._segments if not s.brakes], now_s)
+        slowed = [
+            piece
+            if piece.corner or piece.move.ident == begun
+            else replace(piece, cap=piece.move.paced(fraction, piece.rests))
+            for piece in self._pieces
+        ]
+        if slowed == self._pieces:
+            return
+        knots = self._knots if self.held else timetable(slowed, self._at(now_s))
+        if knots is not None:
+            self._pieces, self._knots = slowed, knots
 
     def pose(self, now_s: float) -> Pose:
         """Where the tip is."""
         self.advance(now_s)
-        return self._segments[0].piece.path.pose(self._segments[0].at(now_s)[0]) if self._segments else self._rest
+        return self._tip(self._at(now_s))
 
     def target(self, now_s: float) -> Pose | None:
         """End of the piece of the path that is being travelled; None at rest."""
         self.advance(now_s)
-        return self._segments[0].piece.path.pose(self._segments[0].piece.end) if self._segments else None
+        return self._pieces[0].pose(self._pieces[0].stop) if len(self._knots) > 1 else None
 
     def exec_id(self, now_s: float) -> int:
         """Id of the running move, or of the one that is held; -1 when there is none. A corner belongs to the move that
         it leads into."""
         self.advance(now_s)
-        if self._segments:
-            return self._segments[0].piece.move.ident
-        return self._held[0].move.ident if self._held else -1
+        return self._pieces[0].move.ident if self._pieces else -1
 
     def joints(self, now_s: float) -> Joints:
         """Joint positions for the present pose of the tip."""
         self.advance(now_s)
-        segment = self._segments[0] if self._segments else None
-        exact = segment.piece.joints(segment.at(now_s)[0]) if segment else None
+        exact = self._pieces[0].joints(self._at(now_s).along) if self._pieces else None
         return exact or self.near_joints(self.pose(now_s))
 
     def near_joints(self, tip: Pose) -> Joints:
@@ -341,89 +317,91 @@ class MotionQueue:
         return self.near
 
     def steady(self, now_s: float) -> bool:
-        """True once the queue has been empty for `STEADY_LAG_S`."""
+        """True once the arm has been at rest for `STEADY_LAG_S`."""
         self.advance(now_s)
-        return not self._segments and now_s - self._rest_since_s >= STEADY_LAG_S
+        return len(self._knots) == 1 and now_s - self._knots[0].at_s >= STEADY_LAG_S
 
-    def _finish(self, segment: Segment) -> None:
-        piece = segment.piece
-        length = piece.end - piece.enter
-        places = [piece.path.pose(piece.enter + length * k / piece.path.stretches) for k in range(piece.path.stretches)]
-        places.append(piece.path.pose(piece.end))
-        self._rest, self._rest_since_s = places[-1], segment.end_s
-        self.near = piece.joints(piece.end) or self.near
-        if segment.ramp.v_out == 0.0:
-            self.rests.append(Rest(segment.end_s, places[-1]))
-        if length > 0.0:
-            for start, end in itertools.pairwise(places):
-                self._on_path(start, end)
+    def _at(self, now_s: float) -> Knot:
+        """Where the arm is, once the knots that are over have been retired."""
+        knot = self._knots[0]
+        if len(self._knots) == 1 or now_s <= knot.at_s:
+            return knot
+        passed_s, whole_s = now_s - knot.at_s, self._knots[1].at_s - knot.at_s
+        speed = knot.speed + (self._knots[1].speed - knot.speed) * passed_s / whole_s
+        return Knot(now_s, knot.along + 0.5 * (knot.speed + speed) * passed_s, speed)
 
-    def _last_piece(self) -> Piece | None:
-        return (self._held or [s.piece for s in self._segments] or [None])[-1]
+    def _tip(self, knot: Knot) -> Pose:
+        begun = bool(self._pieces) and knot.along > self._pieces[0].start
+        return self._pieces[0].pose(knot.along) if begun else self._rest
 
     def _last(self) -> Pose:
         """Where the last accepted move ends."""
-        last = self._last_piece()
-        return self._rest if last is None else last.path.pose(last.end)
+        return self._pieces[-1].pose(self._pieces[-1].stop) if self._pieces else self._rest
 
-    def _end_s(self, now_s: float) -> float:
-        return self._segments[-1].end_s if self._segments else now_s
+    def _retire(self, along: float) -> None:
+        """Report the pieces that end no farther than `along`."""
+        while self._pieces and self._pieces[0].stop <= along:
+            piece = self._pieces.pop(0)
+            length, count = piece.end - piece.begin, piece.path.stretches
+            places = [piece.path.pose(piece.begin + length * k / count) for k in range(count)]
+            places.append(piece.path.pose(piece.end))
+            self._rest = places[-1]
+            self.near = piece.joints(piece.stop) or self.near
+            for start, end in itertools.pairwise(places if length > 0.0 else ()):
+                self._on_path(start, end)
 
     def _append(self, move: Move, now_s: float) -> None:
         self._next_id += 1
-        if self._held is not None:
-            self._held = joined(self._held, move, self.fraction)
-            return
-        free = [s.piece for s in self._segments if not s.brakes]
-        pieces = joined(free, move, self.fraction)
-        if len(pieces) == len(free) + 1 or not self._retime(pieces, now_s):
-            # it begins at rest: the moves before it stay as they are
-            alone = joined([], move, self.fraction)
-            self._segments += timed(alone, 0.0, self._end_s(now_s)) or []
+        here = self._knots[-1] if self.held else self._at(now_s)
+        rounded = self._rounded(move, here.along)
+        if rounded is not None:
+            knots = self._knots if self.held else timetable(rounded, here)
+            if knots is not None:
+                self._pieces, self._knots = rounded, knots
+                return
+        # it begins at rest: the moves before it stay as they are
+        start, rests = (self._pieces[-1].stop if self._pieces else here.along), 2 - (move.blend_mm > 0.0)
+        piece = Piece(move, move.path, start, 0.0, move.path.length, move.paced(self.fraction, rests), move.acc, rests)
+        self._pieces.append(piece)
+        if not self.held:
+            self._go_on([piece], now_s)
 
-    def _retime(self, pieces: list[Piece], now_s: float) -> bool:
-        """Time the pieces anew from where the arm is; False, and no change, if it could not follow."""
-        braking = [s for s in self._segments if s.brakes]
-        begin_s, speed = (braking[-1].end_s if braking else now_s), 0.0
-        if self._segments and not braking:
-            done, speed = self._segments[0].at(now_s)
-            if done > pieces[0].end:
-                return False
-            pieces = [replace(pieces[0], begin=done), *pieces[1:]]
-        segments = timed(pieces, speed, begin_s)
-        if segments is None:
-            return False
-        self._segments = [*braking, *segments]
-        return True
+    def _go_on(self, pieces: Sequence[Piece], now_s: float) -> None:
+        """Travel the pieces from the rest in which the timetable ends."""
+        rest = self._knots[-1]
+        self._knots[-1:] = timetable(pieces, Knot(max(rest.at_s, now_s), rest.along, 0.0)) or [rest]
 
-    def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> list[Piece]:
-        """Come to rest on the path; return what is left of it, from there on."""
+    def _rounded(self, move: Move, along: float) -> list[Piece] | None:
+        """The path with a move appended, and with a corner into it; None where the last move ends at rest.
+
+        The corner has to begin beyond `along`.
+        """
+        match self._pieces and self._pieces[-1].path, move.path:
+            case Line() as a, Line() as b if not a.angular and not b.angular and a.fix is b.fix:
+                last = self._pieces[-1]
+                cut = min(last.move.blend_mm, 0.5 * a.length, 0.5 * b.length)
+            case _:
+                return None
+        if cut <= SHORTEST_CUT or last.stop - cut < along:
+            return None
+        corner, acc = Corner(a, b, cut), min(last.acc, move.acc)
+        # the speed bends by `bend` v within 2 cut / v: an acceleration of v^2 bend / (2 cut)
+        limit = math.sqrt(2.0 * cut * CORNER_SHARE * acc / max(corner.bend, 1e-12))
+        before = replace(last, end=a.length - cut)
+        rests = 1 - (move.blend_mm > 0.0)
+        speed = move.paced(self.fraction, rests)
+        cap = min(limit, last.cap, speed)
+        bent = Piece(move, corner, before.stop, 0.0, corner.length, cap, (1.0 - CORNER_SHARE) * acc)
+        after = Piece(move, b, bent.stop, cut, b.length, speed, move.acc, rests)
+        return [*self._pieces[:-1], before, bent, after]
+
+    def _brake(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
+        """Come to rest on the path, never farther than the arm would have gone."""
         self.advance(now_s)
-        free = [s for s in self._segments if not s.brakes]
-        left_over = [s.piece for s in free]
-        self._segments = [s for s in self._segments if s.brakes]
-        if self._segments or not free:
-            return left_over
-        done, speed = free[0].at(now_s)
-        left_over[0] = replace(left_over[0], begin=done)
-        running = next(i for i, s in enumerate(free) if s.ramp.v_out == 0.0) + 1
-        left = sum(piece.length for piece in left_over[:running])
-        acc = acc_rad_s2 if left_over[0].path.angular else acc_mm_s2
-        acc = max(acc, speed * speed / (2.0 * left) if left > 0.0 else 0.0)  # never farther than it would have gone
-        while speed > REST and running:
-            piece = left_over.pop(0)
-            running -= 1
-            stretch = min(speed * speed / (2.0 * acc), piece.length)
-            after = math.sqrt(max(speed * speed - 2.0 * acc * stretch, 0.0))
-            after = after if after > REST else 0.0
-            rest = piece.begin + stretch
-            ramp = Ramp(stretch, speed, acc, speed, after)
-            self._segments.append(Segment(replace(piece, end=rest), ramp, self._end_s(now_s), brakes=True))
-            speed = after
-            if not after:
-                left_over.insert(0, replace(piece, enter=rest, begin=rest))
-        # from a rest in a corner, or just before one, the arm speeds up within it
-        first = next((i for i, p in enumerate(left_over[:2]) if p.corner), None)
-        if first is not None:
-            left_over[first] = replace(left_over[first], even=False)
-        return left_over
+        if len(self._knots) == 1:
+            return
+        here, rest = self._at(now_s), next(knot for knot in self._knots[1:] if knot.speed == 0.0)
+        acc = acc_rad_s2 if self._pieces[0].path.angular else acc_mm_s2
+        self._knots = [here]
+        if here.speed > 0.0:
+            self._knots.append(here.then(min(here.along + here.speed**2 / (2.0 * acc), rest.along), 0.0))

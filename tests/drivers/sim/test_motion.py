@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
-from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, Ramp, forward, inverse, matrix_of, pose_of
+from brushloop.drivers.sim.kinematics import HOME, LIMITS_DEG, forward, inverse, matrix_of, pose_of
 from brushloop.drivers.sim.motion import STEADY_LAG_S, MotionQueue
 
 TOOL = np.eye(4)
@@ -71,12 +71,9 @@ def x_mm(queue: MotionQueue, now_s: float) -> float:
     return queue.pose(now_s).x_mm
 
 
-def test_a_long_way_is_a_trapezoid():
-    ramp = Ramp(length=100.0, speed=50.0, acc=100.0)
-    assert ramp.peak == 50.0
-    assert ramp.duration_s == pytest.approx(100.0 / 50.0 + 50.0 / 100.0)
-    assert ramp.at(0.5) == (pytest.approx(12.5), pytest.approx(50.0))
-    assert ramp.at(1.25) == (pytest.approx(50.0), pytest.approx(50.0))
+def test_a_long_way_is_a_trapezoid(queue: MotionQueue):
+    queue.add(at(100.0), 50.0, 100.0, now_s=0.0)
+    assert [x_mm(queue, t) for t in (0.5, 1.25, 2.5)] == pytest.approx([12.5, 50.0, 100.0])
 
 
 def test_lines_run_in_the_order_in_which_they_came_and_have_rising_ids(
@@ -225,7 +222,7 @@ def test_no_way_is_taken_faster_or_harder_than_allowed_and_all_of_them_arrive(
     for x, y, blend, v in way:
         queue.add(at(x, y), v, A, 0.0, blend_mm=blend)
     fastest = max(v for *_, v in way)
-    end_s = queue._segments[-1].end_s if queue._segments else 0.0
+    end_s = max(queue._knots[-1].at_s, 0.0)
     coarse_s = 4 * DT_S
     walk = walked(queue, end_s + 0.1, coarse_s)
     moving = speeds(walk, coarse_s)
@@ -308,7 +305,7 @@ def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
         assert np.linalg.norm(free[:, 1:] - point, axis=1).min() < 0.4
     queue.advance(20.0)
     assert queue.exec_id(20.0) == -1
-    assert queue._segments == []
+    assert queue.size == 0
     for (_, a), (b, _) in itertools.pairwise(recorded.stretches):
         assert distance(a, b)[0] < 1e-6
 
@@ -341,6 +338,8 @@ def test_a_move_in_joints_is_not_rounded():
     first, second = (0.4, *HOME[1:]), (0.8, *HOME[1:])
     queue.add_joints(first, 0.5, 2.0, 0.0, 0.0)
     queue.add_joints(second, 0.5, 2.0, 0.0, 0.0)
-    assert [segment.ramp.v_out for segment in queue._segments] == [0.0, 0.0]
-    assert queue.joints(queue._segments[0].end_s - 1e-9) == pytest.approx(first)
-    assert not any(segment.piece.corner for segment in queue._segments)
+    for now_s in np.arange(0.0, 5.0, 0.1):
+        queue.advance(now_s)
+    between, end = queue.rests
+    assert between.pose == pose_of(forward(first))
+    assert end.pose == pose_of(forward(second))
