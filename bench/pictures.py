@@ -43,7 +43,7 @@ from brushloop.collect.tui.teach_guide import ScreenGuide
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.lab.lab import UnknownLab
+from brushloop.drivers.sim.lab import UnknownLab
 from brushloop.drivers.sim.rig import LoopbackRig
 
 FOLDER = ROOT / "docs" / "screens"

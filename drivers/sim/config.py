@@ -49,6 +49,15 @@ class Table:
         yaw = math.radians(self.yaw_deg)
         return math.cos(yaw) * dx + math.sin(yaw) * dy, -math.sin(yaw) * dx + math.cos(yaw) * dy
 
+    def to_base(self, x_mm: float, y_mm: float, above_mm: float = 0.0) -> tuple[float, float, float]:
+        """A point of the paper frame, `above_mm` above the sheet, in the base frame."""
+        yaw = math.radians(self.yaw_deg)
+        return (
+            self.origin_mm[0] + math.cos(yaw) * x_mm - math.sin(yaw) * y_mm,
+            self.origin_mm[1] + math.sin(yaw) * x_mm + math.cos(yaw) * y_mm,
+            self.surface_z_mm(x_mm, y_mm) + above_mm,
+        )
+
     def surface_z_mm(self, x_mm: float, y_mm: float) -> float:
         """Height of the sheet at a point of the paper frame, in the base frame."""
         nx, ny, nz = self.normal
@@ -106,8 +115,6 @@ class View:
     """Real seconds that a picture waits before it is sent, on top of drawing and coding it."""
     delay_jitter_s: float = 0.0
     """Largest random extra delay; pictures never overtake each other."""
-    delay_drift: float = 0.0
-    """Seconds by which the delay grows in each second of the stream."""
     stamp_strip: bool = False
     """Draw the host time into the top rows, for tests of `fresh(after)`."""
 

@@ -11,13 +11,14 @@ import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.sim.brush.spec import complaint
 from brushloop.drivers.sim.world import World
@@ -116,11 +117,15 @@ LOST = frozenset({"deaf"})
 """The request never arrives: it is neither carried out nor answered."""
 REPLIES = frozenset({"mute", "late", "split", "duplicate", "wrong-id", "malformed", "garbage", "drop"})
 """The request is carried out; something is wrong with its reply."""
-STOPS = frozenset({"protective-stop", "emergency-stop", "safeguard-stop"})
+STOPS = {
+    "protective-stop": SafetyMode.PROTECTIVE_STOP,
+    "emergency-stop": SafetyMode.ROBOT_EMERGENCY_STOP,
+    "safeguard-stop": SafetyMode.SAFEGUARD_STOP,
+}
 """The cabinet stops the arm by itself; only a person ends that."""
 
 KINDS: dict[Device, frozenset[str]] = {
-    Device.ROBOT: LOST | REPLIES | STOPS,
+    Device.ROBOT: LOST | REPLIES | STOPS.keys(),
     Device.TELEMETRY: frozenset({"mute", "late"}),
     Device.CAMERA: frozenset({"stale", "black", "frozen", "torn"}),
     Device.INK: frozenset({"deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo", "unplug"}),
@@ -176,11 +181,6 @@ class Fault(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
         """True if it begins without a request."""
         return self.device is Device.INK or (self.kind in STOPS and self.on is None)
 
-    @property
-    def strikes(self) -> int | None:
-        """Number of strikes; None where `for_s` ends it."""
-        return None if self.for_s is not None else self.count or 1
-
     def matches(self, op: str) -> bool:
         """Whether the fault waits for `op`, a method's full name."""
         return self.on is None or op == self.on or op.endswith(f".{self.on}")
@@ -212,8 +212,8 @@ class Hung:
     seen: int = 0
     """Requests that matched before it began."""
     struck: int = 0
-    until_s: float | None = None
-    """Real time at which `for_s` is over; None before it begins."""
+    until_s: float = math.inf
+    """Real time at which `for_s` is over, once it has begun."""
 
 
 class FaultBoard:
@@ -253,34 +253,35 @@ class FaultBoard:
     @property
     def hanging(self) -> tuple[Hung, ...]:
         """Faults that are waiting or active."""
-        self._expire()
+        for hung in tuple(self._hanging.values()):
+            if self._real_s() >= hung.until_s:
+                self._end(hung)
         return tuple(self._hanging.values())
 
-    @property
-    def waits_by_itself(self) -> bool:
-        """True while a fault waits that no request triggers: `due` must be polled."""
-        return any(hung.fault.by_itself and not hung.begun for hung in tuple(self._hanging.values()))
+    def meet(self, device: Device, op: str = "", kinds: Set[str] | None = None) -> Fault | None:
+        """The fault that strikes this request, push, frame or round of a device; it counts as one strike.
 
-    def meet(self, device: Device, op: str, kinds: frozenset[str]) -> Fault | None:
-        """The fault, of these kinds, that strikes this request, push or frame; it counts as one strike."""
+        With `kinds`, only faults of these kinds.
+        """
         for hung in self.hanging:
             fault = hung.fault
-            if fault.device is device and fault.kind in kinds and self._strikes(hung, op):
+            if fault.device is not device or not fault.matches(op) or fault.kind not in (kinds or KINDS[device]):
+                continue
+            if not hung.begun and not fault.by_itself and self._holds(fault):
+                hung.seen += 1
+                if hung.seen >= fault.nth:
+                    self._begin(hung)
+            if hung.begun:
+                self._strike(hung)
                 return fault
         return None
 
-    def kind(self, device: Device) -> str | None:
-        """The kind of the fault that strikes this request to a device, or its round; None for a sound one."""
-        fault = self.meet(device, "", KINDS[device])
-        return None if fault is None else fault.kind
-
-    async def watch(self, stop: Callable[[str], None]) -> None:
-        """Begin faults that no request triggers, until cancelled; `stop` gets the kind of each safety stop."""
+    async def watch(self, stop: Callable[[SafetyMode], None]) -> None:
+        """Begin faults that no request triggers, until cancelled; `stop` gets the mode of each safety stop."""
         while True:
-            waits = self.waits_by_itself
-            for fault in self.due() if waits else ():
-                stop(fault.kind)
-            await asyncio.sleep(TICK_S if waits else IDLE_TICK_S)
+            for fault in self.due():
+                stop(STOPS[fault.kind])
+            await asyncio.sleep(TICK_S if self._hanging else IDLE_TICK_S)
 
     def due(self) -> list[Fault]:
         """Begin the faults that are due now without a request; return the stops among them, which are finished."""
@@ -289,31 +290,19 @@ class FaultBoard:
             if hung.fault.by_itself and not hung.begun and self._holds(hung.fault):
                 self._begin(hung)
                 if hung.fault.kind in STOPS:
-                    hung.struck = 1
-                    self._end(hung)
+                    self._strike(hung)
                     stops.append(hung.fault)
         return stops
-
-    def _strikes(self, hung: Hung, op: str) -> bool:
-        fault = hung.fault
-        if not fault.matches(op):
-            return False
-        if not hung.begun:
-            if fault.by_itself or not self._holds(fault):
-                return False
-            hung.seen += 1
-            if hung.seen < fault.nth:
-                return False
-            self._begin(hung)
-        hung.struck += 1
-        if fault.strikes is not None and hung.struck >= fault.strikes:
-            self._end(hung)
-        return True
 
     def _begin(self, hung: Hung) -> None:
         hung.begun = True
         if hung.fault.for_s is not None:
             hung.until_s = self._real_s() + hung.fault.for_s
+
+    def _strike(self, hung: Hung) -> None:
+        hung.struck += 1
+        if hung.fault.for_s is None and hung.struck >= (hung.fault.count or 1):
+            self._end(hung)
 
     def _holds(self, fault: Fault) -> bool:
         truth = self.truth
@@ -322,11 +311,6 @@ class FaultBoard:
             and (fault.press is None or truth.presses == fault.press)
             and (fault.phase is None or truth.phase() is fault.phase)
         )
-
-    def _expire(self) -> None:
-        for hung in tuple(self._hanging.values()):
-            if hung.until_s is not None and self._real_s() >= hung.until_s:
-                self._end(hung)
 
     def _end(self, hung: Hung) -> None:
         if self.take(hung.ident):

@@ -16,16 +16,18 @@ from brushloop.drivers.camera.source import LOOPBACK_SERVER
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.config import View
-from brushloop.drivers.sim.faults import KINDS, Device, FaultBoard
+from brushloop.drivers.sim.faults import Device, FaultBoard
 from brushloop.drivers.sim.scene import NOISE_FIELDS, Scene, Wall
 
 NOISE_LEVELS = 6
 """Number of gray levels of a covered sensor, which is not quite black."""
 
 
-def dark(shape: tuple[int, ...], seed: int) -> NDArray[np.uint8]:
-    """An image of this shape as taken with the lens cap on."""
-    return np.random.default_rng(seed).integers(0, NOISE_LEVELS, shape, np.uint8)
+def black(jpeg: bytes) -> bytes:
+    """A picture of the same size as taken with the lens cap on, other than the one before."""
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return cv2.imencode(".jpg", np.random.default_rng().integers(0, NOISE_LEVELS, image.shape, np.uint8))[1].tobytes()
 
 
 def renumbered(jpeg: bytes, number: int) -> bytes:
@@ -40,7 +42,7 @@ def torn(jpeg: bytes) -> bytes:
     return jpeg[: len(jpeg) // 2] + b"\xff\xd9"
 
 
-SPOILED: dict[str, Callable[[bytes], bytes]] = {"torn": torn}
+SPOILED: dict[str, Callable[[bytes], bytes]] = {"black": black, "torn": torn}
 """Faults of a single picture: JPEG in, JPEG out."""
 BOUNDARY = "brushloop"
 NEXT_S = 1e-6
@@ -56,7 +58,7 @@ class _Line:
         self._view = view
         self._writer = writer
         self._loop = asyncio.get_running_loop()
-        self._began_s = self._last_s = self._exposed_s = self._loop.time()
+        self._last_s = self._exposed_s = self._loop.time()
         self._random = random.Random(0)
 
     def exposed(self) -> None:
@@ -65,8 +67,8 @@ class _Line:
 
     async def send(self, data: bytes) -> None:
         """Send now, or as soon as it is due."""
-        view, now_s = self._view, self._loop.time()
-        late_s = view.delay_s + view.delay_jitter_s * self._random.random() + view.delay_drift * (now_s - self._began_s)
+        view = self._view
+        late_s = view.delay_s + view.delay_jitter_s * self._random.random()
         if late_s <= 0.0:
             self._writer.write(data)
             await self._writer.drain()
@@ -85,7 +87,7 @@ class _Line:
 class MjpegServer(LoopbackServer):
     """Serves `/stream.mjpg`. A client that reads too slowly is sent the newest image next, never a backlog."""
 
-    def __init__(self, scene: Scene | Wall, view: View) -> None:
+    def __init__(self, scene: Scene | Wall, view: View, faults: FaultBoard | None = None) -> None:
         """`view` gives the rate, the delay and the JPEG quality of the pictures."""
         super().__init__()
         self._scene = scene
@@ -95,8 +97,7 @@ class MjpegServer(LoopbackServer):
         self._rendering = asyncio.Lock()
         self._coded: deque[tuple[NDArray[np.uint8], bytes]] = deque(maxlen=NOISE_FIELDS)
         """The newest images of the scene and their JPEGs, reused while nothing changes."""
-        self.faults: FaultBoard | None = None
-        """Faults of this server; a rig shares one board among all its servers."""
+        self._faults = faults
 
     def show(self, scene: Scene | Wall, view: View) -> None:
         """Look at something else, with other settings. Every stream begins again, as when a camera is set up again."""
@@ -123,27 +124,18 @@ class MjpegServer(LoopbackServer):
         held: deque[bytes] = deque(maxlen=BACKLOG)
         shown = b""
         while True:
-            match self._fault():
-                case "stale":
-                    held.append(await self._jpeg(line))
-                case "black":
-                    held.append(await self._jpeg(line, black=True))
-                    shown = await self._send(held, line)
-                case "frozen":
-                    held.append(renumbered(shown or await self._jpeg(line), time.time_ns()))
-                    shown = await self._send(held, line)
-                case kind if kind in SPOILED:
-                    held.append(SPOILED[kind](await self._jpeg(line)))
-                    await self._send(held, line)
-                case _:
-                    held.append(await self._jpeg(line))
-                    shown = await self._send(held, line)
+            fault = self._faults.meet(Device.CAMERA) if self._faults is not None else None
+            kind = "" if fault is None else fault.kind
+            if kind == "frozen":
+                held.append(renumbered(shown or await self._jpeg(line), time.time_ns()))
+            else:
+                jpeg = await self._jpeg(line)
+                held.append(SPOILED[kind](jpeg) if kind in SPOILED else jpeg)
+            if kind != "stale":
+                sent = await self._send(held, line)
+                shown = shown if kind in SPOILED else sent
             due = max(due + self._period_s, loop.time())
             await asyncio.sleep(due - loop.time())
-
-    def _fault(self) -> str:
-        fault = self.faults.meet(Device.CAMERA, "frame", KINDS[Device.CAMERA]) if self.faults is not None else None
-        return fault.kind if fault is not None else ""
 
     async def _send(self, held: deque[bytes], line: _Line) -> bytes:
         """Send everything that is held, oldest first; return the last image."""
@@ -154,18 +146,16 @@ class MjpegServer(LoopbackServer):
             await line.send(head.encode() + image + b"\r\n")
         return image
 
-    async def _jpeg(self, line: _Line, *, black: bool = False) -> bytes:
+    async def _jpeg(self, line: _Line) -> bytes:
         async with self._rendering:  # the scene keeps a cache: one thread at a time
             # Read the time first, so that no frame shows anything older than its stamp. Read the tool here, because
             # the motion queue belongs to the event loop's thread.
             host_ns, tool = time.time_ns(), self._scene.tool()
             line.exposed()
-            return await asyncio.to_thread(self._encode, host_ns, tool, black)
+            return await asyncio.to_thread(self._encode, host_ns, tool)
 
-    def _encode(self, host_ns: int, tool: Pose, black: bool) -> bytes:
+    def _encode(self, host_ns: int, tool: Pose) -> bytes:
         image: NDArray[np.uint8] = self._scene.render(host_ns, tool)
-        if black:
-            image = dark(image.shape, host_ns)
         for coded, data in self._coded:
             if coded is image:
                 return data

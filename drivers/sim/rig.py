@@ -12,7 +12,7 @@ from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
 from brushloop.drivers.geometry import columns, inverse, of_angles, product
 from brushloop.drivers.ink.simulator import Instrument, PtyLine, PumpFirmware, StationFirmware
-from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, FaultBoard, Truth
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
@@ -166,22 +166,26 @@ class LoopbackRig:
         self.config = config
         self._host = host
         self.world = World(config)
-        self.arcs = ArcsServer(self.world)
-        self.rtde = RtdeServer(self.arcs.cabinet)
-        self.scene = Scene(self.world)
-        """What the camera looks at."""
-        self.camera = MjpegServer(self.scene, config.view)
         self.force = _force(self.world) if config.force_sensor else None
         self.ink = None if config.ink_device == "none" else PtyLine(_ink(self.world, config.ink_device))
         missing = {Device.INK: self.ink, Device.FORCE: self.force}
         self.faults = FaultBoard(Truth(self.world), [device for device, server in missing.items() if server is None])
         """One board for all servers."""
-        self.arcs.faults = self.rtde.faults = self.camera.faults = self.faults
+        self.arcs = ArcsServer(self.world, self.faults)
+        self.rtde = RtdeServer(self.arcs.cabinet, self.faults)
+        self.scene = Scene(self.world)
+        """What the camera looks at."""
+        self.camera = MjpegServer(self.scene, config.view, self.faults)
         if self.ink is not None:
-            self.ink.next_fault = lambda: self.faults.kind(Device.INK)
+            self.ink.next_fault = lambda: self._fault_of(Device.INK)
         if self.force is not None:
-            self.force.board.next_fault = lambda: self.faults.kind(Device.FORCE)
+            self.force.board.next_fault = lambda: self._fault_of(Device.FORCE)
         self._watching: asyncio.Task[None] | None = None
+
+    def _fault_of(self, device: Device) -> str | None:
+        """The kind of the fault that strikes a request to a device, or its round."""
+        fault = self.faults.meet(device)
+        return None if fault is None else fault.kind
 
     async def __aenter__(self) -> LoopbackRig:
         try:
@@ -193,7 +197,7 @@ class LoopbackRig:
                 await self.force.start(self._host, self.config.force_port)
             if self.ink is not None:
                 self.ink.__enter__()
-            self._watching = asyncio.create_task(self.faults.watch(self.arcs.stop_as), name="faults")
+            self._watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
         except BaseException:
             await self.__aexit__()
             raise

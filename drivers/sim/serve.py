@@ -241,9 +241,9 @@ def serve_unknown(
 
     Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
     """
-    from brushloop.drivers.sim.lab.facts import Trap
-    from brushloop.drivers.sim.lab.lab import UnknownLab
-    from brushloop.drivers.sim.lab.lab import truth as truth_of
+    from brushloop.drivers.sim.lab import UnknownLab
+    from brushloop.drivers.sim.lab_facts import Trap
+    from brushloop.drivers.sim.lab_facts import truth as truth_of
 
     if trap is not None and trap not in [*Trap]:
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")

@@ -19,7 +19,7 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import DeviceError, LimitExceeded
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST, Addresses, rig_toml
 from brushloop.drivers.sim.world import World

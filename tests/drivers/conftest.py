@@ -9,7 +9,7 @@ import pytest
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import HOST
 from brushloop.drivers.sim.world import World

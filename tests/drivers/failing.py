@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from brushloop.drivers.force.simulator import ForceBoard
 from brushloop.drivers.ink.simulator import PtyLine
-from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 
 

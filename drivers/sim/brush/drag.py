@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import cv2
@@ -149,13 +149,8 @@ class Stances:
 
 def _between(a: SpineShape, b: SpineShape, share: float) -> SpineShape:
     """The spine a share of the way from one to the other."""
-    return SpineShape(
-        x_mm=a.x_mm + share * (b.x_mm - a.x_mm),
-        z_mm=a.z_mm + share * (b.z_mm - a.z_mm),
-        phi_rad=a.phi_rad + share * (b.phi_rad - a.phi_rad),
-        squash_mm=a.squash_mm + share * (b.squash_mm - a.squash_mm),
-        normal_n=a.normal_n + share * (b.normal_n - a.normal_n),
-    )
+    pairs = ((getattr(a, field.name), getattr(b, field.name)) for field in fields(SpineShape))
+    return SpineShape(*(near + share * (far - near) for near, far in pairs))
 
 
 def middle_mm(shape: SpineShape) -> float:

@@ -19,7 +19,7 @@ from brushloop.collect.rig.devices import Rig, limits_of, make_robot
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World

@@ -22,7 +22,7 @@ from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.errors import ConnectionLost, ProtocolViolation
 from brushloop.drivers.geometry import brush_pose, from_wire
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.kinematics import inverted, matrix_of
 from brushloop.drivers.sim.rig import Addresses, rig_toml

@@ -15,7 +15,7 @@ from brushloop.collect.rig.report import numbers_only, scrubber_of, write_report
 from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.drivers.sim.rig import Addresses, rig_toml

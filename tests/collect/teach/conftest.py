@@ -10,7 +10,7 @@ import pytest
 from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Answer, LeftOff, Question, Shown, StepState
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
 

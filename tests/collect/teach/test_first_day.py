@@ -20,7 +20,7 @@ from brushloop.collect.teach.proof import ProofStep, Proven, read_proof
 from brushloop.collect.teach.store import Notebook, TaughtFile
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import Clock, HostClock
-from brushloop.drivers.sim.lab.facts import Trap
+from brushloop.drivers.sim.lab_facts import Trap
 from tests.collect.teach.unknown import Errors, InLab, errors, first_day, in_lab, newest_session
 
 SMALL_PX = (800, 600)

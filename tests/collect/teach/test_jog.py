@@ -14,7 +14,7 @@ from brushloop.collect.teach.jog import BELOW_MM, touch
 from brushloop.collect.teach.store import touch_of
 from brushloop.drivers.arcs.controller import RobotMode
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
 from tests.collect.teach.conftest import Person, day_of

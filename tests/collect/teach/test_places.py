@@ -14,7 +14,7 @@ from brushloop.collect.teach.guide import Answer, Question
 from brushloop.collect.teach.places import VIEW, PlacesStep, check_pot, check_wipe, text_of
 from brushloop.collect.teach.store import Notebook, taught, touch_of
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from tests.collect.teach.conftest import Person, day_of
 
 Place = tuple[float, float, float]

@@ -32,9 +32,9 @@ from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.lab.lab import truth
+from brushloop.drivers.sim.lab_facts import truth
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from tests.collect.teach.conftest import Person, day_of
 from tests.collect.teach.unknown import InLab, in_lab
@@ -76,10 +76,10 @@ def leaning(x_mm: float, y_mm: float, z_mm: float, toward_deg: float, tilt_deg: 
 async def slipped(person: InLab, target: Target, deg: float) -> Brought:
     """The hand holds the brush as ever, but leaning."""
     lab = person.lab
-    aim = lab._aims.tip(target.kind, target.index, target.corner)
+    aim = lab.person.aim(target.kind, target.index, target.corner)
     lean = Rotation.from_rotvec([math.radians(deg), 0.0, 0.0]) * Rotation.from_quat(aim.quaternion)
     qx, qy, qz, qw = (float(v) for v in lean.as_quat())
-    await person._in_lab(lab._hand.guide(Pose(*aim.position_mm, qx, qy, qz, qw), 0.0))
+    await person._in_lab(lab.person.guide(Pose(*aim.position_mm, qx, qy, qz, qw)))
     return Brought.DONE
 
 

@@ -22,8 +22,8 @@ from brushloop.collect.teach.day import Day
 from brushloop.collect.teach.guide import Answer, Brought, LeftOff, Question, Shown, StepState, Target
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.lab.facts import Trap
-from brushloop.drivers.sim.lab.lab import Seen, UnknownLab, truth
+from brushloop.drivers.sim.lab import Seen, UnknownLab
+from brushloop.drivers.sim.lab_facts import Trap, truth
 from tests.waiting import PATIENCE_S
 
 KIND = {"ink-station": "i", "modbus-pump": "p"}

@@ -15,7 +15,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ArmMoved, LimitExceeded, NotPowered, RobotNotSafe, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.rig import HOST
 
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}

@@ -21,7 +21,7 @@ from brushloop.drivers.errors import (
     WrongGeneration,
 )
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from tests.drivers.failing import mute
 
 NEAR = brush_pose(260.0, -220.0, 250.0)

@@ -15,7 +15,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import PathDisturbed
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.rig import HOST
 
 X_MM, Y_MM, PAPER_Z_MM = 250.0, -230.0, 220.0

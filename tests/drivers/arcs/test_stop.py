@@ -11,7 +11,7 @@ from brushloop.drivers.arcs import stopping
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, MotionError
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from tests.drivers.failing import mute, mute_to
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock

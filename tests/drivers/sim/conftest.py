@@ -8,8 +8,7 @@ import pytest
 
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance, to_wire
-from brushloop.drivers.sim.arcs.cabinet import Cabinet
-from brushloop.drivers.sim.arcs.methods import methods
+from brushloop.drivers.sim.cabinet import Cabinet, methods
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.world import World
 

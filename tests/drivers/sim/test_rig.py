@@ -18,9 +18,9 @@ from brushloop.drivers.force.sri_m8123 import COMMAND_ID, LOOPBACK_CHANNEL, STAR
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.server import LoopbackServer, NotLoopback
 from brushloop.drivers.sim import rig as rig_module
-from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig, View
-from brushloop.drivers.sim.lab.lab import OlderSoftware
+from brushloop.drivers.sim.lab import OlderSoftware
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from brushloop.drivers.sim.serve import ControlServer, serve

@@ -173,7 +173,7 @@ class Open:
 async def test_the_time_to_draw_a_picture_is_a_part_of_its_delay_and_no_picture_overtakes_another() -> None:
     loop, line = Loop(), _Line(View(delay_s=0.3, delay_jitter_s=0.0), cast("asyncio.StreamWriter", Open()))
     line._loop = cast("asyncio.AbstractEventLoop", loop)
-    line._last_s = line._began_s = loop.now_s
+    line._last_s = loop.now_s
     for drawn_s in (0.05, 0.0, 2.0, 0.0):
         line.exposed()
         loop.now_s += drawn_s

@@ -19,8 +19,8 @@ from brushloop.drivers.arcs.wire import RpcConnection, open_arcs
 from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
-from brushloop.drivers.sim.lab.facts import CORNERS, corner, draw, in_picture
-from brushloop.drivers.sim.lab.lab import ARCS_PORT, UnknownLab, truth
+from brushloop.drivers.sim.lab import ARCS_PORT, UnknownLab
+from brushloop.drivers.sim.lab_facts import CORNERS, corner, draw, in_picture, truth
 from brushloop.drivers.sim.serve import LabRefused, live_control
 from brushloop.drivers.sim.world import tool_of
 
@@ -102,7 +102,7 @@ def test_what_is_seen_names_no_truth(lab: UnknownLab):
 
 def test_the_truth_is_json_with_what_a_first_day_finds():
     known = json.loads(json.dumps(truth(draw(1), None)))
-    assert {"tool", "paper", "board", "well", "park_mm", "camera", "force"} <= set(known)
+    assert {"tool", "config", "corners_mm", "park_mm", "camera"} <= set(known)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.faults import KINDS, REPLIES, Device, Fault, FaultBoard, Phase, Truth, fault_of
+from brushloop.drivers.sim.faults import KINDS, Device, Fault, FaultBoard, Phase, Truth, fault_of
 from brushloop.drivers.sim.world import World
 
 
@@ -35,7 +35,7 @@ class Scripted:
         return self.doing
 
     def strikes(self, *ops: str) -> list[bool]:
-        return [self.board.meet(Device.ROBOT, op, REPLIES) is not None for op in ops]
+        return [self.board.meet(Device.ROBOT, op) is not None for op in ops]
 
 
 @pytest.fixture
@@ -100,24 +100,21 @@ def test_for_so_many_seconds_counts_from_when_it_begins(world: Scripted):
 )
 def test_a_stop_begins_by_itself_and_once(world: Scripted, fault: Fault):
     world.board.hang(fault)
-    assert world.board.waits_by_itself
-    assert world.board.meet(fault.device, "x", KINDS[fault.device]) is None
+    assert world.board.meet(fault.device) is None
     assert world.board.due() == []
     world.doing = Phase.LIFTING
     assert world.board.due() == [fault]
     assert world.board.due() == []
-    assert not world.board.waits_by_itself
 
 
 def test_a_fault_of_ink_begins_by_itself_and_strikes_the_requests_that_follow(world: Scripted):
     world.board.hang(Fault(device=Device.INK, kind="garbage", phase=Phase.LIFTING, count=2))
     assert world.board.due() == []
-    assert world.board.meet(Device.INK, "", KINDS[Device.INK]) is None
+    assert world.board.meet(Device.INK) is None
     world.doing = Phase.LIFTING
     world.board.due()
     world.doing = Phase.PARKED
-    assert not world.board.waits_by_itself
-    strikes = [world.board.meet(Device.INK, "", KINDS[Device.INK]) is not None for _ in range(3)]
+    strikes = [world.board.meet(Device.INK) is not None for _ in range(3)]
     assert strikes == [True, True, False]
 
 
@@ -126,15 +123,14 @@ def test_clearing_ends_a_fault_that_has_begun(world: Scripted, device: Device):
     kind = min(KINDS[device])
     world.board.hang(Fault(device=device, kind=kind, count=1000))
     world.board.due()
-    assert world.board.meet(device, "", KINDS[device]) is not None
+    assert world.board.meet(device) is not None
     assert world.board.clear() == 1
-    assert world.board.meet(device, "", KINDS[device]) is None
+    assert world.board.meet(device) is None
 
 
 def test_a_fault_has_what_its_request_says() -> None:
     fault = fault_of({"device": "camera", "kind": "black", "press": 2, "phase": "parked", "for_s": 4})
     assert (fault.device, fault.press, fault.phase, fault.for_s) == (Device.CAMERA, 2, "parked", 4.0)
-    assert fault.strikes is None
 
 
 @pytest.mark.parametrize(

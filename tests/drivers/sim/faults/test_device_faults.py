@@ -25,7 +25,7 @@ from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, SriM8123, SriOptions
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.arcs.server import ArcsServer
+from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from brushloop.drivers.sim.scene import read_strip

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import brush_pose
+from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import SimConfig, Table, View
-from brushloop.drivers.sim.kinematics import HOME, Joints, Matrix, inverse, inverted, matrix_of
-from brushloop.drivers.sim.scene import homography
+from brushloop.drivers.sim.kinematics import HOME, inverse, inverted, matrix_of
+from brushloop.drivers.sim.scene import camera_matrix, homography
 from brushloop.drivers.sim.world import tool_of
 
 Place = tuple[float, float, float]
@@ -25,20 +25,10 @@ CORNERS = ("lower left", "lower right", "upper right", "upper left")
 """Of the board and of the sheet, with the print upright before the reader."""
 
 
-def in_base(table: Table, x_mm: float, y_mm: float, above_mm: float = 0.0) -> Place:
-    """A point of the paper frame, `above_mm` above the sheet's plane."""
-    yaw = math.radians(table.yaw_deg)
-    return (
-        table.origin_mm[0] + math.cos(yaw) * x_mm - math.sin(yaw) * y_mm,
-        table.origin_mm[1] + math.sin(yaw) * x_mm + math.cos(yaw) * y_mm,
-        table.surface_z_mm(x_mm, y_mm) + above_mm,
-    )
-
-
 def over_sheet(table: Table, above_mm: float = 0.0) -> Place:
     """The middle of the sheet, or a place above it."""
     width, height = table.sheet_mm
-    return in_base(table, width / 2, height / 2, above_mm)
+    return table.to_base(width / 2, height / 2, above_mm)
 
 
 def board_size_mm(table: Table) -> tuple[float, float]:
@@ -53,7 +43,7 @@ def corner(table: Table, of: str, name: str) -> Place:
         raise ValueError(f"corner = {name!r} is not one of {', '.join(CORNERS)}")
     left, bottom = table.board_origin_mm if of == "board" else (0.0, 0.0)
     width, height = board_size_mm(table) if of == "board" else table.sheet_mm
-    return in_base(table, left + width * ("right" in name), bottom + height * ("upper" in name))
+    return table.to_base(left + width * ("right" in name), bottom + height * ("upper" in name))
 
 
 def held(place: Place, *, wrist_deg: float, tilt_deg: float = 0.0, toward_deg: float = 0.0) -> Pose:
@@ -61,23 +51,10 @@ def held(place: Place, *, wrist_deg: float, tilt_deg: float = 0.0, toward_deg: f
 
     Unlike `brush_pose`, where the wrist turns with the direction of the lean.
     """
-    toward = math.radians(toward_deg)
-    lean = Rotation.from_rotvec(math.radians(tilt_deg) * np.array([-math.sin(toward), math.cos(toward), 0.0]))
-    upright = Rotation.from_euler("z", wrist_deg, degrees=True) * Rotation.from_rotvec([math.pi, 0.0, 0.0])
-    qx, qy, qz, qw = (float(v) for v in (lean * upright).as_quat())
-    return Pose(*place, qx, qy, qz, qw)
-
-
-def shifted(pose: Pose, shift_mm: Place) -> Pose:
-    """The same orientation at another place."""
-    x, y, z = (a + b for a, b in zip(pose.position_mm, shift_mm, strict=True))
-    return Pose(x, y, z, *pose.quaternion)
-
-
-def withdrawn(pose: Pose, mm: float) -> Pose:
-    """The tip drawn back along the brush."""
-    x, y, z = (float(v) for v in Rotation.from_quat(pose.quaternion).apply([0.0, 0.0, -mm]))
-    return shifted(pose, (x, y, z))
+    toward, tilt = math.radians(toward_deg), math.radians(tilt_deg)
+    lean = of_vector((-math.sin(toward) * tilt, math.cos(toward) * tilt, 0.0))
+    upright = product(of_vector((0.0, 0.0, math.radians(wrist_deg))), DOWN)
+    return Pose(*place, *product(lean, upright))
 
 
 def azimuth_deg(place: Place) -> float:
@@ -147,12 +124,7 @@ def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX)
 def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[int, int]) -> Facts | None:
     table = _table(rng)
     view = _view(rng, table, picture_px)
-    sideways_mm, at, lean_deg, toward = (
-        rng.uniform(0, 15),
-        rng.uniform(0, math.tau),
-        rng.uniform(0, 3),
-        rng.uniform(0, math.tau),
-    )
+    sideways_mm, at, lean_deg, toward = (float(rng.uniform(0, most)) for most in (15, math.tau, 3, math.tau))
     radius_mm, length_mm = BRUSHES[rng.integers(len(BRUSHES))]
     pin = _beside(rng, table, 50.0)
     wash = _beside(rng, table, 35.0)
@@ -161,8 +133,8 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
         rate=rate,
         ink_device=("station", "pump", "none")[rng.integers(3)],
         tool_mm=float(rng.uniform(120, 260)),
-        tool_sideways_mm=(float(sideways_mm * math.cos(at)), float(sideways_mm * math.sin(at))),
-        tool_lean_deg=(float(lean_deg * math.cos(toward)), float(lean_deg * math.sin(toward))),
+        tool_sideways_mm=(sideways_mm * math.cos(at), sideways_mm * math.sin(at)),
+        tool_lean_deg=(lean_deg * math.cos(toward), lean_deg * math.sin(toward)),
         sensor_turn_deg=float(rng.choice([0, 90, 180, 270]) + rng.normal(0.0, 2.0)),
         sensor_sign=1 if rng.random() < 0.75 else -1,
         brush=BrushSpec(seed=seed, radius_mm=radius_mm, length_mm=length_mm),
@@ -180,7 +152,7 @@ def _guess(rng: np.random.Generator, seed: int, rate: float, picture_px: tuple[i
     return Facts(
         seed,
         replace(config, home_mm=park),
-        in_base(table, *pin, float(rng.uniform(20, 60))),
+        table.to_base(*pin, float(rng.uniform(20, 60))),
         wash,
         park,
         clear,
@@ -310,10 +282,10 @@ def poses(facts: Facts) -> Iterator[Pose]:
     """Poses of the tip that the lab must allow: by hand, and those of a later session, with room above."""
     table = facts.config.table
     touched = [corner(table, of, name) for of in ("board", "sheet") for name in CORNERS]
-    touched += [in_base(table, *facts.wash_mm), in_base(table, *table.well_mm)]
+    touched += [table.to_base(*facts.wash_mm), table.to_base(*table.well_mm)]
     for place in touched:
         upright = held(place, wrist_deg=azimuth_deg(place))
-        yield from (upright, shifted(upright, (0.0, 0.0, LIFT_MM + 20.0)))
+        yield from (upright, replace(upright, z_mm=upright.z_mm + LIFT_MM + 20.0))
     for place in touched[4:8]:
         for turn_deg in (0.0, 90.0, 180.0, 270.0):
             x, y, z = place
@@ -326,16 +298,11 @@ def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:
     """Whether the arm reaches every pose of the tip with this tool."""
     tool, near = inverted(tool_of(config)), HOME
     for pose in wanted:
-        joints = joints_for(tool, pose, near)
+        joints = inverse(matrix_of(pose) @ tool, near)
         if joints is None:
             return False
         near = joints
     return True
-
-
-def joints_for(flange_in_tool: Matrix, pose: Pose, near: Joints) -> Joints | None:
-    """Joints for a pose of the tip; None out of reach."""
-    return inverse(matrix_of(pose) @ flange_in_tool, near)
 
 
 class Trap(StrEnum):
@@ -370,36 +337,49 @@ TOO_FAR_MM = 330.0
 """How much farther away the sheet lies."""
 
 
+def patched(facts: Facts, patch: Mapping[str, Any]) -> Facts:
+    """The same lab with other values in these fields of `Facts`, `SimConfig`, `Table` and `View`."""
+
+    def of(part: Facts | SimConfig | Table | View) -> dict[str, Any]:
+        return {field.name: patch[field.name] for field in fields(part) if field.name in patch}
+
+    table, view = facts.config.table, facts.config.view
+    config = replace(facts.config, table=replace(table, **of(table)), view=replace(view, **of(view)))
+    return replace(facts, config=replace(config, **of(config)), **of(facts))
+
+
 def spring(facts: Facts, trap: Trap) -> Facts:
     """The same lab with the trap in it."""
-    rng = np.random.default_rng([facts.seed, 18])
-    config, table, view = facts.config, facts.config.table, facts.config.view
+    return patched(facts, _mistake(facts, trap))
+
+
+def _mistake(facts: Facts, trap: Trap) -> dict[str, Any]:
+    """What is otherwise with the trap, by field."""
+    table, rng = facts.config.table, np.random.default_rng([facts.seed, 18])
     match trap:
         case Trap.SWAPPED_CORNER:
             first = int(rng.integers(4))
-            return replace(facts, swapped=(CORNERS[first], CORNERS[(first + 1) % 4]))
+            return {"swapped": (CORNERS[first], CORNERS[(first + 1) % 4])}
         case Trap.MIRRORED_CAMERA:
-            return replace(facts, config=replace(config, view=replace(view, mirrored=True)))
+            return {"mirrored": True}
         case Trap.WRONG_BOARD_SIZE:
-            table = replace(
-                table, board_square_mm=SHRUNK * table.board_square_mm, board_marker_mm=SHRUNK * table.board_marker_mm
-            )
-            return replace(facts, config=replace(config, table=table))
+            return {field: SHRUNK * getattr(table, field) for field in ("board_square_mm", "board_marker_mm")}
         case Trap.TCP_IN_METRES:
-            typed = (0.0, 0.0, config.tool_mm / 1e6, 0.0, 0.0, 0.0)
-            return replace(facts, cabinet_tcp=typed, ruler_unit="m")
+            return {"cabinet_tcp": (0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0), "ruler_unit": "m"}
         case Trap.PARK_IN_PICTURE:
-            return replace(facts, parks_in_picture=True)
+            return {"parks_in_picture": True}
         case Trap.SLOW_CAMERA:
-            return replace(facts, config=replace(config, view=replace(view, delay_s=SLOW_S)))
+            return {"delay_s": SLOW_S}
         case Trap.FORCE_SIGN:
-            return replace(facts, config=replace(config, sensor_sign=-1))
-        case Trap.SHEET_OUT_OF_REACH:
-            return _farther(facts)
+            return {"sensor_sign": -1}
+        case Trap.SHEET_OUT_OF_REACH:  # with board, pots and camera; the pin stays within reach
+            x, y, _ = over_sheet(table)
+            stretch = TOO_FAR_MM / math.hypot(x, y)
+            return {"origin_mm": (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)}
         case Trap.OLD_SOFTWARE:
-            return replace(facts, arcs_answers=False)
+            return {"arcs_answers": False}
         case Trap.CABLE_PULLED:
-            return replace(facts, cable_after=int(rng.integers(2, 7)))
+            return {"cable_after": int(rng.integers(2, 7))}
 
 
 def mended(trapped: Facts, clean: Facts, trap: Trap) -> Facts:
@@ -409,15 +389,19 @@ def mended(trapped: Facts, clean: Facts, trap: Trap) -> Facts:
             table = trapped.config.table
             return replace(trapped, printed_square_mm=table.board_square_mm, printed_marker_mm=table.board_marker_mm)
         case Trap.FORCE_SIGN:
-            return replace(trapped, config=replace(trapped.config, sensor_sign=1))
+            return patched(trapped, {"sensor_sign": 1})
         case _:
             return clean
 
 
-def _farther(facts: Facts) -> Facts:
-    """The sheet with its board, pots and camera moved away from the arm; the pin stays within reach."""
-    table = facts.config.table
-    x, y, _ = over_sheet(table)
-    stretch = TOO_FAR_MM / math.hypot(x, y)
-    origin = (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)
-    return replace(facts, config=replace(facts.config, table=replace(table, origin_mm=origin)))
+def truth(facts: Facts, trap: Trap | None) -> dict[str, Any]:
+    """The facts as JSON, and what a first day should find from them; lengths in mm, angles in deg, base frame."""
+    table, view, tool = facts.config.table, facts.config.view, tool_of(facts.config)
+    return {
+        **asdict(facts),
+        "trap": trap,
+        "tool": {"tcp_offset_mm": (1e3 * tool[:3, 3]).tolist(), "brush_axis": tool[:3, 2].tolist()},
+        "corners_mm": {of: {name: corner(table, of, name) for name in CORNERS} for of in ("board", "sheet")},
+        "well_rim_mm": table.to_base(*table.well_mm, table.well_depth_mm),
+        "camera": {"matrix": camera_matrix(view).tolist(), "delay_s": view.delay_s + 0.5 * view.delay_jitter_s},
+    }

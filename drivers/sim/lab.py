@@ -19,35 +19,20 @@ import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
-
-import numpy as np
 
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.server import LoopbackServer
-from brushloop.drivers.sim.arcs.cabinet import Cabinet
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.lab.facts import (
-    CORNERS,
-    LIFT_MM,
-    PICTURE_PX,
-    Facts,
-    Trap,
-    corner,
-    draw,
-    in_base,
-    mended,
-    spring,
-)
-from brushloop.drivers.sim.lab.hand import TOUCHED, Aims, Hand
+from brushloop.drivers.sim.lab_facts import PICTURE_PX, Trap, draw, mended, spring
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
+from brushloop.drivers.sim.person import TOUCHED, Person
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.scene import Held, Wall, camera_matrix
-from brushloop.drivers.sim.world import World, tool_of
+from brushloop.drivers.sim.scene import Wall
 
 PRESS_SHARE = 0.45
 """Deepest press, as a share of the free length, that the maker of the brush allows."""
@@ -90,58 +75,9 @@ class Seen:
         ]
 
 
-def truth(facts: Facts, trap: Trap | None) -> dict[str, Any]:
-    """Everything that a first day should find, as JSON; lengths in mm, angles in deg, base frame unless named."""
-    config, table, view = facts.config, facts.config.table, facts.config.view
-    tool = tool_of(config)
-    return {
-        "seed": facts.seed,
-        "trap": None if trap is None else trap.value,
-        "tool": {
-            "tcp_offset_mm": (1e3 * tool[:3, 3]).tolist(),
-            "brush_axis": tool[:3, 2].tolist(),
-            "lean_deg": float(np.degrees(np.arccos(min(1.0, tool[2, 2])))),
-        },
-        "paper": {
-            "origin_mm": list(table.origin_mm),
-            "yaw_deg": table.yaw_deg,
-            "touch_z_mm": table.paper_z_mm,
-            "normal": list(table.normal),
-            "size_mm": list(table.sheet_mm),
-            "corners_mm": {name: list(corner(table, "sheet", name)) for name in CORNERS},
-        },
-        "board": {
-            "origin_mm": list(table.board_origin_mm),
-            "square_mm": table.board_square_mm,
-            "marker_mm": table.board_marker_mm,
-            "corners_mm": {name: list(corner(table, "board", name)) for name in CORNERS},
-        },
-        "well": {
-            "paper_mm": list(table.well_mm),
-            "rim_mm": list(in_base(table, *table.well_mm, table.well_depth_mm)),
-            "radius_mm": table.well_radius_mm,
-            "bottom_z_mm": table.surface_z_mm(*table.well_mm),
-        },
-        "wash": {"paper_mm": list(facts.wash_mm)},
-        "pin_mm": list(facts.pin_mm),
-        "park_mm": list(facts.park_mm),
-        "camera": {
-            "stream": facts.sheet_camera,
-            "delay_s": view.delay_s + 0.5 * view.delay_jitter_s,
-            "fps": view.fps,
-            "matrix": camera_matrix(view).tolist(),
-            "k1": view.k1,
-            "lens_mm": list(view.lens_mm or ()),
-            "mirrored": view.mirrored,
-        },
-        "force": {"turn_deg": config.sensor_turn_deg, "sign": config.sensor_sign, "hanging_kg": config.hanging_kg},
-        "brush": asdict(config.brush),
-        "cabinet": {"tcp_offset": list(facts.cabinet_tcp), "payload_kg": facts.payload_kg},
-    }
-
-
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 CAMERA_PORTS = (8080, 8081)
+PORTS = (ARCS_PORT, RTDE_PORT, CAN_PORT, *CAMERA_PORTS, AUBOPE_PORT)
 ROOM_FPS = 5.0
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
@@ -173,22 +109,24 @@ class UnknownLab:
         self._clean = draw(seed, rate, picture_px)
         self.facts = self._clean if trap is None else spring(self._clean, trap)
         self.host = _free_address(seed)
-        ports = {"arcs_port": ARCS_PORT, "rtde_port": RTDE_PORT, "force_port": CAN_PORT}
-        force_hz = self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS)
         config = replace(
-            self.facts.config, camera_port=CAMERA_PORTS[self.facts.sheet_camera], force_hz=force_hz, **ports
+            self.facts.config,
+            arcs_port=ARCS_PORT,
+            rtde_port=RTDE_PORT,
+            camera_port=CAMERA_PORTS[self.facts.sheet_camera],
+            force_port=CAN_PORT,
+            force_hz=self.facts.config.force_hz * min(max(rate, 1.0), MOST_ROUNDS),
         )
         self.rig = LoopbackRig(config, self.host)
-        self.world: World = self.rig.world
-        self.cabinet: Cabinet = self.rig.arcs.cabinet
+        self.world = self.rig.world
+        self.cabinet = self.rig.arcs.cabinet
         self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
         self.cabinet.payload = [self.facts.payload_kg, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        self.person = Person(self.cabinet, self.facts)
         self._room = MjpegServer(Wall(self.world), View(fps=ROOM_FPS, jpeg_quality=80))
         self._older = OlderSoftware()
         self._touches = 0
         self._pulled: list[int] = []
-        self._hand = Hand(self.cabinet)
-        self._aims = Aims(lambda: self.facts)
         self._busy = asyncio.Lock()
         """The person does one thing at a time."""
 
@@ -239,7 +177,7 @@ class UnknownLab:
                 case "bring":
                     return await self.bring(to, index, corner)
                 case "measure":
-                    return {"says": self.measure(to)}
+                    return {"says": self.person.measure(to)}
                 case "mend":
                     return {"says": await self.mend()}
                 case "plug":
@@ -251,47 +189,28 @@ class UnknownLab:
         """Carry out `bring`, as in the table above. Raises ValueError for a thing that the lab does not have."""
         if to not in THINGS:
             raise ValueError(f"to = {to!r} is not one of {', '.join(THINGS)}")
-        self._hold(self._aims.board(index) if to == "hold-board" else None)
+        self.rig.scene.held = self.person.grip(index) if to == "hold-board" else None
         if to == "hold-board":
             return {"reached": True, "says": "I hold the print before the camera."}
         if to == "push-sensor":
-            await self._hand.push(index)
+            await self.person.push(index)
             return {"reached": True, "says": "I pushed the tip for a second."}
-        aim = self._aims.tip(to, index, corner)
-        if (trouble := await self._hand.take_hold()) is not None:
+        aim = self.person.aim(to, index, corner)
+        if (trouble := await self.person.take_hold()) is not None:
             return {"reached": False, "says": trouble}
-        short_mm = await self._hand.guide(aim, back_mm=LIFT_MM if to == "pin" else 0.0)
+        short_mm = await self.person.guide(aim, along_brush=to == "pin")
         if to in TOUCHED:
             self._touched()
         if short_mm > 0.0:
             return {"reached": False, "says": f"The arm is stretched out, {short_mm:.0f} mm before the {to}."}
         return {"reached": True, "says": f"The tip is at the {to}{f', {corner}' if corner else ''}."}
 
-    def measure(self, what: str) -> str:
-        """A length as the person writes it down. Raises ValueError for one that nobody can measure."""
-        facts = self.facts
-        lengths_mm = {
-            "square": round(facts.config.table.board_square_mm, 2),
-            "marker": round(facts.config.table.board_marker_mm, 2),
-            "tool": round(facts.config.tool_mm),
-        }
-        if what not in lengths_mm:
-            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
-        return f"{lengths_mm[what] / 1e3:g}" if facts.ruler_unit == "m" and what == "tool" else f"{lengths_mm[what]:g}"
-
-    def _hold(self, board: Held | None) -> None:
-        """Hold the print before the camera, or put it away."""
-        self.rig.scene.held = board
-
     def _touched(self) -> None:
         """Count another touched thing; with one trap, somebody then trips over the cable."""
         self._touches += 1
         if self._touches == self.facts.cable_after:
-            board = self.rig.faults
-            self._pulled = [
-                board.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS)),
-                board.hang(Fault(device=Device.TELEMETRY, kind="mute", count=ALWAYS)),
-            ]
+            lost = ((Device.ROBOT, "deaf"), (Device.TELEMETRY, "mute"))
+            self._pulled = [self.rig.faults.hang(Fault(device=d, kind=kind, count=ALWAYS)) for d, kind in lost]
 
     def plug(self) -> str:
         """Put the cable back."""
@@ -301,13 +220,14 @@ class UnknownLab:
         return "The cable was out; it is in again." if pulled else "Every cable is in."
 
     async def mend(self) -> str:
-        """Correct the mistake that the trap is, as `traps.mended` describes; return what was done."""
+        """Correct the mistake that the trap is; return what was done."""
         trap, self.trap = self.trap, None
         if trap is None:
             return "Nothing is wrong that I know of."
         if trap is Trap.CABLE_PULLED:
             return self.plug()
         was, self.facts = self.facts, mended(self.facts, self._clean, trap)
+        self.person.facts = self.facts
         if self.facts.config != was.config:
             self.rig.reconfigure(self.facts.config)
         if self.facts.cabinet_tcp != was.cabinet_tcp:
@@ -328,15 +248,11 @@ def _free_address(seed: int) -> str:
         host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + tried) % ADDRESSES}"
         with contextlib.ExitStack() as probes:
             try:
-                for port in _ports():
+                for port in PORTS:
                     probe = probes.enter_context(socket.socket())
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                     probe.bind((host, port))
             except OSError:
                 continue
             return host
-    raise OSError(f"no loopback address for the lab of seed {seed}: ports {', '.join(map(str, _ports()))} are in use")
-
-
-def _ports() -> Iterator[int]:
-    yield from (ARCS_PORT, RTDE_PORT, CAN_PORT, *CAMERA_PORTS, AUBOPE_PORT)
+    raise OSError(f"no loopback address for the lab of seed {seed}: ports {', '.join(map(str, PORTS))} are in use")

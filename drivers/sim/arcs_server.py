@@ -7,88 +7,66 @@ its framing. The RTDE port greets, and pushes samples to subscribers at the freq
 from __future__ import annotations
 
 import asyncio
-import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
 from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, named
 from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.server import LoopbackServer
-from brushloop.drivers.sim.arcs.cabinet import Cabinet
-from brushloop.drivers.sim.arcs.methods import methods
-from brushloop.drivers.sim.faults import KINDS, LOST, REPLIES, STOPS, Device, Fault, FaultBoard, Truth
+from brushloop.drivers.sim.cabinet import Cabinet, methods
+from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard, Truth
 from brushloop.drivers.sim.motion import Rest
 from brushloop.drivers.sim.world import World
 
 PIECE_S = 0.001
-CUTS = (2, 6, 9)
-"""Offsets at which a frame is split: in the magic bytes, in the length, and just after the head."""
+CUTS = (2, 4, 3)
+"""Lengths of the first pieces of a split frame: it is cut in the magic bytes, in the length, and after the head."""
 GARBAGE = b"\x00\xffnothing that anyone speaks\r\n"
 
 
-class Dropped(ConnectionError):
-    """The connection is to be closed without an answer."""
+async def send(
+    writer: asyncio.StreamWriter, frame: Callable[[bytes], bytes], answer: bytes, fault: Fault | None
+) -> None:
+    """Send a reply in its frame, as a fault changes it. Raises ConnectionError where the fault is `drop`."""
+    kind, whole = "" if fault is None else fault.kind, frame(answer)
+    match kind:
+        case "mute":
+            return
+        case "drop":
+            raise ConnectionResetError("the connection is to be closed without an answer")
+        case "late":
+            assert fault is not None
+            asyncio.get_running_loop().call_later(fault.late_s, _write, writer, whole)
+            return
+        case "split":
+            for cut in (*CUTS, len(whole) // 2):
+                if cut < len(whole):
+                    writer.write(whole[:cut])
+                    whole = whole[cut:]
+                    await writer.drain()
+                    await asyncio.sleep(PIECE_S)
+        case "duplicate":
+            whole *= 2
+        case "wrong-id":
+            whole = frame(_with_another_id(answer))
+        case "malformed":
+            whole = frame(answer[: len(answer) // 2])
+        case "garbage":
+            whole = GARBAGE
+        case _:
+            pass
+    # In one piece: the vendor's client never recovers from a header that arrives in two.
+    writer.write(whole)
+    await writer.drain()
 
 
-class Replies:
-    """Sends the replies of one connection, with faults applied to them."""
-
-    def __init__(self, writer: asyncio.StreamWriter, frame: Callable[[bytes], bytes]) -> None:
-        self._writer = writer
-        self._frame = frame
-        self._late: set[asyncio.TimerHandle] = set()
-
-    async def send(self, answer: bytes, fault: Fault | None) -> None:
-        """Send the answer as the fault changes it. Raises `Dropped`."""
-        match fault.kind if fault is not None else "":
-            case "mute":
-                return
-            case "drop":
-                raise Dropped
-            case "late":
-                assert fault is not None
-                self._later(fault.late_s, self._frame(answer))
-            case "split":
-                await self._in_pieces(self._frame(answer))
-            case "duplicate":
-                self._writer.write(self._frame(answer) * 2)
-            case "wrong-id":
-                self._writer.write(self._frame(_with_another_id(answer)))
-            case "malformed":
-                self._writer.write(self._frame(answer[: len(answer) // 2]))
-            case "garbage":
-                self._writer.write(GARBAGE)
-            case _:
-                # In one piece: the vendor's client never recovers from a header that arrives in two.
-                self._writer.write(self._frame(answer))
-        await self._writer.drain()
-
-    def close(self) -> None:
-        """Cancel replies that have not been sent yet."""
-        for handle in self._late:
-            handle.cancel()
-        self._late.clear()
-
-    def _later(self, after_s: float, whole: bytes) -> None:
-        def send() -> None:
-            self._late.discard(handle)
-            if not self._writer.is_closing():
-                self._writer.write(whole)
-
-        handle = asyncio.get_running_loop().call_later(after_s, send)
-        self._late.add(handle)
-
-    async def _in_pieces(self, whole: bytes) -> None:
-        edges = sorted({0, *(cut for cut in (*CUTS, len(whole) // 2) if cut < len(whole)), len(whole)})
-        for begin, end in itertools.pairwise(edges):
-            self._writer.write(whole[begin:end])
-            await self._writer.drain()
-            await asyncio.sleep(PIECE_S)
+def _write(writer: asyncio.StreamWriter, data: bytes) -> None:
+    if not writer.is_closing():
+        writer.write(data)
 
 
 def _with_another_id(answer: bytes) -> bytes:
@@ -108,11 +86,11 @@ PARSE_ERROR, METHOD_NOT_FOUND, INVALID_PARAMS = -32700, -32601, -32602
 class ArcsServer(LoopbackServer):
     """One controller for any number of clients."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, faults: FaultBoard | None = None) -> None:
+        """`faults` is the board of the whole rig; alone, the server has one of its own."""
         super().__init__()
         self.cabinet = Cabinet(world)
-        self.faults = FaultBoard(Truth(world))
-        """Faults of this server; a rig shares one board among all its servers."""
+        self.faults = faults or FaultBoard(Truth(world))
         self._methods = methods(self.cabinet)
 
     async def stop(self) -> None:
@@ -120,46 +98,30 @@ class ArcsServer(LoopbackServer):
         self.cabinet.close()
         await super().stop()
 
-    def stop_as(self, kind: str) -> None:
-        """Enter the safety stop that a fault of this kind asks for; `emergency-stop` also switches the power off."""
-        match kind:
-            case "protective-stop":
-                self.cabinet.safety_stop(SafetyMode.PROTECTIVE_STOP)
-            case "safeguard-stop":
-                self.cabinet.safety_stop(SafetyMode.SAFEGUARD_STOP)
-            case _:
-                self.cabinet.emergency_stop()
-
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer requests in order. The motion queue continues after the client disconnects, as a cabinet's would."""
         data = await reader.read(65536)
         bare = data[:1] in (b"{", b"[", b" ", b"\t", b"\r", b"\n")
         decoder = BareDecoder() if bare else FrameDecoder()
-        replies = Replies(writer, bytes if bare else encode)
-        try:
-            while data:
-                try:
-                    payloads = decoder.feed(data)
-                except ProtocolViolation as error:
-                    if bare:  # a peer that speaks JSON gets an error before the connection is closed
-                        writer.write(_error(None, PARSE_ERROR, f"parse error: {error.what}"))
-                    raise
-                for payload in payloads:
-                    await self._serve_one(payload, replies)
-                data = await reader.read(65536)
-        finally:
-            replies.close()
-
-    async def _serve_one(self, payload: bytes, replies: Replies) -> None:
-        request = _parsed(payload)
-        op = _op(request)
-        if self.faults.meet(Device.ROBOT, op, LOST) is not None:
-            return
-        answer = self._answer(request)
-        stop = self.faults.meet(Device.ROBOT, op, STOPS)
-        if stop is not None:
-            self.stop_as(stop.kind)
-        await replies.send(answer, self.faults.meet(Device.ROBOT, op, REPLIES))
+        frame = bytes if bare else encode
+        while data:
+            try:
+                payloads = decoder.feed(data)
+            except ProtocolViolation as error:
+                if bare:  # a peer that speaks JSON gets an error before the connection is closed
+                    writer.write(_error(None, PARSE_ERROR, f"parse error: {error.what}"))
+                raise
+            for payload in payloads:
+                request = _parsed(payload)
+                op = _op(request)
+                if self.faults.meet(Device.ROBOT, op, LOST) is not None:
+                    continue
+                answer = self._answer(request)
+                fault = self.faults.meet(Device.ROBOT, op, KINDS[Device.ROBOT] - LOST)
+                if fault is not None and fault.kind in STOPS:
+                    self.cabinet.safety_stop(STOPS[fault.kind])
+                await send(writer, frame, answer, fault)
+            data = await reader.read(65536)
 
     def _answer(self, request: Any) -> bytes:
         match request:
@@ -229,10 +191,10 @@ class Topic:
 class RtdeServer(LoopbackServer):
     """One RTDE port for any number of clients."""
 
-    def __init__(self, cabinet: Cabinet) -> None:
+    def __init__(self, cabinet: Cabinet, faults: FaultBoard | None = None) -> None:
+        """`faults` is the board of the whole rig; alone, the server has one of its own."""
         super().__init__()
-        self.faults = FaultBoard(Truth(cabinet.world))
-        """Faults of this server; a rig shares one board among all its servers."""
+        self.faults = faults or FaultBoard(Truth(cabinet.world))
         self._cabinet = cabinet
         self.pings = 0
         """Keep-alives seen, for tests."""
@@ -298,17 +260,12 @@ class RtdeServer(LoopbackServer):
         return self._outputs[name][1]()
 
     def _push_once(self, topic: Topic, writer: asyncio.StreamWriter, rest: Rest | None = None) -> None:
-        fault = self.faults.meet(Device.TELEMETRY, "push", KINDS[Device.TELEMETRY])
+        fault = self.faults.meet(Device.TELEMETRY)
         if fault is not None and fault.kind == "mute":
             return
         sample = encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments])
         late_s = 0.0 if fault is None else fault.late_s
-        asyncio.get_running_loop().call_later(late_s, self._send, writer, sample)
-
-    @staticmethod
-    def _send(writer: asyncio.StreamWriter, sample: bytes) -> None:
-        if not writer.is_closing():
-            writer.write(sample)
+        asyncio.get_running_loop().call_later(late_s, _write, writer, sample)
 
 
 def topic_of(payload: bytes) -> Topic:

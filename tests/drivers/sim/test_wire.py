@@ -13,7 +13,7 @@ import pytest
 from brushloop.drivers.arcs.telemetry import encode_topic
 from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, encode_short
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.arcs.server import ArcsServer, RtdeServer
+from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.rig import HOST
 
 Ask = Callable[[bytes, int], Awaitable[list[Any]]]

@@ -11,7 +11,7 @@ import pytest
 
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.geometry import brush_pose, distance, from_wire
-from brushloop.drivers.sim.arcs.cabinet import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
+from brushloop.drivers.sim.cabinet import BOOT_S, BRAKE_RELEASE_S, POWER_OFF_S, POWER_ON_S
 from brushloop.drivers.sim.kinematics import HOME
 
 START = brush_pose(250.0, -230.0, 260.0)
@@ -154,7 +154,7 @@ def test_what_is_out_of_reach_is_accepted_and_reported_by_a_message(on: Any):
 async def bitten(on: Any) -> None:
     """Return once no watchdog is waiting."""
     async with asyncio.timeout(5.0):
-        while on.cabinet._timers:
+        while on.cabinet.watchdogs:
             await asyncio.sleep(0.01)
 
 
@@ -163,20 +163,20 @@ async def test_a_watchdog_that_is_not_fed_bites_and_one_that_is_fed_does_not(on:
     ends_s: list[float] = []
     for _ in range(4):
         assert on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=3) == 0
-        assert len(on.cabinet._timers) == 1, "the timer set before is cancelled"
-        ends_s.append(on.cabinet._timers["wd"].when())
+        assert len(on.cabinet.watchdogs) == 1, "the timer set before is cancelled"
+        ends_s.append(on.cabinet.watchdogs["wd"].when())
     assert ends_s == sorted(ends_s)
     assert on.safety == "Normal"
     await bitten(on)
     assert on.safety == "ProtectiveStop"
     on.ask("RobotManage.setUnlockProtectiveStop")
-    assert not on.cabinet._timers, "it bites once"
+    assert not on.cabinet.watchdogs, "it bites once"
 
 
 async def test_a_watchdog_can_be_disarmed_and_its_actions_differ(on: Any):
     on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=3)
     on.ask("RegisterControl.setWatchDog", key="wd", timeout=0.1, action=0)
-    assert not on.cabinet._timers
+    assert not on.cabinet.watchdogs
     for wrong in ({"timeout": 0.05, "action": 3}, {"timeout": math.nan, "action": 3}, {"timeout": 1.0, "action": 4}):
         assert on.ask("RegisterControl.setWatchDog", key="wd", **wrong) == -5
     for action, held in ((1, True), (2, False)):
@@ -210,23 +210,20 @@ def test_every_transition_takes_its_time(off: Any):
 
 
 def test_nothing_less_takes_the_place_of_an_emergency_stop(on: Any):
-    on.cabinet.emergency_stop()
+    on.cabinet.safety_stop(SafetyMode.ROBOT_EMERGENCY_STOP)
     for mode in (SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP):
         on.cabinet.safety_stop(mode)
         assert on.safety == "RobotEmergencyStop"
-    on.cabinet.power.reduce(True)
-    on.cabinet.power.reset_safeguard()
-    assert on.safety == "RobotEmergencyStop"
 
 
 @pytest.mark.parametrize("asked", ["RobotManage.restartInterfaceBoard", "RobotManage.poweron", "RobotManage.startup"])
 def test_no_method_brings_an_arm_back_while_the_button_is_down(on: Any, asked: str):
-    on.cabinet.emergency_stop()
+    on.cabinet.safety_stop(SafetyMode.ROBOT_EMERGENCY_STOP)
     for method in (asked, "RobotManage.setUnlockProtectiveStop", "RuntimeMachine.resume"):
         assert on.ask(method) != 0
         on.clock.s += 5.0
     assert (on.safety, on.mode) == ("RobotEmergencyStop", "PowerOff")
-    on.cabinet.power.release_emergency_stop()
+    on.cabinet.power.button_down = False
     on.clock.s += 5.0
     assert on.safety == "RobotEmergencyStop", "releasing the button alone brings nothing back"
     assert on.ask("RobotManage.restartInterfaceBoard") == 0
@@ -241,22 +238,20 @@ def test_a_safeguard_is_reset_by_a_person_and_the_path_is_gone(on: Any):
     assert on.ask("RobotState.isPowerOn") is True
     for method in ("RobotManage.setUnlockProtectiveStop", "RuntimeMachine.resume", "RobotManage.restartInterfaceBoard"):
         assert on.ask(method) == 1
-    on.cabinet.power.reset_safeguard()
+    assert on.cabinet.release() == SafetyMode.SAFEGUARD_STOP
     on.clock.s += 5.0
     assert (on.safety, on.exec_id) == ("Normal", -1)
     assert on.off_mm(NEAR) > 10.0
     assert on.line(NEAR) == 0
 
 
-def test_reduced_mode_comes_and_goes_with_its_input_and_moves_are_slow_meanwhile(on: Any):
-    on.cabinet.power.reduce(True)
-    assert on.safety == "ReducedMode"
+def test_moves_are_slow_in_reduced_mode(on: Any):
+    on.cabinet.power.safety = SafetyMode.REDUCED
     on.line(brush_pose(600.0, -230.0, 260.0), v=1.0)
     on.clock.s += 0.8
     assert on.speed_m_s() == pytest.approx(0.25)
     on.clock.s += 10.0
-    on.cabinet.power.reduce(False)
-    assert on.safety == "Normal"
+    on.cabinet.power.safety = SafetyMode.NORMAL
     on.line(NEAR, v=1.0)
     on.clock.s += 0.48
     assert on.speed_m_s() > 0.4

@@ -1,0 +1,439 @@
+"""The loopback cabinet: an arm's motion, tool, power, safety and watchdogs, and its methods by their names on the wire.
+
+It simulates what a driver can get wrong: refusals by return code, poses that are accepted first and fail in planning, a
+path that a protective stop keeps. It simulates neither accuracy nor safety functions. Speeds above what the arm allows
+are clipped. The joints' speeds are those of the maker's URDF for the i5; the other maxima are the examples in the SDK's
+headers, which are for an i5H. A real cabinet reports its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOWED, ReturnCode, RobotMode, SafetyMode
+from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import from_wire, to_wire
+from brushloop.drivers.sim.kinematics import LIMITS_DEG, Joints, forward, inverse, inverted, matrix_of, pose_of
+from brushloop.drivers.sim.world import World
+
+BOOT_S = 0.7
+POWER_ON_S = 1.0
+"""Time from `poweron` to Idle."""
+BRAKE_RELEASE_S = 1.0
+POWER_OFF_S = 0.3
+
+EMERGENCY_STOPS = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
+
+
+class Power:
+    """Power and safety state. `now_s` is simulated time; each transition takes effect when it is due."""
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._steps: list[tuple[float, RobotMode]] = [(-1.0, RobotMode.POWER_OFF)]
+        self.safety = SafetyMode.NORMAL
+        self.button_down = False
+        """Whether the emergency stop button is down; a person pushes and releases it."""
+
+    @property
+    def mode(self) -> RobotMode:
+        """The robot mode now."""
+        while len(self._steps) > 1 and self._steps[1][0] <= self._now_s():
+            self._steps.pop(0)
+        return self._steps[0][1]
+
+    @property
+    def on(self) -> bool:
+        """True from PowerOn to Running."""
+        return self.joint_state != "Poweroff"
+
+    @property
+    def joint_state(self) -> str:
+        """What every joint reports in the robot mode."""
+        if self.mode in {RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.BRAKE_RELEASING}:
+            return "Idle"
+        return "Running" if self.mode == RobotMode.RUNNING else "Poweroff"
+
+    def power_on(self) -> int:
+        """Request power; Idle comes `POWER_ON_S` later."""
+        if self.safety in EMERGENCY_STOPS:
+            return ReturnCode.BAD_STATE
+        if self.mode == RobotMode.POWER_OFF:
+            self.then((0.0, RobotMode.BOOTING), (BOOT_S, RobotMode.POWER_ON), (POWER_ON_S, RobotMode.IDLE))
+        return ReturnCode.OK
+
+    def start_up(self) -> int:
+        """Request the brakes' release; Running comes `BRAKE_RELEASE_S` later."""
+        if self.mode == RobotMode.RUNNING:
+            return ReturnCode.OK
+        if self.mode != RobotMode.IDLE or self.safety not in MOVING_ALLOWED:
+            return ReturnCode.BAD_STATE
+        self.then((0.0, RobotMode.BRAKE_RELEASING), (BRAKE_RELEASE_S, RobotMode.RUNNING))
+        return ReturnCode.OK
+
+    def unlock(self) -> int:
+        """Clear a protective stop and nothing else. The arm does not resume by itself."""
+        if self.safety != SafetyMode.PROTECTIVE_STOP:
+            return ReturnCode.REQUEST_IGNORED if self.safety == SafetyMode.NORMAL else ReturnCode.BAD_STATE
+        self.safety = SafetyMode.NORMAL
+        return ReturnCode.OK
+
+    def restart_interface_board(self) -> int:
+        """Clear an emergency stop or a fault, once the button is released and the power is off."""
+        if self.button_down or self.mode != RobotMode.POWER_OFF:
+            return ReturnCode.BAD_STATE
+        if self.safety in EMERGENCY_STOPS or self.safety == SafetyMode.FAULT:
+            self.safety = SafetyMode.NORMAL
+        return ReturnCode.OK
+
+    def then(self, *steps: tuple[float, RobotMode]) -> None:
+        """Go through these modes, each so many seconds from now."""
+        now_s = self._now_s()
+        self._steps = [(now_s + after_s, mode) for after_s, mode in steps]
+
+
+ROBOT = "rob1"
+IK_NO_CONVERGE = -23
+HARD_STOP_M_S2 = 10.0
+SOFT_STOP_M_S2 = 2.0
+JOINT_SPEEDS_RAD_S = (2.5964, 2.5964, 2.5964, 3.1105, 3.1105, 3.1105)
+JOINT_ACCS_RAD_S2 = (31.1, 31.1, 31.1, 20.7, 20.7, 20.7)
+TCP_SPEED_M_S, TCP_ACC_M_S2 = 2.0, 10.0
+REDUCED_M_S = 0.25
+"""Limit in reduced mode and manual operation: ISO 10218-1's reduced speed, 250 mm/s. Configurable on a real cabinet."""
+REACH_M = 0.8865
+REDUCED_RAD_S = REDUCED_M_S / REACH_M
+"""Joint speed at which the tip of the stretched arm stays below `REDUCED_M_S`."""
+POSE_OUT_OF_REACH = 30047
+BLEND_M = (0.001, 1.0)
+OPERATIONAL_MODES = ("Disabled", "Automatic", "Manual")
+
+Params = dict[str, Any]
+
+
+class Cabinet:
+    """State behind the controller's methods. The world decides where the tip is; the joints follow from it."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.motion = world.motion
+        self.power = Power(self.now_s)
+        self.tcp_offset = [0.0] * 6
+        self.payload: list[Any] = [0.0, [0.0] * 3, [0.0] * 3, [0.0] * 6]
+        self.collision_level = 6
+        self.operational_mode = "Automatic"
+        self.messages: list[dict[str, Any]] = []
+        self._near = self.motion.near
+        """Joints of the last pose that was asked for: the next one is likely to be near."""
+        self.watchdogs: dict[str, asyncio.TimerHandle] = {}
+        """The watchdogs that wait, by key."""
+
+    def now_s(self) -> float:
+        """Simulated time."""
+        return self.world.clock.now_s()
+
+    def safety_stop(self, mode: SafetyMode = SafetyMode.PROTECTIVE_STOP) -> None:
+        """Enter a safety stop where the arm is; only a person can clear it, and no lesser stop replaces it.
+
+        A protective stop keeps the path. An emergency stop, whose button is then down, switches the power off at once.
+        """
+        if mode == SafetyMode.PROTECTIVE_STOP:
+            self.hold(HARD_STOP_M_S2)
+        else:
+            self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
+        if mode in EMERGENCY_STOPS:
+            self.power.button_down = True
+            self.power.then((0.0, RobotMode.POWER_OFF))
+        if mode in EMERGENCY_STOPS or self.power.safety not in EMERGENCY_STOPS:
+            self.power.safety = mode
+
+    def release(self) -> str:
+        """End a safety stop as a person at the arm would; return the previous safety mode.
+
+        A protective stop is unlocked at the pendant, and a safeguard stop is reset at its input. For an emergency stop,
+        the button is released and the interface board restarted, which leaves the arm without power.
+        """
+        before = self.power.safety
+        if before in EMERGENCY_STOPS:
+            self.power.button_down = False
+            self.power.restart_interface_board()
+        elif before in {SafetyMode.PROTECTIVE_STOP, SafetyMode.SAFEGUARD_STOP}:
+            self.power.safety = SafetyMode.NORMAL
+        return before.value
+
+    def power_off(self) -> int:
+        """Stop the arm, engage the brakes, then switch its power off."""
+        self.stop(HARD_STOP_M_S2, HARD_STOP_M_S2)
+        if self.power.mode != RobotMode.POWER_OFF:
+            self.power.then((0.0, RobotMode.POWERING_OFF), (POWER_OFF_S, RobotMode.POWER_OFF))
+        return ReturnCode.OK
+
+    @property
+    def tcp_offset(self) -> list[float]:
+        """Flange to tool centre point as configured: [x, y, z m, rx, ry, rz rad]. The true tip stays where it is."""
+        return self._tcp_offset
+
+    @tcp_offset.setter
+    def tcp_offset(self, offset: list[float]) -> None:
+        self._tcp_offset = list(offset)
+        self._tool = matrix_of(from_wire(offset))
+        fix = inverted(self._tool) @ self.motion.tool
+        self._fix = None if np.allclose(fix, np.eye(4), rtol=0.0, atol=1e-9) else fix
+        """From the configured tool centre point to the true tip; None if they are the same."""
+
+    def configured(self, tip: Pose) -> Pose:
+        """Where the controller takes the tip to be, at the configured tool centre point, when the true one is there."""
+        return tip if self._fix is None else pose_of(matrix_of(tip) @ inverted(self._fix))
+
+    def tcp(self) -> Pose:
+        """Pose of the configured tool centre point now."""
+        return self.configured(self.world.tool())
+
+    def joints(self) -> Joints:
+        """Joint positions for the present pose of the tip."""
+        return self.motion.joints(self.now_s())
+
+    def fk(self, q: list[float]) -> list[Any]:
+        """[pose of the configured tool centre point, return code]."""
+        return [to_wire(pose_of(forward([float(v) for v in q]) @ self._tool)), 0]
+
+    def ik(self, near: list[float], pose: list[float]) -> list[Any]:
+        """[joints, return code]; the joints are `near` if there is no solution."""
+        joints = self._flange(from_wire([float(v) for v in pose]), _floats(near, 6))
+        return [list(near), IK_NO_CONVERGE] if joints is None else [list(joints), 0]
+
+    def _flange(self, target: Pose, *near: list[float] | Joints) -> Joints | None:
+        """Joints for a pose of the configured tool centre point, searched from each of `near` in turn."""
+        flange = matrix_of(target) @ inverted(self._tool)
+        return next((joints for start in near if (joints := inverse(flange, start)) is not None), None)
+
+    def stop(self, acc_m_s2: float, acc_rad_s2: float) -> int:
+        """Decelerate and forget the path."""
+        if not (acc_m_s2 > 0.0 and acc_rad_s2 > 0.0):
+            return -ReturnCode.INVALID_ARGUMENT
+        self.motion.stop(acc_m_s2 * 1e3, acc_rad_s2, self.now_s())
+        return ReturnCode.OK
+
+    def hold(self, acc_m_s2: float = SOFT_STOP_M_S2) -> int:
+        """Decelerate and keep the path."""
+        self.motion.hold(acc_m_s2 * 1e3, acc_m_s2, self.now_s())
+        return ReturnCode.OK
+
+    def resume(self) -> int:
+        """Resume a path that was held. Refused while a safety stop lasts."""
+        code = self._may_move()
+        if code == ReturnCode.OK:
+            self.motion.resume(self.now_s())
+        return code
+
+    def _may_move(self) -> int:
+        if self.power.mode != RobotMode.RUNNING:
+            return -1
+        return ReturnCode.OK if self.power.safety in MOVING_ALLOWED else ReturnCode.BAD_STATE
+
+    def move_line(self, p: Params) -> int:
+        """Queue a line; a pose out of reach is accepted first and fails in planning, as on a controller."""
+        target = from_wire([float(v) for v in p["pose"]])
+        if (code := self._admit(p)) != ReturnCode.OK:
+            return code
+        joints = self._flange(target, self._near, self.motion.near)
+        if joints is None:
+            return self._out_of_reach()
+        self._near = joints
+        speed_m_s, acc_m_s2 = self._pace(p, TCP_SPEED_M_S, TCP_ACC_M_S2, REDUCED_M_S)
+        added = self.motion.add(
+            target,
+            speed_m_s * 1e3,
+            acc_m_s2 * 1e3,
+            self.now_s(),
+            float(p.get("duration", 0.0)),
+            blend_mm=float(p.get("blend_radius", 0.0)) * 1e3,
+            fix=self._fix,
+        )
+        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
+
+    def move_joint(self, p: Params) -> int:
+        """Queue a move that is straight in joints."""
+        q = [float(v) for v in p["q"]]
+        if len(q) != 6 or not all(math.isfinite(v) for v in q):
+            return -ReturnCode.INVALID_ARGUMENT
+        if (code := self._admit(p)) != ReturnCode.OK:
+            return code
+        if any(abs(v) > math.radians(limit) for v, limit in zip(q, LIMITS_DEG, strict=True)):
+            return self._out_of_reach()
+        speed_rad_s, acc_rad_s2 = self._pace(p, min(JOINT_SPEEDS_RAD_S), min(JOINT_ACCS_RAD_S2), REDUCED_RAD_S)
+        joints: Joints = (q[0], q[1], q[2], q[3], q[4], q[5])
+        least_s = float(p.get("duration", 0.0))
+        added = self.motion.add_joints(joints, speed_rad_s, acc_rad_s2, self.now_s(), least_s)
+        return ReturnCode.OK if added else ReturnCode.REQUEST_IGNORED
+
+    def _admit(self, p: Params) -> int:
+        """Return code for queueing a move: OK if it may be queued."""
+        if (code := self._may_move()) != ReturnCode.OK:
+            return code
+        acc, speed, duration_s = float(p["a"]), float(p["v"]), float(p.get("duration", 0.0))
+        blend_m = float(p.get("blend_radius", 0.0))
+        timed = math.isfinite(duration_s) and duration_s > 0.0  # then a and v may be left at 0
+        if not (duration_s == 0.0 or timed) or math.isnan(acc) or math.isnan(speed):
+            return -ReturnCode.INVALID_ARGUMENT
+        if not (timed or (acc > 0.0 and speed > 0.0)) or not (blend_m == 0.0 or BLEND_M[0] <= blend_m <= BLEND_M[1]):
+            return -ReturnCode.INVALID_ARGUMENT
+        return ReturnCode.QUEUE_FULL if self.motion.full else ReturnCode.OK
+
+    def _pace(self, p: Params, fastest: float, hardest: float, reduced: float) -> tuple[float, float]:
+        """Speed and acceleration, clipped to what the arm allows; the maxima if only a duration was given."""
+        speed, acc = float(p["v"]), float(p["a"])
+        slow = self.power.safety == SafetyMode.REDUCED or self.operational_mode == "Manual"
+        limit = reduced if slow else fastest
+        return min(speed, limit) if speed > 0.0 else limit, min(acc, hardest) if acc > 0.0 else hardest
+
+    def _out_of_reach(self) -> int:
+        """Accept a move that then proves to be out of reach: the arm stops and a message says why."""
+        self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
+        self.tell(POSE_OUT_OF_REACH)
+        return ReturnCode.OK
+
+    def tell(self, code: int) -> None:
+        """Put a message where `Trace.peek` finds it."""
+        stamp = max(int(self.now_s() * 1e9), self.messages[-1]["timestamp"] + 1 if self.messages else 1)
+        self.messages.append({"code": code, "level": "ERROR", "source": ROBOT, "args": [], "timestamp": stamp})
+
+    def queue_size(self) -> int:
+        """Number of moves that are not over."""
+        self.motion.advance(self.now_s())
+        return self.motion.size
+
+    def set_watchdog(self, key: str, timeout_s: float, action: int) -> int:
+        """Restart the watchdog `key` from now; action 0 ends it. It counts real time, as its client does."""
+        if action not in (0, 1, 2, 3) or not timeout_s >= 0.1:
+            return -ReturnCode.INVALID_ARGUMENT
+        if (timer := self.watchdogs.pop(key, None)) is not None:
+            timer.cancel()
+        if action:
+            self.watchdogs[key] = asyncio.get_running_loop().call_later(timeout_s, self._fire, key, action)
+        return ReturnCode.OK
+
+    def close(self) -> None:
+        """End the watchdogs' timers."""
+        for timer in self.watchdogs.values():
+            timer.cancel()
+        self.watchdogs.clear()
+
+    def _fire(self, key: str, action: int) -> None:
+        self.watchdogs.pop(key, None)
+        match action:
+            case 1:
+                self.hold()
+            case 2:
+                self.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2)
+            case _:
+                self.safety_stop(SafetyMode.PROTECTIVE_STOP)
+
+    def set_speed_fraction(self, fraction: float) -> int:
+        """Scale the speed of every move that has not begun."""
+        if not 0.0 < fraction <= 1.0:
+            return -ReturnCode.INVALID_ARGUMENT
+        self.motion.set_fraction(fraction, self.now_s())
+        return ReturnCode.OK
+
+    def configure(self, name: str, value: object, allowed: bool) -> int:
+        """Set one of the cabinet's settings, if the value is allowed."""
+        if not allowed:
+            return -ReturnCode.INVALID_ARGUMENT
+        setattr(self, name, value)
+        return ReturnCode.OK
+
+    def set_tcp_offset(self, p: Params) -> int:
+        """Take the flange to tool centre point, in m and rad."""
+        offset = [float(v) for v in p["offset"]]
+        return self.configure("tcp_offset", offset, len(offset) == 6 and all(math.isfinite(v) for v in offset))
+
+    def set_payload(self, p: Params) -> int:
+        """Take mass in kg, centre of gravity in m, and what a robot has beside."""
+        mass_kg, inertia = float(p["m"]), [float(v) for v in p["inertia"]]
+        payload = [mass_kg, _floats(p["cog"], 3), _floats(p["aom"], 3), inertia]
+        return self.configure("payload", payload, 0.0 <= mass_kg <= 5.0 and len(inertia) in (6, 9))
+
+    def peek(self, count: int, after: int) -> list[dict[str, Any]]:
+        """The newest `count` messages after a time stamp."""
+        return [m for m in self.messages if m["timestamp"] > after][-count:] if count > 0 else []
+
+
+def _floats(values: Any, count: int) -> list[float]:
+    floats = [float(v) for v in values]
+    if len(floats) != count or not all(math.isfinite(v) for v in floats):
+        raise ValueError(f"expected {count} finite numbers, got {values!r}")
+    return floats
+
+
+def methods(cabinet: Cabinet) -> dict[str, Callable[[Params], Any]]:
+    """Every method that the controller knows by name, from named params to what goes on the wire.
+
+    Any other method is unknown to it (-32601). May raise KeyError, TypeError or ValueError for wrong params.
+    """
+    power, motion, now_s = cabinet.power, cabinet.motion, cabinet.now_s
+    of_robot: dict[str, Callable[[Params], Any]] = {
+        "MotionControl.moveLine": cabinet.move_line,
+        "MotionControl.moveJoint": cabinet.move_joint,
+        "MotionControl.stopLine": lambda p: cabinet.stop(float(p["acc"]), float(p["acc_rot"])),
+        "MotionControl.stopJoint": lambda p: cabinet.stop(SOFT_STOP_M_S2, float(p["acc"])),
+        "MotionControl.stopMove": lambda _: cabinet.hold(),
+        "MotionControl.startMove": lambda _: cabinet.resume(),
+        "MotionControl.setSpeedFraction": lambda p: cabinet.set_speed_fraction(float(p["fraction"])),
+        "MotionControl.getSpeedFraction": lambda _: motion.fraction,
+        "MotionControl.getExecId": lambda _: motion.exec_id(now_s()),
+        "MotionControl.getQueueSize": lambda _: cabinet.queue_size(),
+        "RobotConfig.getRobotType": lambda _: "aubo_i5",
+        "RobotConfig.getRobotSubType": lambda _: "aubo_i5_11",
+        "RobotConfig.getControlBoxType": lambda _: LOOPBACK_CONTROL_BOX,
+        "RobotConfig.getDof": lambda _: 6,
+        "RobotConfig.setTcpOffset": cabinet.set_tcp_offset,
+        "RobotConfig.getTcpOffset": lambda _: cabinet.tcp_offset,
+        "RobotConfig.setPayload": cabinet.set_payload,
+        "RobotConfig.getPayload": lambda _: cabinet.payload,
+        "RobotConfig.setCollisionLevel": lambda p: cabinet.configure(
+            "collision_level", int(p["level"]), 0 <= int(p["level"]) <= 9
+        ),
+        "RobotConfig.getCollisionLevel": lambda _: cabinet.collision_level,
+        "RobotManage.poweron": lambda _: power.power_on(),
+        "RobotManage.startup": lambda _: power.start_up(),
+        "RobotManage.poweroff": lambda _: cabinet.power_off(),
+        "RobotManage.getOperationalMode": lambda _: cabinet.operational_mode,
+        "RobotManage.setOperationalMode": lambda p: cabinet.configure(
+            "operational_mode", p["mode"], p["mode"] in OPERATIONAL_MODES
+        ),
+        "RobotManage.setUnlockProtectiveStop": lambda _: power.unlock(),
+        "RobotManage.restartInterfaceBoard": lambda _: power.restart_interface_board(),
+        "RobotManage.isSimulationEnabled": lambda _: True,  # no arm is behind this controller
+        "RobotState.getRobotModeType": lambda _: power.mode.value,
+        "RobotState.getSafetyModeType": lambda _: power.safety.value,
+        "RobotState.isPowerOn": lambda _: power.on,
+        "RobotState.isSteady": lambda _: motion.steady(now_s()),
+        "RobotState.getTcpPose": lambda _: to_wire(cabinet.tcp()),
+        "RobotState.getJointPositions": lambda _: cabinet.joints(),
+        "RobotState.getJointState": lambda _: [power.joint_state] * 6,
+        "RobotAlgorithm.forwardKinematics": lambda p: cabinet.fk(p["q"]),
+        "RobotAlgorithm.inverseKinematics": lambda p: cabinet.ik(p["qnear"], p["pose"]),
+        "Trace.peek": lambda p: cabinet.peek(int(p["num"]), int(p.get("last_time", 0))),
+    }
+    of_controller: dict[str, Callable[[Params], Any]] = {
+        "SystemInfo.getInterfaceVersionCode": lambda _: 24000,
+        "SystemInfo.getControlSoftwareVersionCode": lambda _: 31001,
+        "SystemInfo.getControlSoftwareFullVersion": lambda _: f"0.31.1-{LOOPBACK_CONTROL_BOX}",
+        "getRobotNames": lambda _: [ROBOT],
+        "RuntimeMachine.abort": lambda _: cabinet.stop(SOFT_STOP_M_S2, SOFT_STOP_M_S2),
+        "RuntimeMachine.stop": lambda _: ReturnCode.OK,  # a program, not motion that clients asked for
+        "RuntimeMachine.pause": lambda _: cabinet.hold(),
+        "RuntimeMachine.resume": lambda _: cabinet.resume(),
+        # Motion from a client runs with the runtime Stopped.
+        "RuntimeMachine.getRuntimeState": lambda _: "Paused" if motion.held else "Stopped",
+        "RegisterControl.setWatchDog": lambda p: cabinet.set_watchdog(
+            str(p["key"]), float(p["timeout"]), int(p["action"])
+        ),
+    }
+    return {f"{ROBOT}.{name}": method for name, method in of_robot.items()} | of_controller
