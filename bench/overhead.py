@@ -14,7 +14,7 @@ import json
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -209,18 +209,9 @@ async def _controller(path: Path, seed: int) -> None:
     from brushloop.drivers.sim.config import SimConfig
     from brushloop.drivers.sim.rig import LoopbackRig
 
-    spans: list[Span] = []
     async with LoopbackRig(SimConfig(seed=seed + 1)) as rig:
         queue, clock = rig.world.motion, rig.world.clock
-        finish = queue._finish  # pyright: ignore[reportPrivateUsage]
-
-        def finished(segment: Any) -> None:
-            # At rate 1 the rig's clock and the monotonic one, which all processes share, differ by a constant.
-            shift_s = time.monotonic() - clock.now_s()
-            spans.append((segment.begin_s + shift_s, segment.end_s + shift_s))
-            finish(segment)
-
-        queue._finish = finished  # pyright: ignore[reportPrivateUsage]
+        queue.rests = deque()  # all of them
         # The rig and what collects share the cores with whatever else runs here, and a sensor's thread that has to wait
         # for one falls silent. No brush is in danger: the longest silence that the loopback bus may have is allowed.
         text = rig.toml()
@@ -229,6 +220,9 @@ async def _controller(path: Path, seed: int) -> None:
         questions = await lines_of_input()
         tell("ready")
         while await questions.readline():
+            # At rate 1 the rig's clock and the monotonic one, which all processes share, differ by a constant.
+            shift_s = time.monotonic() - clock.now_s()
+            spans: list[Span] = [(rest.left_s + shift_s, rest.at_s + shift_s) for rest in queue.rests]
             tell(json.dumps(spans))
 
 

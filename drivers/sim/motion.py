@@ -128,6 +128,8 @@ class Rest:
 
     at_s: float
     pose: Pose
+    left_s: float
+    """When the arm had left the rest before."""
 
 
 def timetable(pieces: Sequence[Piece], start: Knot) -> list[Knot] | None:
@@ -181,6 +183,8 @@ class MotionQueue:
         self._solved: tuple[Pose, Joints] | None = None
         """The last pose whose joints were found, and the joints."""
         self._rest = home
+        self._left_s = -1.0
+        """When the arm left the last rest, or came to it."""
         self._on_path = on_path
         self._capacity = capacity
         self._next_id = 0
@@ -238,9 +242,11 @@ class MotionQueue:
         """Retire every piece that is over by `now_s`."""
         while len(self._knots) > 1 and self._knots[1].at_s <= now_s:
             self._knots.pop(0)
-            self._retire(self._knots[0].along)
-            if self._knots[0].speed == 0.0:
-                self.rests.append(Rest(self._knots[0].at_s, self._tip(self._knots[0])))
+            knot = self._knots[0]
+            self._retire(knot.along)
+            if knot.speed == 0.0:
+                self.rests.append(Rest(knot.at_s, self._tip(knot), self._left_s))
+                self._left_s = knot.at_s
         self._retire(self._at(now_s).along)
 
     def stop(self, acc_mm_s2: float, acc_rad_s2: float, now_s: float) -> None:
@@ -369,7 +375,10 @@ class MotionQueue:
     def _go_on(self, pieces: Sequence[Piece], now_s: float) -> None:
         """Travel the pieces from the rest in which the timetable ends."""
         rest = self._knots[-1]
-        self._knots[-1:] = timetable(pieces, Knot(max(rest.at_s, now_s), rest.along, 0.0)) or [rest]
+        start = Knot(max(rest.at_s, now_s), rest.along, 0.0)
+        if len(self._knots) == 1:
+            self._left_s = start.at_s
+        self._knots[-1:] = timetable(pieces, start) or [rest]
 
     def _rounded(self, move: Move, along: float) -> list[Piece] | None:
         """The path with a move appended, and with a corner into it; None where the last move ends at rest.
