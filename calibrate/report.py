@@ -8,14 +8,16 @@ import hashlib
 import html
 import io
 import json
+import math
 import re
-from collections.abc import Iterable, Mapping
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import Frozen
@@ -25,10 +27,13 @@ from brushloop.calibrate.session import Calibration
 from brushloop.sessions.records import Header, Source
 
 Image = NDArray[np.float32]
+Floats = NDArray[np.float64]
 PAPER = "#fbf9f4"
 """Background of picture files."""
-BLUE, ORANGE = "#0072B2", "#D55E00"
-"""Colours of Okabe and Ito for a plot's lines and points."""
+COLOURS = BLUE, ORANGE, *_ = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
+"""Colours of Okabe and Ito for a chart's lines and points."""
+LINE_PX, CHAR_PX, PADDING = 16, 7, 0.04
+"""Height of a line of a chart's text, about the width of a character, and the margin of an axis as a share of it."""
 PHOTOGRAPH_PX, JPEG_QUALITY = 1600, 80
 """Longest side and quality of a photograph in a page: about 500 kB at most."""
 ORIGIN = {
@@ -228,15 +233,104 @@ def dress(axis: Any, title: str, x: str, y: str = "", *, grid: str = "both", leg
         axis.legend()
 
 
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """Points of a chart, (n,) x and y, as dots, joined by a line, or both; a point that is not finite is left out."""
+
+    x: ArrayLike
+    y: ArrayLike
+    colour: str = BLUE
+    name: str = ""
+    """In the legend, if there is one."""
+    dot_px: float = 0.0
+    line_px: float = 0.0
+    """Diameter of the dots and width of the line; 0 for none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """An axis of a chart; without `ticks` (value -> text) up to seven round values are chosen."""
+
+    name: str = ""
+    ticks: Mapping[float, str] | None = None
+    log: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One pair of axes of a chart."""
+
+    title: str
+    x: Axis
+    y: Axis
+    marks: Sequence[Marks]
+
+
+def chart_uri(panels: Sequence[Panel], size_px: tuple[int, int], title: str = "") -> str:
+    """Panels side by side below a title, as an SVG data URI; the same panels give the same bytes."""
+    width, height = size_px
+    head, heads = _lines(title, width), [_lines(panel.title, width // len(panels)) for panel in panels]
+    above = LINE_PX * (1 + len(head))
+    named = any(mark.name for panel in panels for mark in panel.marks)
+    top, bottom = above + LINE_PX * (max(map(len, heads)) + named) - 4, height - 3 * LINE_PX
+    scales = [_scale(panel.y, [mark.y for mark in panel.marks], bottom, top) for panel in panels]
+    beside = [
+        CHAR_PX * max(len(text) for _, text in ticks) + (2 * LINE_PX if panel.y.name else LINE_PX)
+        for panel, (_, ticks) in zip(panels, scales, strict=True)
+    ]
+    side = (width - sum(beside)) // len(panels) - LINE_PX
+    drawn: list[dict[str, Any]] = []
+    for k, (panel, (y_of, y_ticks)) in enumerate(zip(panels, scales, strict=True)):
+        left = sum(beside[: k + 1]) + k * (side + LINE_PX)
+        x_of, x_ticks = _scale(panel.x, [mark.x for mark in panel.marks], left, left + side)
+        marks: list[tuple[Marks, list[tuple[float, float]]]] = []
+        for mark in panel.marks:
+            places = np.stack([x_of(np.asarray(mark.x)), y_of(np.asarray(mark.y))], axis=-1)
+            marks.append((mark, places[np.isfinite(places).all(axis=1)].tolist()))
+        frame = {"left": left, "right": left + side, "beside": beside[k], "x_ticks": x_ticks, "y_ticks": y_ticks}
+        legend = [(mark.colour, printable(mark.name)) for mark in panel.marks if mark.name]
+        drawn.append({"title": heads[k], "x": panel.x, "y": panel.y, "marks": marks, "legend": legend, **frame})
+    about = {"width": width, "height": height, "title": head, "above": above, "top": top, "bottom": bottom}
+    svg = render("chart.svg.j2", panels=drawn, **about)
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+
+
+def _scale(
+    axis: Axis, values: Sequence[ArrayLike], start_px: float, end_px: float
+) -> tuple[Callable[[Floats], Floats], list[tuple[float, str]]]:
+    """Where values lie along an axis, in pixels, and its ticks with their texts."""
+    known = np.concatenate([np.asarray(part, np.float64) for part in values]) if values else np.ones(1)
+    known = known[np.isfinite(known)] if np.isfinite(known).any() else np.ones(1)
+    ticks = axis.ticks or _ticks(float(known.min()), float(known.max()), log=axis.log)
+    shape = np.log10 if axis.log else np.positive
+    ends = shape(np.array([*known, *ticks], np.float64))
+    low, range_of = float(ends.min()), float(np.ptp(ends)) or 1.0
+    step_px = (end_px - start_px) / (1.0 + 2.0 * PADDING) / range_of
+
+    def place(at: Floats) -> Floats:
+        return np.round(start_px + (shape(at) - low + PADDING * range_of) * step_px, 1)
+
+    return place, list(zip(place(np.array([*ticks], np.float64)).tolist(), ticks.values(), strict=True))
+
+
+def _ticks(low: float, high: float, *, log: bool) -> dict[float, str]:
+    """Up to seven round values between two: powers of ten on a logarithmic axis that holds two of them."""
+    if log and (powers := range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1))[1:]:
+        return {10.0**power: f"{10.0**power:g}" for power in powers}
+    rough = (high - low) / 7.0 or 1.0
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = power * next(unit for unit in (1, 2, 5, 10) if unit * power >= rough)
+    return {k * step: f"{k * step:.6g}" for k in range(math.ceil(low / step), math.floor(high / step) + 1)}
+
+
+def _lines(text: str, width_px: int) -> list[str]:
+    """The text in lines of at most about this width."""
+    return textwrap.wrap(printable(text), max(1, width_px // CHAR_PX))
+
+
 def printable(text: str) -> str:
     """A name or label for the text of a plot, with `?` for every character that no font draws."""
     return "".join(c if c.isprintable() else "?" for c in text)
-
-
-def shortened(text: str, most: int) -> str:
-    """The text for a plot, at most so long."""
-    short = printable(text)
-    return short if len(short) <= most else f"{short[: most - 1]}…"
 
 
 def plot_uri(figure: Any) -> str:

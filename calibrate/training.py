@@ -16,13 +16,13 @@ from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.report import (
     BLUE,
     ORANGE,
+    Axis,
+    Marks,
+    Panel,
     Point,
-    dress,
+    chart_uri,
     ink_uri,
     overlay_uri,
-    plot,
-    plot_uri,
-    shortened,
     write_page,
 )
 from brushloop.model.generator.config import INPUTS
@@ -103,17 +103,15 @@ def _trust(file: GeneratorFile, checks: NDArray[np.float64]) -> Iterator[Point]:
 
 def _losses(losses: NDArray[np.float64], checks: NDArray[np.float64], label: str) -> str:
     """Training loss of the steps with its running mean, and the validation losses: the paper's figure 9."""
-    figure, axis = plot(1, 1, (10.0, 3.8))
     steps, losses = losses.T
     every = slice(None, None, max(1, -(-len(losses) // MAX_POINTS)))
-    axis.semilogy(steps[every], losses[every], color="0.75", lw=0.6, label="training, Eq. 6, each step")
+    marks = [Marks(steps[every], losses[every], "#bfbfbf", "training, Eq. 6, each step", line_px=0.7)]
     if len(losses) > 10 * SMOOTH_STEPS:
         mean = np.convolve(losses, np.full(SMOOTH_STEPS, 1.0 / SMOOTH_STEPS), "valid")
-        label_of_mean = f"mean of {SMOOTH_STEPS} steps"
-        axis.semilogy(steps[SMOOTH_STEPS - 1 :][every], mean[every], color=BLUE, lw=1.2, label=label_of_mean)
-    axis.semilogy(*checks.T, ".-", color=ORANGE, lw=1.2, label="validation, MSE")
-    dress(axis, f"losses ({shortened(label, 60)})", "step", "loss", legend=True)
-    return plot_uri(figure)
+        name = f"mean of {SMOOTH_STEPS} steps"
+        marks.append(Marks(steps[SMOOTH_STEPS - 1 :][every], mean[every], BLUE, name, line_px=1.2))
+    marks.append(Marks(checks[:, 0], checks[:, 1], ORANGE, "validation, MSE", dot_px=5.0, line_px=1.2))
+    return chart_uri([Panel(f"losses ({label})", Axis("step"), Axis("loss", log=True), marks)], (1060, 400))
 
 
 def _facts(file: GeneratorFile, path: Path) -> Iterator[tuple[str, str]]:

@@ -21,13 +21,13 @@ from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.drags.captures import MM_PER_PX, Drags, Drawn, read_drags
 from brushloop.calibrate.drags.fit import PREDICTED, DragArtefact, predicted
 from brushloop.calibrate.report import (
-    BLUE,
     ORANGE,
-    dress,
+    Axis,
+    Marks,
+    Panel,
+    chart_uri,
     image_uri,
     overlay_uri,
-    plot,
-    plot_uri,
     recording_facts,
     render,
     source_label,
@@ -270,14 +270,13 @@ def fit_sentences(drags: Drags) -> Iterator[str]:
 
 def _plot(drags: Drags) -> str:
     """Width against depth, with the fitted line."""
-    figure, axis = plot(1, 1, (6.0, 3.4))
-    points, line = drags.widths(), drags.width_on_depth()
-    axis.plot([x for x, _ in points], [y for _, y in points], ".", ms=5, alpha=0.6, color=BLUE)
+    points, line = np.array(drags.widths()).reshape(-1, 2), drags.width_on_depth()
+    marks = [Marks(points[:, 0], points[:, 1], dot_px=5.0)]
     if line is not None:
-        ends = np.array([min(points)[0], max(points)[0]])
-        axis.plot(ends, line.slope * ends + line.intercept, color=ORANGE, lw=1.5)
-    dress(axis, str(drags.header.source), "commanded depth, mm", "measured width at the middle, mm")
-    return plot_uri(figure)
+        ends = np.array([points[:, 0].min(), points[:, 0].max()])
+        marks.append(Marks(ends, line.slope * ends + line.intercept, ORANGE, line_px=1.5))
+    across, up = Axis("commanded depth, mm"), Axis("measured width at the middle, mm")
+    return chart_uri([Panel(str(drags.header.source), across, up, marks)], (720, 400))
 
 
 def summary(validation: DragValidation) -> Iterator[Table | str]:

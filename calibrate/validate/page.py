@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import textwrap
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,14 @@ from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.report import (
     BLUE,
+    COLOURS,
     ORANGE,
-    dress,
+    Axis,
+    Marks,
+    Panel,
+    chart_uri,
     ink_uri,
     overlay_uri,
-    plot,
-    plot_uri,
     recording_facts,
     render,
     source_note,
@@ -48,8 +50,6 @@ MAX_REFUSED = 200
 ROWS = slice(32, 96)
 """Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 MAX_POINTS = 200
-LABEL_CHARS = 120
-"""As many fit on a line over two plots; a label that names a simulated brush is longer."""
 MAX_SAMPLES, MAX_CELLS, EXTREMES = 15, 5, 6
 MAX_CURVE_BYTES = 64 * 1024 * 1024
 
@@ -182,55 +182,51 @@ def _predicted(outcome: Outcome, row: Row, name: str) -> Image | None:
 
 def _distributions(outcome: Outcome, report: Report) -> str:
     """CSIM of every stroke by model in both alignments, with the average and its interval."""
-    models = [model for name in outcome.scores.models if (model := report.model(name)) is not None]
-    figure, axes = plot(1, 2, (11.0, 0.9 + 0.36 * len(models)))
-    for axis, key in zip(axes, (STRICT, NORMAL), strict=True):
+    models = [model for name in outcome.scores.models if (model := report.model(name)) is not None][::-1]
+    panels: list[Panel] = []
+    for key in (STRICT, NORMAL):
         rng = np.random.default_rng(0)  # jitter only, so that points do not hide each other
-        for place, model in enumerate(reversed(models)):
+        marks: list[Marks] = []
+        for place, model in enumerate(models):
             stat = report.stat(model.name, key)
             if stat is None:
                 continue
-            values = 100.0 * outcome.scores.of_key(model.name, key)[:, 0]
-            values = values[np.isfinite(values)]
-            some = values[:: max(1, -(-len(values) // MAX_POINTS))]
-            axis.plot(some, place + 0.14 * rng.uniform(-1, 1, len(some)), ".", ms=3, alpha=0.5, color=BLUE)
+            csim = 100.0 * outcome.scores.of_key(model.name, key)[:, 0]
+            csim = csim[np.isfinite(csim)][:: max(1, -(-len(csim) // MAX_POINTS))]
+            marks.append(Marks(csim, place + 0.14 * rng.uniform(-1, 1, len(csim)), dot_px=3.0))
             if stat.csim.avg_interval is not None:
-                axis.plot(stat.csim.avg_interval, [place] * 2, color=ORANGE, lw=2.5, solid_capstyle="butt")
-            axis.plot(stat.csim.avg, place, "|", ms=15, mew=2.5, color=ORANGE)
-        axis.set_yticks(range(len(models)), [model.label for model in reversed(models)])
-        dress(axis, f"{key[0]}, binary", "CSIM, %", grid="x")
-    axes[1].set_yticklabels([])
-    figure.suptitle(textwrap.fill(report.label, LABEL_CHARS), fontsize=10)
-    return plot_uri(figure)
+                marks.append(Marks(stat.csim.avg_interval, [place] * 2, ORANGE, line_px=3.0))
+            marks.append(Marks([stat.csim.avg] * 2, [place - 0.3, place + 0.3], ORANGE, line_px=3.0))
+        labels = {float(place): "" if panels else model.label for place, model in enumerate(models)}
+        panels.append(Panel(f"{key[0]}, binary", Axis("CSIM, %"), Axis(ticks=labels), marks))
+    return chart_uri(panels, (1060, 120 + 32 * len(models)), report.label)
 
 
 def _by_strokes(report: Report) -> str:
     """CSIM on presses that were not fitted, against the number of presses that were."""
-    figure, axis = plot(1, 1, (6.4, 3.2))
+    marks: list[Marks] = []
     for name, colour in (("CCD-BSM", ORANGE), ("Bézier", BLUE)):
         csim: dict[int, list[float]] = {}
         for step in report.by_strokes:
             if step.model == name:
                 csim.setdefault(step.strokes, []).append(step.csim)
-        means = [np.mean(csim[count]) for count in sorted(csim)]
-        axis.plot(sorted(csim), means, "o-", ms=4, color=colour, label=f"{name} fitted")
-    ticks = sorted({step.strokes for step in report.by_strokes})
-    axis.set_xscale("log")
-    axis.set_xticks(ticks, [str(n) for n in ticks])
-    axis.minorticks_off()
-    title = f"mm, binary\n{textwrap.fill(report.label, LABEL_CHARS // 2)}"
-    dress(axis, title, "presses that were fitted", "CSIM on all others, %", legend=True)
-    return plot_uri(figure)
+        counts = sorted(csim)
+        means = [np.mean(csim[count]) for count in counts]
+        marks.append(Marks(counts, means, colour, f"{name} fitted", dot_px=6.0, line_px=1.5))
+    ticks = {float(step.strokes): str(step.strokes) for step in report.by_strokes}
+    across, up = Axis("presses that were fitted", ticks, log=True), Axis("CSIM on all others, %")
+    return chart_uri([Panel("mm, binary", across, up, marks)], (720, 340), report.label)
 
 
 def _curves(curves: Sequence[Curve]) -> str:
     """Validation losses of trained generators: the paper's figures 9 and 12."""
-    figure, axis = plot(1, 1, (6.4, 3.2))
-    for name, steps, losses in curves:
-        axis.semilogy(steps, losses, ".-", ms=4, label=name)
-    title = "networks trained on exact images of stroke models"
-    dress(axis, title, "step", "validation loss (MSE)", legend=True)
-    return plot_uri(figure)
+    colours = itertools.cycle(COLOURS)
+    marks = [
+        Marks(steps, losses, colour, name, dot_px=4.0, line_px=1.5)
+        for (name, steps, losses), colour in zip(curves, colours, strict=False)
+    ]
+    title, up = "networks trained on exact images of stroke models", Axis("validation loss (MSE)", log=True)
+    return chart_uri([Panel(title, Axis("step"), up, marks)], (720, 340))
 
 
 def _cell(report: Report, cell: Cell, columns: Sequence[ModelInfo]) -> tuple[Cell, int, list[Stat | None]]:
