@@ -20,7 +20,7 @@ from google.protobuf.message import DecodeError
 from pydantic import ValidationError
 
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.waits import unlike
+from brushloop.calibrate.stats import odd_waits
 from brushloop.sessions.disk import check_room, csv_text, staged_folder
 from brushloop.sessions.errors import InputError, SessionDamaged, disk_error
 from brushloop.sessions.events import Begin, StepEvent, StepKind
@@ -179,7 +179,7 @@ def _write_pictures(
 ) -> list[Row]:
     """Write the pictures; returns a row for each stroke, None where a value is not recorded."""
     waits = {one.stroke_id: one.dip_to_touch_s for one in recording.stroke_records() if one.dip_to_touch_s is not None}
-    odd, judged = unlike(waits), verdicts(recording)
+    odd, judged = odd_waits(waits), verdicts(recording)
     total, rows = recording.counts[Topic.STROKE], list[Row]()
     for index, capture in enumerate(counted(recording.captures(), "strokes exported", total, progress)):
         stroke = capture.stroke

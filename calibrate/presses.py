@@ -25,12 +25,11 @@ from brushloop.calibrate.compare.place import (
     to_pixels,
 )
 from brushloop.calibrate.errors import CaptureRefused
-from brushloop.calibrate.pool import Scheduler, threads
 from brushloop.calibrate.session import Calibration, OpenSession
-from brushloop.calibrate.store import Arrays, key_of
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
 from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure, prepare
 from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
+from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Condition, Stroke
@@ -109,9 +108,9 @@ def read_presses(
             if k in numbers
         )
         with nullcontext(scheduler) if scheduler else threads() as used:
-            finished = used.run(prepare_job, jobs)
-            for key, arrays in counted(finished, f"{session.header.session_id}: found", len(numbers), progress):
-                store.put(key, arrays)
+            finished = used.finished(prepare_job, jobs, store)
+            for _ in counted(finished, f"{session.header.session_id}: found", len(numbers), progress):
+                pass
 
     prepare({k for k in wanted if keys[k] not in store})
     for k in wanted:

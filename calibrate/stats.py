@@ -1,4 +1,4 @@
-"""Statistics: lines, summaries with intervals, paired tests, the ceiling, and the order of a design.
+"""Statistics: lines, summaries with intervals, paired tests, the ceiling, the order of a design, and odd waits.
 
 Equal scores give equal numbers.
 
@@ -14,12 +14,17 @@ has strays of its own.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.sessions.events import CaptureResult
+from brushloop.sessions.journal import RunState
+
+K = TypeVar("K")
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Interval = tuple[float, float]
@@ -33,6 +38,8 @@ FLIPS = 10_000
 CEILING = "ceiling"
 NEAR_POINTS = 1.5
 """Distance from the ceiling that counts as near, in points of average CSIM."""
+ODD_S, ODD_SPREADS, LEAST_WAITS = 2.0, 3.0, 4
+"""A wait is odd if it is this many seconds and median absolute deviations from the others; fewer waits have none."""
 MAX_OTHERS = 9
 """Most others that a press or a writing is compared with: all those of ten, as in the paper, or the next nine of
 more."""
@@ -305,3 +312,33 @@ def spread_out(depths_mm: Sequence[float], tilts_deg: Sequence[float]) -> list[C
     range_of = np.ptp(places, axis=0)
     places = (places - places.min(axis=0)) / np.where(range_of > 0.0, range_of, 1.0)
     return [cells[k] for k in farthest_first(places, cells.index(min(cells)), len(cells))]
+
+
+def waits_of(state: RunState) -> dict[int, float]:
+    """Seconds from dip to touch, by number of the still that shows the stroke; of those that were measured."""
+    presses = {capture.still: capture.press for capture in state.results(CaptureResult)}
+    return {still: press.dip_to_touch_s for still, press in presses.items() if press.dip_to_touch_s is not None}
+
+
+def wait_limit_s(waits: Iterable[float]) -> tuple[float, float] | None:
+    """Median of a session's waits and the distance from it that counts as alike; None for too few waits."""
+    known = np.array([*waits])
+    if len(known) < LEAST_WAITS:
+        return None
+    median = float(np.median(known))
+    return median, max(ODD_S, ODD_SPREADS * float(np.median(np.abs(known - median))))
+
+
+def odd_waits(waits: Mapping[K, float]) -> dict[K, str]:
+    """Reason for each stroke whose ink waited longer, or less long, than that of the others: it may be drier or wetter.
+
+    `waits` are seconds from dip to touch.
+    """
+    if (limit_s := wait_limit_s(waits.values())) is None:
+        return {}
+    median, most_s = limit_s
+    return {
+        key: f"touched the paper {wait:.1f} s after its dip, the others after {median:.1f} s"
+        for key, wait in waits.items()
+        if abs(wait - median) > most_s
+    }

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.fit.captures import Cell, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.heldout import BEZIER, HeldOut, Predicted, held_out_scores, image_of, refit_bezier
-from brushloop.calibrate.store import Store, key_of
+from brushloop.calibrate.work import Store, key_of
 from brushloop.drivers.sim.brush.spec import BrushSpec, SoundHead
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Recording

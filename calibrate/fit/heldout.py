@@ -14,9 +14,8 @@ from brushloop.calibrate.compare.place import SIZE_PX, Alignment, draw_loop, sim
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell, inked_rows
 from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.prior import Prior
-from brushloop.calibrate.pool import Scheduler, finished, threads
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
-from brushloop.calibrate.store import Arrays, Store, key_of
+from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.arrays import as_batch
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
@@ -119,7 +118,7 @@ def refits(
     """The fitted brush of each job; jobs that are not finished in the store run side by side."""
     keys = [job.key for job in jobs]
     unique = dict(zip(keys, jobs, strict=True))
-    results = dict(counted(finished(scheduler, store, refit, unique.items()), what, len(unique), progress))
+    results = dict(counted(scheduler.finished(refit, unique.items(), store), what, len(unique), progress))
     return [FittedPress(job.radius_mm, job.length_mm, **results[key]) for key, job in zip(keys, jobs, strict=True)]
 
 

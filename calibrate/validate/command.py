@@ -18,7 +18,6 @@ from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
-from brushloop.calibrate.pool import cluster, threads
 from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import framed, png_uri, source_note, write_files
 from brushloop.calibrate.scores import scores_csv, write_parquet
@@ -28,6 +27,7 @@ from brushloop.calibrate.validate.models import FittedSession
 from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
 from brushloop.calibrate.validate.report import Report, report_of
 from brushloop.calibrate.validate.run import Outcome, Refused, Request, validate_presses
+from brushloop.calibrate.work import cluster, threads
 from brushloop.calibrate.writing.scores import FILE as WRITTEN_FILE
 from brushloop.calibrate.writing.scores import PICTURE, WrittenRecord, read_written
 from brushloop.sessions.disk import check_writable, csv_text

@@ -27,11 +27,9 @@ from brushloop.calibrate.compare.place import (
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.captures import Pressed, grid_of
 from brushloop.calibrate.fit.heldout import MAX_FOLDS, Refit, RefittedBezier, leave_out, refit_bezier, refits
-from brushloop.calibrate.pool import Scheduler, finished
 from brushloop.calibrate.presses import read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Row, Scores, similarities
 from brushloop.calibrate.stats import others_of
-from brushloop.calibrate.store import Arrays, key_of
 from brushloop.calibrate.validate.models import (
     ANOTHER,
     BEZIER_LEFT_OUT,
@@ -47,6 +45,7 @@ from brushloop.calibrate.validate.models import (
     tuned,
 )
 from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
+from brushloop.calibrate.work import Arrays, Scheduler, key_of
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.records import Condition
@@ -267,7 +266,7 @@ def _score(
                 yield key, (rows[k].images, against)
 
     what, count = f"{session.header.session_id}: compared", sum(map(len, cells))
-    for key, arrays in counted(finished(scheduler, session.store, score_job, jobs()), what, count, progress):
+    for key, arrays in counted(scheduler.finished(score_job, jobs(), session.store), what, count, progress):
         scores.values[np.ix_(places[key], columns)] = arrays["values"]
 
 

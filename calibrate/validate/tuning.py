@@ -19,9 +19,9 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, prepare_press
 from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
-from brushloop.calibrate.store import key_of
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.work import key_of
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target

@@ -15,7 +15,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import FOLDER as FITS
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.session import board_of, lens_in_use
-from brushloop.calibrate.waits import unlike, waits_of
+from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.last_capture import likeness, mark_of, pictures_of
 from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.capture_screen import LargeCapture
@@ -100,7 +100,7 @@ class Review:
         """Read the journal and the remarks again."""
         state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
         self.open = state.is_open
-        odd = unlike(waits_of(state))
+        odd = odd_waits(waits_of(state))
         self.captures = tuple(
             ReviewCapture(result, step.file, remarks.get(result.still), odd.get(result.still, ""))
             for step in state.files.values()

@@ -18,7 +18,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.export import export
-from brushloop.calibrate.waits import unlike, waits_of
+from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.sessions.disk import as_cell, as_text, csv_text, number
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, PressResult, StepKind
@@ -215,7 +215,7 @@ def test_a_wait_belongs_to_the_take_that_the_photograph_shows(make, store):
     ],
 )
 def test_far_is_two_seconds_and_three_median_deviations(waits: list[float], far: list[int]):
-    assert list(unlike(dict(enumerate(waits)))) == far
+    assert list(odd_waits(dict(enumerate(waits)))) == far
 
 
 def test_an_export_gives_the_wait_and_names_strokes_whose_wait_differs(make, tmp_path, to):

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from brushloop.calibrate import presses, store
+from brushloop.calibrate import presses, work
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.fit import heldout
@@ -48,14 +48,14 @@ def session(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def work(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """How often each kind of work was done, by the name of its function."""
     counts: Counter[str] = Counter()
 
     def count(module: ModuleType, name: str) -> None:
-        do: Callable[[Any], store.Arrays] = getattr(module, name)
+        do: Callable[[Any], work.Arrays] = getattr(module, name)
 
-        def counting(job: object) -> store.Arrays:
+        def counting(job: object) -> work.Arrays:
             counts[name] += 1
             return do(job)
 
@@ -79,49 +79,49 @@ def same(one: Press, other: Press) -> bool:
     return images and np.array_equal(one.coverage, other.coverage) and one.measured == other.measured
 
 
-def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, work: Counter[str]) -> None:
+def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, calls: Counter[str]) -> None:
     request = Request(places=(str(session),), out=tmp_path / "report")
     fit_presses(FitRequest(session))
     validate(request)
-    assert (work["prepare_job"], work["refit"], work["score_job"]) == (3, 3, 3)
+    assert (calls["prepare_job"], calls["refit"], calls["score_job"]) == (3, 3, 3)
     fit_presses(FitRequest(session))
     validate(request)
-    assert work.total() == 9
+    assert calls.total() == 9
 
 
 def test_what_a_press_depends_on_makes_it_anew(
-    session: Path, tmp_path: Path, work: Counter[str], monkeypatch: pytest.MonkeyPatch
+    session: Path, tmp_path: Path, calls: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = read(session)
     assert [press.stroke.depth_mm for press in first] == [11.0, 15.0, 20.0]
     assert all(map(same, first, read(session)))
-    assert work["prepare_job"] == 3
+    assert calls["prepare_job"] == 3
 
     read(session, Field(mm_per_px=0.4))
-    assert work["prepare_job"] == 6, "another scale"
+    assert calls["prepare_job"] == 6, "another scale"
     params = CALIBRATION.model_copy(update={"preprocess": {"contrast_gate": 0.3}})
     for calibration in (CALIBRATION, params):
         read(replace(open_session(session), calibration=calibration))
-    assert work["prepare_job"] == 12, "other parameters"
-    monkeypatch.setattr(store, "VERSION", "of tomorrow")
+    assert calls["prepare_job"] == 12, "other parameters"
+    monkeypatch.setattr(work, "VERSION", "of tomorrow")
     read(session)
-    assert work["prepare_job"] == 15, "other software"
+    assert calls["prepare_job"] == 15, "other software"
 
     photograph = tmp_path / "photos" / "0.png"
     image = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(photograph), np.roll(image, 10, axis=1))
     lines = (tmp_path / "photos" / "strokes.csv").read_text().splitlines()
     other = imported(tmp_path / "photos", lines, tmp_path / "other", "press")
-    shutil.copytree(session / store.FOLDER, other / store.FOLDER)
+    shutil.copytree(session / work.FOLDER, other / work.FOLDER)
     assert not same(first[0], read(other)[0])
-    assert work["prepare_job"] == 18, "another photograph"
+    assert calls["prepare_job"] == 18, "another photograph"
 
 
 def test_damaged_large_and_lost_entries_are_prepared_again(
-    session: Path, work: Counter[str], monkeypatch: pytest.MonkeyPatch
+    session: Path, calls: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = read(session)
-    flipped, truncated, lost = sorted((session / store.FOLDER).iterdir())
+    flipped, truncated, lost = sorted((session / work.FOLDER).iterdir())
     data = bytearray(flipped.read_bytes())
     data[len(data) // 2] ^= 0x10
     flipped.write_bytes(data)
@@ -129,28 +129,28 @@ def test_damaged_large_and_lost_entries_are_prepared_again(
     lost.unlink()
     for _ in range(2):
         assert all(map(same, first, read(session)))
-        assert work["prepare_job"] == 6
-    monkeypatch.setattr(store, "MAX_ENTRY_BYTES", 1000)
+        assert calls["prepare_job"] == 6
+    monkeypatch.setattr(work, "MAX_ENTRY_BYTES", 1000)
     key = flipped.name.removesuffix(".npz.gz")
-    assert store.Store(session / store.FOLDER).get(key) is None, "more than may be unpacked"
+    assert work.Store(session / work.FOLDER).get(key) is None, "more than may be unpacked"
 
 
-def test_two_processes_at_once_do_no_harm(session: Path, work: Counter[str]) -> None:
+def test_two_processes_at_once_do_no_harm(session: Path, calls: Counter[str]) -> None:
     command = [sys.executable, "-c", READ, str(session)]
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     one, other = (process.communicate()[0] for process in both)
     assert [process.returncode for process in both] == [0, 0]
     assert one == other != ""
     assert str([float(press.coverage.sum()) for press in read(session)]) == one.strip()
-    assert work["prepare_job"] == 0
-    assert len(list((session / store.FOLDER).iterdir())) == 3, "no half-written file is left"
+    assert calls["prepare_job"] == 0
+    assert len(list((session / work.FOLDER).iterdir())) == 3, "no half-written file is left"
 
 
 def test_the_oldest_entries_make_room(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read(session)
-    monkeypatch.setattr(store, "MAX_BYTES", 1)
+    monkeypatch.setattr(work, "MAX_BYTES", 1)
     open_session(session)
-    assert list((session / store.FOLDER).iterdir()) == []
+    assert list((session / work.FOLDER).iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,10 +159,10 @@ def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, m
 
     monkeypatch.setattr(Path, "mkdir", full)
     assert len(read(session)) == 3
-    assert not (session / store.FOLDER).exists()
+    assert not (session / work.FOLDER).exists()
 
 
-def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(session: Path, work: Counter[str]) -> None:
+def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(session: Path, calls: Counter[str]) -> None:
     [name, *_] = [press.stroke.stroke_id for press in read(session)]
     mark_bad_or_good(session, 0, name, 1)
     refused: list[tuple[str, str]] = []
@@ -170,7 +170,7 @@ def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(sessi
     assert refused == [(name, "was marked bad")]
     mark_bad_or_good(session, 0, name, 2)
     assert len(read(session)) == 3
-    assert work["prepare_job"] == 3
+    assert calls["prepare_job"] == 3
 
 
 def test_a_press_is_cut_out_of_its_page_before_the_page_is_resampled(session: Path, tmp_path: Path) -> None:

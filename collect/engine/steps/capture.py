@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stats import odd_waits, wait_limit_s, waits_of
 from brushloop.calibrate.stroke import Gray
-from brushloop.calibrate.waits import limit_s, unlike, waits_of
 from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of
 from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.engine.steps.retake import decide
@@ -212,8 +212,8 @@ def _wait_check(context: StepContext, press: Press) -> records.Check | None:
     if wait_s is None:
         return None
     waits = {**waits_of(context.run.store.state), still: wait_s}
-    reason, found = unlike(waits).get(still, ""), limit_s(waits.values())
-    threshold = None if found is None else sum(found)
+    reason, limit_s = odd_waits(waits).get(still, ""), wait_limit_s(waits.values())
+    threshold = None if limit_s is None else sum(limit_s)
     return records.Check(name="dip_to_touch", score=wait_s, threshold=threshold, passed=not reason, reason=reason)
 
 

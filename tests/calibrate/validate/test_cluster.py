@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.calibrate import pool
+from brushloop.calibrate import work
 from brushloop.calibrate.errors import CalibrationError
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -71,7 +71,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> None:
     environment = os.environ | {"DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "1s"}
     program = (
-        "import sys, brushloop.__main__, brushloop.calibrate.pool as pool; pool.CONNECT_S = 1.0; "
+        "import sys, brushloop.__main__, brushloop.calibrate.work as work; work.CONNECT_S = 1.0; "
         f"sys.argv = ['brushloop', 'validate', {str(session)!r}, '--out', {str(tmp_path / 'out')!r}, "
         "'--scheduler', 'tcp://127.0.0.1:9']; brushloop.__main__.main()"
     )
@@ -90,9 +90,9 @@ def test_no_scheduler_there_is_one_clear_line(session: Path, tmp_path: Path) -> 
 
 def test_a_worker_with_other_software_is_refused(cluster: Cluster) -> None:
     program = (
-        "import brushloop.calibrate.store as store; store.VERSION = 'of tomorrow'\n"
+        "import brushloop.calibrate.work as work; work.VERSION = 'of tomorrow'\n"
         "from brushloop.calibrate.errors import CalibrationError\n"
-        "from brushloop.calibrate.pool import cluster\n"
+        "from brushloop.calibrate.work import cluster\n"
         f"try:\n    with cluster({cluster.address!r}):\n        pass\n"
         "except CalibrationError as error:\n    print(error)\n"
     )
@@ -109,7 +109,7 @@ import os, signal
 from pathlib import Path
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.presses import PrepareJob, prepare_job
-from brushloop.calibrate.pool import cluster, threads
+from brushloop.calibrate.work import cluster, threads
 from brushloop.sessions.recording import Recording
 captures = list(Recording(Path({str(session)!r})).captures()) * 3
 jobs = [(str(k), PrepareJob(one, None, Field())) for k, one in enumerate(captures)]
@@ -117,12 +117,12 @@ def plain(results):
     return {{name: {{part: array.tolist() for part, array in arrays.items()}} for name, arrays in results}}
 there = {{}}
 with cluster({cluster.address!r}) as pool:
-    for name, press in pool.run(prepare_job, iter(jobs)):
+    for name, press in pool.finished(prepare_job, iter(jobs)):
         there[name] = press
         if len(there) == 5:
             os.kill({cluster.workers[0].pid}, signal.SIGKILL)
 with threads(1) as pool:
-    here = dict(pool.run(prepare_job, iter(jobs)))
+    here = dict(pool.finished(prepare_job, iter(jobs)))
 print(len(there), plain(there.items()) == plain(here.items()))
 """
     ran = subprocess.run(
@@ -134,5 +134,5 @@ print(len(there), plain(there.items()) == plain(here.items()))
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(CalibrationError, match=r"brushloop\[cluster\]"), pool.cluster("tcp://127.0.0.1:9"):
+    with pytest.raises(CalibrationError, match=r"brushloop\[cluster\]"), work.cluster("tcp://127.0.0.1:9"):
         pass
