@@ -317,7 +317,9 @@ def _ticks(low: float, high: float, *, log: bool) -> dict[float, str]:
     """Up to seven round values between two: powers of ten on a logarithmic axis that holds two of them."""
     if log and (powers := range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1))[1:]:
         return {10.0**power: f"{10.0**power:g}" for power in powers}
-    rough = (high - low) / 7.0 or 1.0
+    if low == high:
+        return {low: f"{low:.6g}"}
+    rough = (high - low) / 7.0
     power = 10.0 ** math.floor(math.log10(rough))
     step = power * next(unit for unit in (1, 2, 5, 10) if unit * power >= rough)
     return {k * step: f"{k * step:.6g}" for k in range(math.ceil(low / step), math.floor(high / step) + 1)}

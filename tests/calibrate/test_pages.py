@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -18,7 +20,7 @@ from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
 from brushloop.calibrate.loop import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts, write_loop
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.report import printable, source_label, source_note
+from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.page import pages_beside
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
@@ -201,8 +203,16 @@ def test_the_label_of_any_other_brush_is_its_source() -> None:
     assert source_note(Source.REAL, "Langhao brush (12 mm)") == source_note(Source.REAL)
 
 
-def test_a_plot_shows_a_question_mark_for_what_no_font_draws() -> None:
-    assert printable("left\t\x1b[31m.png") == "left??[31m.png"
+def test_a_chart_has_round_ticks_leaves_gaps_out_and_shows_a_question_mark_for_what_no_font_draws() -> None:
+    marks = Marks([0.0, 5.0, 10.0], [1.0, np.nan, 100.0], name="left\t\x1b[31m<b>.png", dot_px=3.0)
+    uri = chart_uri([Panel("losses", Axis("step"), Axis("loss", log=True), [marks])], (600, 300), "loopback rig")
+    svg = base64.b64decode(uri.partition(",")[2]).decode()
+    texts = [element.text for element in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+    assert {"loopback rig", "losses", "step", "loss", "0", "2", "10", "1", "100"} <= set(texts)
+    assert "left??[31m&lt;b&gt;.png" in svg
+    assert svg.count("h0") == 2
+    for points in ([], [Marks([2.3], [4.1], dot_px=1.0)]):
+        assert chart_uri([Panel("few", Axis(), Axis(), points)], (600, 300)).startswith("data:image/svg+xml;base64,")
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
