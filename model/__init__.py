@@ -1,1 +1,1 @@
-"""Maths of the stroke models: closed-form shapes and exact rasters on torch tensors, without I/O."""
+"""Maths of the stroke models: closed-form shapes and exact rasters, without I/O."""

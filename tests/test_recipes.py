@@ -35,7 +35,7 @@ from brushloop.drivers.sim.faults import ALWAYS, KINDS, Device, Fault
 from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
 from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_models
 from tests.collect.conftest import SHARP_VIEW, SMALL_TABLE, serving
 from tests.collect.until import wait_for_end
@@ -68,7 +68,7 @@ def test_a_stroke_model_is_a_file_in_the_folder(tmp_path: Path, monkeypatch: pyt
     try:
         models = stroke_models(Brush())
         drop, circle = (
-            coverage_at(models[name].profile(15.0, 5.0), (15.0, 15.0)).sum().item() for name in ("drop", "circle")
+            float(coverage(models[name].profile(15.0, 5.0), (15.0, 15.0)).sum()) for name in ("drop", "circle")
         )
         assert drop == pytest.approx(0.5 * circle, rel=0.01)
     finally:

@@ -19,6 +19,7 @@ from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanReco
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.characters.glyph import parse_csv, parse_glyph, paths_of, reference, swept
 from brushloop.model.characters.plan import Floats, Image, Patch, Reach, StrokePath, covered, drawn, first_lead, lead
+from brushloop.model.characters.presses import refine, trajectory, written
 from brushloop.model.drag import Footprint
 from brushloop.model.similarity import csim, ssim
 from brushloop.model.strokes import StrokeModel, stroke_model
@@ -140,8 +141,6 @@ def pressed(
     wanted: Wanted, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int
 ) -> PlannedFigure:
     """Plan a figure as presses that are laid over each other along the way."""
-    from brushloop.model.characters.presses import refine, trajectory, written  # loads torch
-
     side_mm = patch.side_mm
     first = [trajectory(path, model, reach, patch, tilt_deg) for path in wanted.paths]
     refined = refine(model, first, wanted.image, side_mm, reach, steps)

@@ -31,7 +31,7 @@ from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.presses import ReplayConfig
 from brushloop.model.ccdbsm import Brush, ccdbsm
-from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster import coverage
 from brushloop.sessions.imports import ImportOptions, import_photographs
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
@@ -46,7 +46,7 @@ START = (34.0, 20.0)  # mm from the left and top edge
 def photograph(depth_mm: float, tilt_deg: float, start_x_mm: float = START[0]) -> np.ndarray:
     """A 50 x 40 mm photograph at 12 px/mm of CCD-BSM's own mark, touched at START, ferrule to the right."""
     origin = (start_x_mm + depth_mm * math.tan(math.radians(tilt_deg)), START[1])
-    ink = coverage_at(ccdbsm(Brush(), depth_mm, tilt_deg).outline(), origin, size_px=600, px_mm=1 / PX)[0].numpy()[:480]
+    ink = coverage(ccdbsm(Brush(), depth_mm, tilt_deg).outline(), origin, size_px=600, px_mm=1 / PX)[0][:480]
     return np.rint(230.0 * (1.0 - 0.92 * ink)).astype(np.uint8)
 
 

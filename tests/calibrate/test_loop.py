@@ -21,7 +21,7 @@ from brushloop.calibrate.loop import (
 from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
 from brushloop.calibrate.scores import Scores
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
@@ -36,8 +36,8 @@ STRICT = (Alignment.MM, Tone.BINARY)
 def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
     """100 x 80 mm at 10 px/mm, straight from above, with the model's mark at the anchor."""
     axis_x = ANCHOR[0] + depth_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage_at(MODEL.profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
-    return np.rint(230.0 * (1.0 - 0.92 * mark[0].numpy()[:800])).astype(np.uint8)
+    mark = coverage(MODEL.profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    return np.rint(230.0 * (1.0 - 0.92 * mark[0][:800])).astype(np.uint8)
 
 
 def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of: str | None = None) -> Press:

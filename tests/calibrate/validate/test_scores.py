@@ -13,7 +13,7 @@ from brushloop.calibrate.scores import Row, Scores, similarities
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.run import score_job
 from brushloop.model.ccdbsm import Brush
-from brushloop.model.raster.exact import coverage_at
+from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_models
 from brushloop.sessions.messages import encode_png
 from brushloop.sessions.recording import Capture
@@ -28,8 +28,8 @@ MM, NORMAL = (Alignment.MM, Tone.BINARY), (Alignment.SIZE_NORMALISED, Tone.BINAR
 def page_of(depth_mm: float, tilt_deg: float, model: str = "ccd-bsm") -> np.ndarray:
     """A 100 x 80 mm page, photographed straight from above at 10 px/mm, with a model's mark at the anchor."""
     axis_x = ANCHOR[0] + depth_mm * math.tan(math.radians(tilt_deg))
-    mark = coverage_at(MODELS[model].profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
-    return np.rint(230.0 * (1.0 - 0.92 * np.asarray(mark[0])[:800])).astype(np.uint8)
+    mark = coverage(MODELS[model].profile(depth_mm, tilt_deg), (axis_x, 80.0 - ANCHOR[1]), size_px=1000, px_mm=0.1)
+    return np.rint(230.0 * (1.0 - 0.92 * mark[0][:800])).astype(np.uint8)
 
 
 def images_of(page: np.ndarray) -> np.ndarray:
