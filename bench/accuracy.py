@@ -40,7 +40,7 @@ from brushloop.calibrate.fit.fit import fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
 from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
-from brushloop.calibrate.writing.scores import HEADLINE, REFERENCE, SIMULATED, read_written
+from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, read_written
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush
 from brushloop.model.fitted import FittedPress
 from brushloop.model.generator import SHIPPED_GENERATOR

@@ -133,12 +133,16 @@ class Drawings:
     x_mm: Floats
     y_mm: Floats
 
+    @staticmethod
+    def of(strokes: Sequence[Sequence[Floats]], ink: NDArray[np.float32], x_mm: Floats, y_mm: Floats) -> Drawings:
+        """Images (B, len(y_mm), len(x_mm)) of the strokes of each."""
+        groups = np.cumsum([0, *(len(paths) for paths in strokes)])
+        return Drawings([path for paths in strokes for path in paths], groups, ink, x_mm, y_mm)
+
     def only(self, images: Indices) -> Drawings:
         """These images and their strokes."""
-        each = [self.paths[int(self.groups[i]) : int(self.groups[i + 1])] for i in images]
-        groups = np.cumsum([0, *(len(strokes) for strokes in each)])
-        paths = [path for strokes in each for path in strokes]
-        return replace(self, paths=paths, groups=groups, ink=self.ink[images])
+        strokes = [self.paths[int(self.groups[i]) : int(self.groups[i + 1])] for i in images]
+        return Drawings.of(strokes, self.ink[images], self.x_mm, self.y_mm)
 
     def every(self, step: int) -> Drawings:
         """The same with only each `step`-th row and column."""

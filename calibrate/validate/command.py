@@ -28,8 +28,8 @@ from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read
 from brushloop.calibrate.validate.report import Report, report_of
 from brushloop.calibrate.validate.run import Outcome, Refused, Request, validate_presses
 from brushloop.calibrate.work import cluster, threads
-from brushloop.calibrate.writing.scores import FILE as WRITTEN_FILE
-from brushloop.calibrate.writing.scores import PICTURE, WrittenRecord, read_written
+from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
+from brushloop.calibrate.writing.compare import PICTURE, WrittenRecord, read_written
 from brushloop.sessions.disk import check_writable, csv_text
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.journal import JOURNAL_NAME, replay

@@ -30,7 +30,7 @@ from brushloop.calibrate.validate.models import (
     ModelInfo,
 )
 from brushloop.calibrate.validate.run import Outcome, Refused, Step
-from brushloop.calibrate.writing.scores import WrittenRecord
+from brushloop.calibrate.writing.compare import WrittenRecord
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult

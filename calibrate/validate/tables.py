@@ -19,8 +19,8 @@ from brushloop.calibrate.scores import MEASURES, Stat
 from brushloop.calibrate.stats import CEILING, Summary
 from brushloop.calibrate.validate.models import ANOTHER, FITTED_HELD_OUT, GENERATOR_HELD_OUT, HELD_OUT, LAMBDAS
 from brushloop.calibrate.validate.report import NORMAL, STRICT, Report
-from brushloop.calibrate.writing.scores import ANOTHER as ANOTHER_WRITING
-from brushloop.calibrate.writing.scores import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row
+from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
+from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row
 from brushloop.sessions.disk import csv_text
 
 MISSING = {

@@ -61,8 +61,8 @@ def compare(
     """Compare written characters with the simulated image and with the reference, in both polarities (Table 3)."""
     import sys
 
-    from brushloop.calibrate.writing.report import CompareRequest
-    from brushloop.calibrate.writing.report import compare as run
+    from brushloop.calibrate.writing.compare import CompareRequest
+    from brushloop.calibrate.writing.compare import compare as run
     from brushloop.sessions.terminal import show_work
 
     command = " ".join(["brushloop", *sys.argv[1:]])

@@ -13,7 +13,6 @@ A character whose last round was no better than the best one goes back to the be
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -28,11 +27,11 @@ from pydantic import Field, model_validator
 from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
 from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.drags.fit import captured_distance
-from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.presses import prepare_cell
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import Written
-from brushloop.calibrate.session import Calibration, open_session
+from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stroke import PX_PER_MM
+from brushloop.calibrate.writing.compare import WritingComparison, compare_written, read_writings, round_of
 from brushloop.calibrate.writing.record import (
     FigureRecord,
     PlannedBy,
@@ -41,9 +40,9 @@ from brushloop.calibrate.writing.record import (
     as_points,
     encoded,
     load_plan,
+    recorded_figures,
     write_plan,
 )
-from brushloop.calibrate.writing.scores import WritingComparison, compare_written, round_of
 from brushloop.model.characters.plan import (
     LATER_SPREADS_MM,
     Phase,
@@ -59,10 +58,7 @@ from brushloop.model.characters.plan import (
 from brushloop.model.drag import NAMES, Drawings, Footprint, fit_each, fit_footprint, inked
 from brushloop.model.similarity import binary_scores
 from brushloop.sessions.disk import check_writable
-from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Header
-from brushloop.sessions.terminal import Progress, counted, unseen
+from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
 MOST_MM = 1.5
@@ -123,77 +119,45 @@ class PracticeRequest:
     cell_mm: float = 70.0
 
 
-def reach_of(by: PlannedBy) -> Reach:
-    """The reach that a plan is made with. Raises ValueError for ranges that make no sense."""
-    return Reach(by.depth_range_mm, by.tilt_range_deg, turn_deg_mm=by.wrist_deg_s / by.speed_mm_s)
-
-
 def fit(session: Path, progress: Progress = unseen) -> Written:
     """Fit the footprint to the figures of a session and put it to use.
 
     Raises `CalibrationError` if the session is an import, or holds too few strokes.
     """
-    opened = open_session(session, "drag")
-    header = opened.header
-    if opened.calibration is None:
-        raise CalibrationError(str(session), "is an import: a footprint is fitted to figures that the arm wrote")
-    figures, used, refused = figures_of(header), list[tuple[list[Floats], Image]](), list[str]()
-    for capture in counted(opened.recording.captures(), "figures read", len(opened.strokes), progress):
-        try:
-            used.append(_figure(capture, opened.calibration, figures))
-        except (CaptureRefused, SessionDamaged) as error:
-            refused.append(f"left out: {capture.stroke.stroke_id}: {error.what}")
-    paths = [path for strokes, _ in used for path in strokes]
-    if len(paths) < LEAST:
-        raise CalibrationError(str(session), f"holds {len(paths)} usable strokes, at least {LEAST} are needed")
-    groups = np.cumsum([0, *(len(strokes) for strokes, _ in used)])
-    cell_mm = opened.strokes[0].cell_mm
-    assert cell_mm is not None  # as every stroke that the arm wrote has
-    side_mm, ink = cell_mm[2], np.array([image for _, image in used])
-    footprint, csim_percent = fitted(Drawings(paths, groups, ink, *grid(side_mm, ink.shape[1])))
+    opened, refused = open_session(session, "drag"), list[tuple[str, str]]()
+    figures, cell_mm = recorded_figures(opened.header), opened.strokes[0].cell_mm
+    assert cell_mm is not None  # as every stroke that a protocol of figures drew has
+    strokes, ink = list[list[Floats]](), list[Image]()
+    for stroke_id, name, prepared in read_writings(opened, refused, progress):
+        if prepared.cut or name not in figures:
+            why = "is cut by the edge of its photograph or patch" if prepared.cut else "is not a figure of its protocol"
+            refused.append((stroke_id, why))
+            continue
+        side_px = round(len(prepared.mask) / PX_PER_MM / MM_PER_PX)
+        strokes.append(figures[name])
+        coverage = cv2.resize(prepared.mask.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_AREA)
+        ink.append(np.asarray(coverage, np.float32))
+    count = sum(map(len, strokes))
+    if count < LEAST:
+        raise CalibrationError(str(session), f"holds {count} usable strokes, at least {LEAST} are needed")
+    footprint, csim_percent = fitted(drawings_of(strokes, ink, cell_mm[2]))
     artefact = FootprintArtefact(
-        session_id=header.session_id,
-        source=str(header.source),
+        session_id=opened.header.session_id,
+        source=str(opened.header.source),
         recording_sha256=opened.sha256,
-        calibration=opened.calibration.digest,
+        calibration=opened.calibration_digest,
         software=made_by(),
         values=dict(zip(NAMES, footprint.values, strict=True)),
-        images=len(used),
-        strokes=len(paths),
+        images=len(ink),
+        strokes=count,
         csim_percent=csim_percent,
     )
     path = put_to_use(artefact, session, FOLDER)
     words = (
-        f"footprint of {artefact.strokes} strokes on {artefact.images} cells ({artefact.source}): draws them with CSIM "
-        f"{artefact.csim_percent:.1f} %, ink = 1"
+        f"footprint of {count} strokes on {len(ink)} cells ({artefact.source}): draws them with CSIM "
+        f"{csim_percent:.1f} %, ink = 1"
     )
-    return Written(path, (*refused, words, str(path)))
-
-
-def figures_of(header: Header) -> dict[str, list[Floats]]:
-    """The strokes (n, 4) of each figure of the recorded protocol, without tilt. Raises `CalibrationError`."""
-    try:
-        return {
-            str(figure["name"]): [without_tilt(np.array(stroke["points"], np.float64)) for stroke in figure["strokes"]]
-            for figure in json.loads(header.protocol)["figures"]
-        }
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        problem = f"its recorded protocol holds no trajectories ({error})"
-        raise CalibrationError(header.session_id, problem) from None
-
-
-def _figure(capture: Capture, calibration: Calibration, figures: dict[str, list[Floats]]) -> tuple[list[Floats], Image]:
-    """What was commanded, and the ink of its patch at `MM_PER_PX`. Raises `CaptureRefused`."""
-    stroke_id = capture.stroke.stroke_id
-    paths = figures.get(stroke_id.rpartition("-r")[0])
-    if paths is None:
-        raise CaptureRefused(stroke_id, "is not a figure of the recorded protocol")
-    prepared = prepare_cell(capture, calibration)
-    if prepared.cut:
-        raise CaptureRefused(stroke_id, "is cut by the edge of its photograph or patch")
-    size = round(len(prepared.mask) / PX_PER_MM / MM_PER_PX)
-    ink = cv2.resize(prepared.mask.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA)
-    return paths, np.asarray(ink, np.float32)
+    return Written(path, (*(f"left out: {stroke_id}: {why}" for stroke_id, why in refused), words, str(path)))
 
 
 def fitted(drawings: Drawings) -> tuple[Footprint, float]:
@@ -208,7 +172,7 @@ def fitted(drawings: Drawings) -> tuple[Footprint, float]:
 def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     """Write the protocol of a practice sheet, each stroke on a patch of its own. Raises `CalibrationError`."""
     check_writable(request.out)
-    strokes = practice_strokes(request.cell_mm, reach_of(request.by), request.by.length_mm)
+    strokes = practice_strokes(request.cell_mm, request.by.reach, request.by.length_mm)
     blank = encoded(np.zeros((SIZE_PX, SIZE_PX), np.float32))
     figures = tuple(
         FigureRecord(
@@ -290,31 +254,31 @@ def learned(written: WritingComparison, gain: float = 0.7) -> PlanRecord:
     writings = {character.name: character for character in written.characters}
     for figure in plan.figures:
         if figure.name not in writings:
-            raise CalibrationError(str(written.recording), f"shows no {figure.name!r}: nothing is learned for it")
-    ink = {name: character.mean_ink() for name, character in writings.items()}
-    known, drawings = plan.planned_by.footprint, _drawings(plan.figures, ink, plan.cell_mm)
+            raise CalibrationError(
+                str(written.session.recording.path), f"shows no {figure.name!r}: nothing is learned for it"
+            )
+    ink = [writings[figure.name].mean_ink() for figure in plan.figures]
+    known, drawings = plan.planned_by.footprint, drawings_of([each.strokes for each in plan.figures], ink, plan.cell_mm)
     footprint = fit_footprint(drawings, None if known is None else Footprint(known))
-    reach = reach_of(plan.planned_by)
     figures: list[FigureRecord] = []
-    for figure in plan.figures:
+    for figure, captured in zip(plan.figures, ink, strict=True):
         after = _after(figure, round_of(figure, writings[figure.name], plan.cell_mm))
-        figures.append(after if after.settled else _corrected(after, ink, footprint, reach, plan.cell_mm, gain))
+        if not after.settled:
+            after = _corrected(after, captured, footprint, plan.planned_by.reach, plan.cell_mm, gain)
+        figures.append(after)
     by = plan.planned_by.model_copy(update={"footprint": footprint.values})
     return plan.model_copy(update={"planned_by": by, "figures": tuple(figures), "software": made_by()})
 
 
-def _drawings(figures: Sequence[FigureRecord], ink: dict[str, Image], side_mm: float) -> Drawings:
-    """What was commanded, and the mean ink (128, 128) of each figure."""
-    strokes = [[without_tilt(points) for points in figure.strokes] for figure in figures]
-    groups = np.cumsum([0, *(len(paths) for paths in strokes)])
-    images = np.stack([ink[figure.name] for figure in figures])
-    paths = [path for paths in strokes for path in paths]
-    return Drawings(paths, groups, images, *grid(side_mm, images.shape[1]))
+def drawings_of(strokes: Sequence[Sequence[Floats]], ink: Sequence[Image], side_mm: float) -> Drawings:
+    """The strokes, (N, 5) each, that were commanded on every patch, and the ink (S, S) that they left."""
+    paths = [[without_tilt(points) for points in of_patch] for of_patch in strokes]
+    return Drawings.of(paths, np.stack(ink), *grid(side_mm, len(ink[0])))
 
 
 def _after(figure: FigureRecord, last: Round) -> FigureRecord:
     """The figure with its round added, back at its best; settled if the round has not helped."""
-    before = max((one.csim_percent for one in figure.rounds), default=float("-inf"))
+    before = max((each.csim_percent for each in figure.rounds), default=float("-inf"))
     best = figure.commanded if last.csim_percent > before or not figure.best else figure.best
     settled = figure.settled or last.csim_percent < before + LEAST_GAIN_PERCENT
     update = {"rounds": (*figure.rounds, last), "best": best, "settled": settled, "commanded": best}
@@ -322,23 +286,14 @@ def _after(figure: FigureRecord, last: Round) -> FigureRecord:
 
 
 def _corrected(
-    figure: FigureRecord, ink: dict[str, Image], footprint: Footprint, reach: Reach, side_mm: float, gain: float
+    figure: FigureRecord, captured: Image, footprint: Footprint, reach: Reach, side_mm: float, gain: float
 ) -> FigureRecord:
-    strokes, captured = figure.strokes, ink[figure.name]
-    size_px = len(captured)
-    footprints = fit_each(_drawings([figure], ink, side_mm), footprint)
+    strokes, size_px = figure.strokes, len(captured)
+    footprints = fit_each(drawings_of([strokes], [captured], side_mm), footprint)
     miss = missed(captured, drawn(footprints, strokes, side_mm, size_px), side_mm)
     miss *= gain * _trust(figure, side_mm, size_px)
-    moved = lead(
-        footprints,
-        strokes,
-        figure.wanted(),
-        side_mm,
-        reach,
-        added_mm=miss,
-        spreads_mm=LATER_SPREADS_MM,
-        held=HELD,
-    )
+    wanted, near = figure.wanted(), LATER_SPREADS_MM
+    moved = lead(footprints, strokes, wanted, side_mm, reach, added_mm=miss, spreads_mm=near, held=HELD)
     simulated = covered(drawn(footprints, moved, side_mm, size_px) + miss, side_mm)
     return figure.model_copy(update={"commanded": as_points(moved), "simulated_png": encoded(simulated)})
 
@@ -359,6 +314,6 @@ def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
     """A factor on the correction of each pixel: less in phases that the last round made worse."""
     if len(figure.rounds) < 2 or not figure.medians:
         return np.ones((size_px, size_px))
-    before, now = (one.lost_percent for one in figure.rounds[-2:])
+    before, now = (each.lost_percent for each in figure.rounds[-2:])
     factors = [WORSE if now.get(phase, 0.0) > before.get(phase, 0.0) else 1.0 for phase in Phase]
     return np.array(factors)[phase_map(figure.paths, side_mm, size_px)]

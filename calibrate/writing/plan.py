@@ -14,8 +14,16 @@ from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import BLUE, Written, picture_grid, save_picture
-from brushloop.calibrate.writing.learn import FootprintArtefact, reach_of
-from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, write_plan
+from brushloop.calibrate.writing.learn import FootprintArtefact
+from brushloop.calibrate.writing.record import (
+    FigureRecord,
+    PlannedBy,
+    PlanRecord,
+    as_points,
+    code_points,
+    encoded,
+    write_plan,
+)
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.characters.glyph import parse_csv, parse_glyph, paths_of, reference, swept
 from brushloop.model.characters.plan import Floats, Image, Patch, Reach, StrokePath, covered, drawn, first_lead, lead
@@ -110,7 +118,7 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     try:
         if high > MOST_TILT_DEG or by.depth_range_mm[0] <= 0:
             raise ValueError(f"tilts end at {MOST_TILT_DEG:g} deg, depths begin above 0 mm")
-        reach, patch = reach_of(by), Patch(request.cell_mm)
+        reach, patch = by.reach, Patch(request.cell_mm)
         model = stroke_model("ccd-bsm", Brush(by.radius_mm, by.length_mm))
         model.profile(by.depth_range_mm[1], high)
     except (ValueError, DomainError) as error:
@@ -248,8 +256,3 @@ def draw(figures: list[PlannedFigure], side_mm: float, path: Path) -> None:
             axes[3].scatter(stroke[:, 0], stroke[:, 1], s=0.4 * stroke[:, 2], color=BLUE, zorder=3)
         axes[0].set_ylabel("mm", fontsize=7)
     save_picture(picture, path)
-
-
-def code_points(name: str) -> str:
-    """A name with code points for Chinese characters, since most machines have no font that shows them."""
-    return " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in name)

@@ -1,7 +1,4 @@
-"""The files of a plan: plan.json with everything that later commands need, and the protocol that draws it.
-
-Reading one needs no torch, so that a rig's computer can read a plan.
-"""
+"""The files of a plan: plan.json with everything that later commands need, and the protocol that draws it."""
 
 from __future__ import annotations
 
@@ -21,10 +18,11 @@ from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import write_files
-from brushloop.model.characters.plan import StrokePath
+from brushloop.model.characters.plan import Reach, StrokePath
 from brushloop.model.drag import NAMES
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.messages import decode_gray, encode_png
+from brushloop.sessions.records import Header
 
 FILE, PROTOCOL = "plan.json", "protocol-write.toml"
 """Names of the files of a plan; the protocol is written last: if it exists, so does the other."""
@@ -49,6 +47,11 @@ class PlannedBy(Frozen):
     """Greatest speed of the wrist."""
     footprint: Annotated[tuple[Number, ...], Field(min_length=len(NAMES), max_length=len(NAMES))] | None = None
     """Values of the fitted footprint (`model.drag`) that the plan leads the brush by; None without one."""
+
+    @property
+    def reach(self) -> Reach:
+        """The limits as trajectories keep them. Raises ValueError for ranges that make no sense."""
+        return Reach(self.depth_range_mm, self.tilt_range_deg, turn_deg_mm=self.wrist_deg_s / self.speed_mm_s)
 
 
 class Round(Frozen):
@@ -143,6 +146,22 @@ def write_plan(record: PlanRecord, repeats: int, out: Path) -> Path:
             lines.append("]")
     write_files(out, {FILE: record.model_dump_json(indent=2) + "\n", PROTOCOL: "\n".join(lines) + "\n"})
     return out / PROTOCOL
+
+
+def recorded_figures(header: Header) -> dict[str, list[Floats]]:
+    """The strokes, (N, 5) each, of every figure of a recorded protocol. Raises `CalibrationError` without any."""
+    try:
+        return {
+            str(figure["name"]): [np.array(stroke["points"], np.float64).reshape(-1, 5) for stroke in figure["strokes"]]
+            for figure in json.loads(header.protocol)["figures"]
+        }
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise CalibrationError(header.session_id, "was not collected by a `write` protocol") from None
+
+
+def code_points(name: str) -> str:
+    """A name with code points for Chinese characters, since most machines have no font that shows them."""
+    return " ".join(f"U+{ord(c):04X}" if ord(c) > 0x2E7F else c for c in name)
 
 
 def as_points(strokes: Sequence[Floats]) -> Points:

@@ -152,12 +152,12 @@ class Writing:
         return collected_session(self._say, wanted)
 
     def _compare(self, session: Path, plan: Path, out: Path, references: tuple[str, ...] = ()) -> Path:
-        from brushloop.calibrate.writing import report  # slow to import
+        from brushloop.calibrate.writing import compare  # slow to import
 
         given = "".join(f" --reference {reference}" for reference in references)
         line = f"brushloop write compare {session} --plan {plan} --out {out}{given}"
         self._say(f"$ {line}")
-        return show_work(report.compare, report.CompareRequest(session, plan, out, line, references)).path
+        return show_work(compare.compare, compare.CompareRequest(session, plan, out, line, references)).path
 
 
 def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:

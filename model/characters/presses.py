@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.ndimage import gaussian_filter
 
@@ -95,7 +97,7 @@ class Stamps:
             out[:, k] = np.einsum("mij,mij->m", moved - self._marks, pull) / nudge
         return out
 
-    def _tiles(self, canvas: Floats | Image) -> Floats | Image:
+    def _tiles(self, canvas: NDArray[Any]) -> NDArray[Any]:
         """What each press's tile shows of an image with margins, (M, tile, tile)."""
         return sliding_window_view(canvas, (self._tile, self._tile))[self._rows, self._columns]
 

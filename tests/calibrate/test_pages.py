@@ -23,9 +23,8 @@ from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.page import pages_beside
+from brushloop.calibrate.writing.compare import Character, WritingComparison, table_3, write_written
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
-from brushloop.calibrate.writing.report import write_written
-from brushloop.calibrate.writing.scores import Character, WritingComparison, score_character
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
@@ -115,17 +114,15 @@ def _written(folder: Path) -> str:
         simulated_png=encoded(cross),
     )
     one = Character("字", "a font", ink, ink, {"zi-r01": ink, "zi-r02": ink})
-    scores = list(score_character(one))
-    made = WritingComparison(
+    session = SimpleNamespace(
         header=Header(session_id="write-01", source=Source.LOOPBACK, software="test", brush=TWIN),
-        recording=folder,
-        recording_sha256="ab",
+        recording=SimpleNamespace(path=folder),
+        sha256="ab",
         calibration=CALIBRATION,
-        plan=PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,)),
-        characters=[one],
-        scores=scores,
     )
-    return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
+    plan = PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
+    made = WritingComparison(session, plan, [one])
+    return write_written(made, table_3([one]), folder / "written", "brushloop write").read_text(encoding="utf-8")
 
 
 def _pressed(folder: Path) -> Path:

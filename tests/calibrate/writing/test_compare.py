@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import cv2
@@ -11,9 +10,9 @@ import pytest
 
 from brushloop.calibrate.compare.place import Alignment, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, load_plan
-from brushloop.calibrate.writing.scores import (
+from brushloop.calibrate.writing.compare import (
     ANOTHER,
+    HEADLINE,
     KEYS,
     PLANNED,
     REFERENCE,
@@ -24,12 +23,10 @@ from brushloop.calibrate.writing.scores import (
     compare_ink,
     read_reference,
     read_written,
-    score_character,
     table_3,
 )
+from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, load_plan
 from tests.calibrate.records import written_record
-
-STRICT = (Alignment.MM, Tone.BINARY, Polarity.INK)
 
 
 def cross(dx: int = 0, width: int = 8) -> np.ndarray:
@@ -53,24 +50,23 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
     assert np.ptp(np.flatnonzero(whole.any(axis=1))) + 1 == pytest.approx(100, abs=2)
 
 
-def character() -> Character:
-    writings = {f"x-r{k:02d}": as_ink(cross(dx)) for k, dx in enumerate((0, 1, 2), 1)}
-    return Character("x", "font of the test", as_ink(cross()), as_ink(cross(width=10)), writings)
+def character(writings: int = 3) -> Character:
+    captured = {f"x-r{k + 1:02d}": as_ink(cross(k)) for k in range(writings)}
+    return Character("x", "font of the test", as_ink(cross()), as_ink(cross(width=10)), captured)
 
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
-    scores = list(score_character(character()))
-    rows = table_3(scores, {"x": "font of the test"})
+    rows = table_3([character()])
     assert len(rows) == len(KEYS) * 4
-    strict = {row.pair: row for row in rows if (row.alignment, row.tone, row.polarity) == STRICT}
+    strict = {row.pair: row for row in rows if (row.alignment, row.tone, row.polarity) == HEADLINE}
     assert [strict[pair].csim.n for pair in (SIMULATED, REFERENCE, PLANNED, ANOTHER)] == [3, 3, 1, 3]
     csim = strict[REFERENCE].csim
     assert csim.max == pytest.approx(100.0)
     assert csim.max > csim.avg > csim.min
     assert strict[REFERENCE].reference == "font of the test"
-    # The middle one is nearest to the two others.
-    another = {s.stroke_id: s.csim for s in scores if s.pair == ANOTHER and (s.alignment, s.tone, s.polarity) == STRICT}
-    assert max(another, key=lambda name: another[name]) == "x-r02"
+    # The middle one is nearest to the two others, and a writing alone has no other.
+    assert character().scores[ANOTHER, HEADLINE][:, 0].argmax() == 1
+    assert ANOTHER not in {row.pair for row in table_3([character(1)])}
 
     path = tmp_path / "written.json"
     path.write_text(written_record(table_3=tuple(rows)).to_json())
@@ -81,12 +77,6 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
     path.write_text("{}")
     with pytest.raises(CalibrationError, match="not a report with a digest: write it with `brushloop write compare`"):
         read_written(path)
-
-
-def test_a_writing_alone_has_no_other() -> None:
-    one = character()
-    alone = dataclasses.replace(one, captured=dict(list(one.captured.items())[:1]))
-    assert ANOTHER not in {score.pair for score in score_character(alone)}
 
 
 def test_a_plan_keeps_its_images_and_its_points(tmp_path: Path) -> None:

@@ -14,11 +14,11 @@ from brushloop.calibrate.writing.learn import (
     MARGIN,
     FootprintArtefact,
     PracticeRequest,
-    figures_of,
     fitted,
     practice,
     practice_strokes,
 )
+from brushloop.calibrate.writing.record import recorded_figures
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.write import WriteConfig
 from brushloop.model.characters.plan import Reach, grid, without_tilt
@@ -60,10 +60,10 @@ def test_a_drawn_figure_has_the_strokes_of_its_protocol() -> None:
 
     points = [[1.0, 2.0, 3.0, 4.0, 90.0], [5.0, 6.0, 7.0, 8.0, 90.0]]
     protocol = {"kind": "write", "figures": [{"name": "yong", "strokes": [{"points": points}, {"points": points}]}]}
-    figures = figures_of(header(json.dumps(protocol)))
-    assert [path.tolist() for path in figures["yong"]] == [[[1.0, 2.0, 3.0, 90.0], [5.0, 6.0, 7.0, 90.0]]] * 2
-    with pytest.raises(CalibrationError, match="holds no trajectories"):
-        figures_of(header('{"kind": "grid"}'))
+    figures = recorded_figures(header(json.dumps(protocol)))
+    assert [path.tolist() for path in figures["yong"]] == [points, points]
+    with pytest.raises(CalibrationError, match="was not collected by a `write` protocol"):
+        recorded_figures(header('{"kind": "grid"}'))
 
 
 def test_a_file_that_is_no_footprint_is_one_line(tmp_path: Path) -> None:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.session import Calibration
-from brushloop.calibrate.writing.learn import MOST_MM, learned, missed, reach_of
+from brushloop.calibrate.writing.compare import (
+    Character,
+    WritingComparison,
+    as_ink,
+    round_of,
+    table_3,
+    write_written,
+)
+from brushloop.calibrate.writing.learn import MOST_MM, learned, missed
 from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
-from brushloop.calibrate.writing.report import write_written
-from brushloop.calibrate.writing.scores import Character, WritingComparison, as_ink, round_of, score_character
 from brushloop.model.characters.glyph import swept
 from brushloop.model.characters.plan import StrokePath, covered, drawn, first_lead, lead
 from brushloop.model.drag import NAMES, START, Footprint
@@ -36,8 +41,8 @@ TRUE = brush_of(half_mm_2=-0.1, leash_mm=1.2, across_mm=0.6)
 
 def plan_of() -> PlanRecord:
     by = PlannedBy(footprint=PLANNED.values)
-    strokes = first_lead([LINE], PLANNED, reach_of(by), SIDE_MM, 5.0)
-    strokes = lead([PLANNED], strokes, WANTED, SIDE_MM, reach_of(by))
+    strokes = first_lead([LINE], PLANNED, by.reach, SIDE_MM, 5.0)
+    strokes = lead([PLANNED], strokes, WANTED, SIDE_MM, by.reach)
     median = tuple((x, y, 2.0) for x, y in LINE.points.tolist())
     figure = FigureRecord(
         name="bar",
@@ -58,7 +63,9 @@ def session(plan: PlanRecord, name: str = "bar", ink: np.ndarray | None = None) 
     seen = came_out(plan) if ink is None else ink
     one = Character(name, "test", as_ink(WANTED), as_ink(seen), {f"{name}-r01": as_ink(seen)})
     header = Header(session_id="s", source=Source.LOOPBACK, software="test")
-    return WritingComparison(header, Path("s.mcap"), "", Calibration.model_construct(), plan, [one], [])
+    recording = SimpleNamespace(path=Path("s.mcap"))
+    opened = SimpleNamespace(header=header, recording=recording, sha256="", calibration=CALIBRATION)
+    return WritingComparison(opened, plan, [one])
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +106,8 @@ def test_after_a_round_that_does_not_help_the_best_one_is_kept(plan: PlanRecord,
 
 def test_the_report_lists_rounds_and_what_each_phase_lost(after: PlanRecord, tmp_path: Path) -> None:
     written = session(after)
-    written = replace(written, calibration=CALIBRATION, scores=list(score_character(written.characters[0])))
-    page = write_written(written, tmp_path, "brushloop write compare").read_text(encoding="utf-8")
+    table = table_3(written.characters)
+    page = write_written(written, table, tmp_path, "brushloop write compare").read_text(encoding="utf-8")
     assert "bar: wrong pixels (missing or too much) by phase of the strokes" in page
     assert "<th>phase</th><th>round 1</th><th>these writings</th>" in page
     assert "<td>initiation, hidden tip</td>" in page
@@ -110,7 +117,7 @@ def test_a_correction_stays_within_reach(plan: PlanRecord) -> None:
     blob = np.zeros((128, 128), np.float32)
     blob[0:20, 0:20] = 1.0
     made = learned(session(plan, ink=blob), gain=1.5)
-    [command], reach = made.figures[0].strokes, reach_of(made.planned_by)
+    [command], reach = made.figures[0].strokes, made.planned_by.reach
     assert command[:, 2].min() >= reach.depth_mm[0]
     assert command[:, 2].max() <= reach.depth_mm[1]
     assert np.all((command[:, :2] >= 0.0) & (command[:, :2] <= SIDE_MM))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.calibrate.writing.scores import ANOTHER, REFERENCE, SIMULATED, Table3Row, read_written
+from brushloop.calibrate.writing.compare import ANOTHER, REFERENCE, SIMULATED, Table3Row, read_written
 
 if TYPE_CHECKING:
     from tests.collect.chains.conftest import Bench

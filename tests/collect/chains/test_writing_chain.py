@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from brushloop.calibrate.report import Written
+from brushloop.calibrate.writing.compare import CompareRequest
 from brushloop.calibrate.writing.learn import LearnRequest, PracticeRequest
 from brushloop.calibrate.writing.plan import PlanRequest
 from brushloop.calibrate.writing.record import FILE as PLAN
 from brushloop.calibrate.writing.record import PROTOCOL, FigureRecord, PlannedBy, PlanRecord
-from brushloop.calibrate.writing.report import CompareRequest
 from brushloop.collect.chains import writing
 from brushloop.collect.chains.writing import FOOTPRINT, Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
@@ -32,7 +32,7 @@ class Commands:
     def __init__(self, settled_after: int, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ran: list[str] = []
         self._rounds, self._settled_after = 0, settled_after
-        for name in ("plan.plan", "report.compare", "learn.learn", "learn.practice", "learn.fit"):
+        for name in ("plan.plan", "compare.compare", "learn.learn", "learn.practice", "learn.fit"):
             command = getattr(self, name.split(".")[1])
             monkeypatch.setattr(f"brushloop.calibrate.writing.{name}", command)
 

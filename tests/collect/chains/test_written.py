@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from brushloop.calibrate.writing.scores import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, read_written
+from brushloop.calibrate.writing.compare import ANOTHER, PLANNED, REFERENCE, SIMULATED, Table3Row, read_written
 from brushloop.sessions.recording import Recording
 
 if TYPE_CHECKING:

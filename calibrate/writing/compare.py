@@ -1,0 +1,457 @@
+"""`brushloop write compare`: written characters beside the plan's simulated image, the reference, and each other.
+
+Table 3 and Figure 13 of the paper, as one self-contained page, CSV and JSON.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, cast
+
+import cv2
+import numpy as np
+
+from brushloop.calibrate.artefact import Frozen, made_by
+from brushloop.calibrate.compare.place import (
+    ROBOT_WRITING,
+    SIZE_PX,
+    TABLE_3,
+    Alignment,
+    Image,
+    Polarity,
+    Tone,
+    averaged,
+    similarity,
+    to_tone,
+)
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.files import read_gray
+from brushloop.calibrate.presses import prepare_cell
+from brushloop.calibrate.report import (
+    Sealed,
+    Written,
+    about,
+    ink_uri,
+    load_sealed,
+    overlay,
+    overlay_uri,
+    picture_grid,
+    png_uri,
+    recording_facts,
+    render,
+    save_picture,
+    show_picture,
+    write_files,
+)
+from brushloop.calibrate.session import OpenSession, open_session
+from brushloop.calibrate.stats import Floats, Summary, pair_means, summarise
+from brushloop.calibrate.stroke.preprocess import Prepared
+from brushloop.calibrate.writing.record import (
+    FigureRecord,
+    PlanRecord,
+    Round,
+    as_points,
+    code_points,
+    load_plan,
+    recorded_figures,
+)
+from brushloop.model.characters.plan import Phase, phase_map
+from brushloop.model.similarity import SSIM_SETTINGS
+from brushloop.sessions.disk import check_writable, csv_text
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.records import Source
+from brushloop.sessions.terminal import Progress, counted, unseen
+
+FILE, PICTURE, PAGE, TABLE = "written.json", "figure-13.png", "written.html", "written.csv"
+FORMAT = "brushloop-written-2"
+MAX_BYTES = 8 * 1024 * 1024
+Key = tuple[Alignment, Tone, Polarity]
+KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone, Polarity))
+HEADLINE: Key = (Alignment.MM, Tone.BINARY, Polarity.INK)
+"""The comparison that decides which writing is better."""
+Ink = dict[Tone, Image]
+"""(128, 128) ink of a cell from 0 to 1 by tone: coverage of what counts as ink, and how dark it is."""
+SIMULATED, REFERENCE = "captured, simulated", "captured, reference"
+PLANNED, ANOTHER = "simulated, reference", "captured, another writing"
+PAIRS = (SIMULATED, REFERENCE, PLANNED, ANOTHER)
+"""The comparisons made."""
+PAPER_ROWS = {SIMULATED: TABLE_3["ccd-bsmg"], REFERENCE: TABLE_3[ROBOT_WRITING]}
+"""The paper's row shown with a comparison: our reading, see `TABLE_3`."""
+NORMAL_SIDE_PX = 100
+
+
+@dataclass(frozen=True)
+class Character:
+    """One character: the image asked for, the model's image of the plan, and what was written."""
+
+    name: str
+    reference_name: str
+    reference: Ink
+    simulated: Ink
+    captured: dict[str, Ink]
+    """Ink by stroke id."""
+    cut: tuple[str, ...] = ()
+    """Writings whose ink reaches the edge of their cell."""
+
+    def mean_ink(self) -> Image:
+        """(128, 128) share of the writings that inked each pixel."""
+        return np.asarray(np.mean([ink[Tone.BINARY] for ink in self.captured.values()], axis=0), np.float32)
+
+    @functools.cached_property
+    def scores(self) -> dict[tuple[str, Key], Floats]:
+        """(n, 2) CSIM and SSIM, from 0 to 1, of every writing in each of `PAIRS` and `KEYS`.
+
+        `PLANNED` has one row, since no writing is involved; a writing alone has NaN for another one.
+        """
+        inks = list(self.captured.values())
+        scores: dict[tuple[str, Key], Floats] = {}
+        for key in KEYS:
+            scores[SIMULATED, key] = np.array([compare_ink(ink, self.simulated, key) for ink in inks])
+            scores[REFERENCE, key] = np.array([compare_ink(self.reference, ink, key) for ink in inks])
+            scores[PLANNED, key] = np.array([compare_ink(self.reference, self.simulated, key)])
+            scores[ANOTHER, key] = pair_means(
+                len(inks), lambda k, others, key=key: np.array([compare_ink(inks[k], inks[j], key) for j in others])
+            )
+        return scores
+
+    def ranked(self) -> list[str]:
+        """Stroke ids by CSIM against the reference (`HEADLINE`), best first."""
+        order = np.argsort(-self.scores[REFERENCE, HEADLINE][:, 0], kind="stable")
+        return [list(self.captured)[k] for k in order]
+
+
+class Table3Row(Frozen):
+    """One comparison over the writings of one character, in percent."""
+
+    character: str
+    reference: str
+    """The font, or the user's picture."""
+    pair: str
+    """What was compared with what."""
+    alignment: Alignment
+    tone: Tone
+    polarity: Polarity
+    csim: Summary
+    ssim: Summary
+
+
+class WrittenRecord(Sealed):
+    """Written characters as their `written.json` holds them: everything but the images and the single scores."""
+
+    FORMAT: ClassVar[str] = FORMAT
+    MADE_BY: ClassVar[str] = "brushloop write compare"
+
+    format: str = FORMAT
+    source: Source
+    session: str
+    recording_sha256: str
+    brush: str
+    """Name in the recording."""
+    model: str
+    cell_mm: float
+    table_3: tuple[Table3Row, ...]
+    refused: tuple[tuple[str, str], ...]
+    """(stroke, why)."""
+    figure_13_sha256: str
+    """Of Figure 13 in the same folder."""
+    software: str
+    command: str
+
+    @property
+    def characters(self) -> tuple[str, ...]:
+        """Their names, in the table's order."""
+        return tuple(dict.fromkeys(row.character for row in self.table_3))
+
+
+def read_written(path: Path) -> WrittenRecord:
+    """Read `written.json`, or that in a report's folder. Raises `CalibrationError` if it is not one or was edited."""
+    return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord, MAX_BYTES)
+
+
+@dataclass(frozen=True, slots=True)
+class WritingComparison:
+    """Written characters, compared with their plan."""
+
+    session: OpenSession
+    plan: PlanRecord
+    characters: list[Character]
+    refused: tuple[tuple[str, str], ...] = ()
+    """(stroke, why), never dropped in silence."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompareRequest:
+    """Which written characters are compared, and where the report goes."""
+
+    session: Path
+    plan: Path
+    """The plan's folder, or its plan.json."""
+    out: Path
+    command: str
+    """Named by the report as what made it."""
+    references: tuple[str, ...] = ()
+    """Pictures to compare with instead of the plan's font, as `CHARACTER=FILE`."""
+
+
+def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
+    """Compare written characters with their simulation and reference; write the report. Raises `CalibrationError`."""
+    check_writable(request.out)
+    references: dict[str, tuple[str, Image]] = {}
+    for words in request.references:
+        name, _, path = words.partition("=")
+        if not name or not path:
+            raise CalibrationError("--reference", f"{words!r}: expected CHARACTER=FILE, as 字=zi.png")
+        references[name] = (Path(path).name, read_reference(Path(path)))
+    written = compare_written(request.session, load_plan(request.plan), references, progress)
+    table = table_3(counted(written.characters, "characters compared", len(written.characters), progress))
+    report = write_written(written, table, request.out, request.command)
+    lines = summary(written, table)
+    return Written(report, (*lines, f"Picture: {request.out / PICTURE}", f"Report:  {report}"))
+
+
+def compare_written(
+    path: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]], progress: Progress = unseen
+) -> WritingComparison:
+    """Read the writings of a session beside their plan. `references` (character -> name, image) replace the plan's.
+
+    Raises `CalibrationError` if the two do not belong together or nothing can be compared.
+    """
+    session, refused = open_session(path), list[tuple[str, str]]()
+    _check_drawn_from(plan, session)
+    if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
+        raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
+    writings: dict[str, dict[str, Ink]] = {}
+    cut = set[str]()
+    for stroke_id, name, prepared in read_writings(session, refused, progress):
+        ink = {Tone.BINARY: _small(prepared.mask.astype(np.float32)), Tone.GRAY: _small(prepared.soft)}
+        writings.setdefault(name, {})[stroke_id] = ink
+        cut |= {stroke_id} if prepared.cut else set()
+    characters: list[Character] = []
+    for figure in plan.figures:
+        if captured := writings.get(figure.name):
+            name, image = references.get(figure.name) or (figure.source, figure.wanted())
+            at_the_edge = tuple(stroke_id for stroke_id in captured if stroke_id in cut)
+            images = as_ink(image), as_ink(figure.simulated())
+            characters.append(Character(figure.name, name, *images, captured, at_the_edge))
+    if not characters:
+        why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
+        raise CalibrationError(str(session.recording.path), f"no character can be compared{why}")
+    return WritingComparison(session, plan, characters, tuple(refused))
+
+
+def read_writings(
+    session: OpenSession, refused: list[tuple[str, str]], progress: Progress
+) -> Iterator[tuple[str, str, Prepared]]:
+    """Yield stroke id, name of the figure and ink of every cell that the arm wrote on; the others go to `refused`.
+
+    Raises `CalibrationError` for an import.
+    """
+    if session.calibration is None:
+        raise CalibrationError(str(session.recording.path), "is an import: it holds no figures that the arm wrote")
+    what = f"{session.header.session_id}: found"
+    for capture in counted(session.recording.captures(), what, len(session.strokes), progress):
+        stroke_id = capture.stroke.stroke_id
+        try:
+            prepared = prepare_cell(capture, session.calibration)
+        except (CaptureRefused, SessionDamaged) as error:
+            refused.append((stroke_id, error.what))
+        else:
+            yield stroke_id, stroke_id.rsplit("-r", 1)[0], prepared
+
+
+def _check_drawn_from(plan: PlanRecord, session: OpenSession) -> None:
+    """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
+    where, cell_mm = str(session.recording.path), session.strokes[0].cell_mm
+    for name, strokes in recorded_figures(session.header).items():
+        figure = plan.figure(name)
+        if figure is None or figure.commanded != as_points(strokes):
+            raise CalibrationError(where, f"{name!r} was not drawn from this plan")
+    if cell_mm is not None and cell_mm[2:] != (plan.cell_mm, plan.cell_mm):
+        raise CalibrationError(where, f"has cells of {cell_mm[2]:g} x {cell_mm[3]:g} mm, the plan {plan.cell_mm:g} mm")
+
+
+def compare_ink(fixed: Ink, moving: Ink, key: Key) -> tuple[float, float]:
+    """(CSIM, SSIM) of the ink of two cells. Raises ValueError for a blank one."""
+    alignment, tone, polarity = key
+    one, other = (to_tone(aligned(ink[tone], alignment), tone) for ink in (fixed, moving))
+    return similarity(one, other, alignment, polarity)
+
+
+def aligned(ink: Image, alignment: Alignment) -> Image:
+    """(128, 128) as it is, or with the longer side of its ink scaled to 100 px and its bounding box in the middle."""
+    if alignment is Alignment.MM:
+        return ink
+    rows, columns = (np.flatnonzero((ink > 0.5).any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        raise ValueError("holds no ink")
+    step_px = float(1 + max(np.ptp(rows), np.ptp(columns))) / NORMAL_SIDE_PX
+    left, top = (0.5 * float(at[0] + at[-1] + 1 - SIZE_PX * step_px) for at in (columns, rows))
+    return averaged(ink, (left, top), step_px, SIZE_PX, fine=1).clip(0.0, 1.0)
+
+
+def as_ink(image: Image) -> Ink:
+    """Make ink from an image that was not photographed: its darkness is its coverage."""
+    return dict.fromkeys(Tone, image)
+
+
+def read_reference(path: Path) -> Image:
+    """Read (128, 128) ink from a picture of a dark character on light, padded to square. Raises `CalibrationError`."""
+    ink = 1.0 - read_gray(path).astype(np.float32) / 255.0
+    if float(ink.mean()) > 0.5:
+        raise CalibrationError(str(path), "is mostly dark: a reference is dark ink on light paper")
+    height, width = ink.shape
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    return _small(np.pad(ink, ((top, side - height - top), (left, side - width - left))))
+
+
+def _small(image: Image) -> Image:
+    return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
+
+
+def round_of(figure: FigureRecord, character: Character, side_mm: float) -> Round:
+    """What the writings of a figure show on average; phases for characters only."""
+    wanted, writings = figure.wanted(), character.captured.values()
+    csim = float(np.mean([compare_ink(as_ink(wanted), ink, HEADLINE)[0] for ink in writings]))
+    lost: dict[str, float] = {}
+    if figure.medians:
+        where = phase_map(figure.paths, side_mm, len(wanted))
+        wrong = np.mean([(wanted > 0.5) != (ink[Tone.BINARY] > 0.5) for ink in writings], axis=0)
+        share = 100.0 * np.bincount(where.ravel(), wrong.ravel(), len(Phase)) / max(1, np.count_nonzero(wanted > 0.5))
+        present = np.unique(where)
+        lost = {str(phase): round(float(share[k]), 2) for k, phase in enumerate(Phase) if k in present}
+    return Round(csim_percent=round(100.0 * csim, 3), lost_percent=lost)
+
+
+def table_3(characters: Iterable[Character]) -> list[Table3Row]:
+    """The rows, by character, then in the order of `KEYS` and `PAIRS`; without those that compare nothing."""
+    rows: list[Table3Row] = []
+    for character, key, pair in itertools.product(characters, KEYS, PAIRS):
+        csim, ssim = (summarise(percent) for percent in 100.0 * character.scores[pair, key].T)
+        if csim is not None and ssim is not None:
+            how = dict(zip(("alignment", "tone", "polarity"), key, strict=True))
+            about_it = {"character": character.name, "reference": character.reference_name, "pair": pair}
+            rows.append(Table3Row.model_validate(about_it | how | {"csim": csim, "ssim": ssim}))
+    return rows
+
+
+def summary(written: WritingComparison, table: Sequence[Table3Row]) -> Iterator[str]:
+    """Lines for the terminal: the strict and the lenient comparison, ink = 1."""
+    source, count = written.session.header.source, sum(len(character.captured) for character in written.characters)
+    yield f"{count} characters written, {len(written.refused)} not compared ({source})"
+    for row in table:
+        if row.polarity is Polarity.INK and row.tone is Tone.BINARY:
+            csim, ssim = ("{:.2f} / {:.2f} / {:.2f}".format(*of.range_and_avg) for of in (row.csim, row.ssim))
+            yield f"{row.character} {row.alignment}, {row.pair}: CSIM {csim}, SSIM {ssim}"
+
+
+def write_written(written: WritingComparison, table: Sequence[Table3Row], folder: Path, command: str) -> Path:
+    """Write the report's files into `folder`; returns the page's path. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    draw(written, folder / PICTURE)
+    picture = (folder / PICTURE).read_bytes()
+    session, plan, header = written.session, written.plan, written.session.header
+    facts = recording_facts(
+        header.model_copy(update={"protocol": ""}),  # the plan, point by point
+        session.recording.path.name,
+        session.sha256,
+        session.calibration,
+    )
+    record = WrittenRecord(
+        source=header.source,
+        session=header.session_id,
+        recording_sha256=session.sha256,
+        brush=header.brush,
+        model=plan.model,
+        cell_mm=plan.cell_mm,
+        table_3=tuple(table),
+        refused=written.refused,
+        figure_13_sha256=hashlib.sha256(picture).hexdigest(),
+        software=made_by(),
+        command=command,
+    )
+    page = render(
+        "written.html.j2",
+        **about(header),
+        names=" ".join(record.characters),
+        writings=sum(len(character.captured) for character in written.characters),
+        model=plan.model,
+        cell_mm=plan.cell_mm,
+        tables=_tables(table),
+        paper_rows=PAPER_ROWS,
+        characters=[_character(plan, character) for character in written.characters],
+        refused=written.refused,
+        cut=[stroke_id for character in written.characters for stroke_id in character.cut],
+        ssim_settings=SSIM_SETTINGS,
+        picture=png_uri(picture),
+        provenance=[*facts, ("compared with", record.software), ("command", command)],
+    )
+    write_files(folder, {TABLE: scores_csv(written), FILE: record.sealed().to_json(), PAGE: page})
+    return folder / PAGE
+
+
+def scores_csv(written: WritingComparison) -> str:
+    """Every score as the text of a CSV file; the stroke id is empty where no writing is involved."""
+    head = ["character", "stroke_id", "pair", "alignment", "tone", "polarity", "csim", "ssim", "source"]
+    source, rows = str(written.session.header.source), list[tuple[str, ...]]()
+    for character in written.characters:
+        for (pair, key), scores in character.scores.items():
+            names = [""] if pair == PLANNED else character.captured
+            for stroke_id, (csim, ssim) in zip(names, scores.tolist(), strict=True):
+                if np.isfinite(csim):
+                    rows.append((character.name, stroke_id, pair, *key, f"{csim:.6f}", f"{ssim:.6f}", source))
+    return csv_text(head, rows)
+
+
+def draw(written: WritingComparison, path: Path) -> None:
+    """Draw Figure 13, a row per character: reference, simulated, best and worst writing, all writings over reference.
+
+    Raises OSError.
+    """
+    header, count = written.session.header, len(written.characters)
+    title = f"{header.session_id} ({header.source})"
+    figure, rows = picture_grid(count, 5, (13.0, 0.5 + 2.9 * count), title)
+    for character, axes in zip(written.characters, rows, strict=True):
+        names = character.ranked()
+        reference = character.reference[Tone.GRAY]
+        parts: tuple[tuple[str, Image], ...] = (
+            (f"reference {code_points(character.name)}", reference),
+            ("simulated", character.simulated[Tone.GRAY]),
+            (f"captured, best of {len(names)}", character.captured[names[0]][Tone.GRAY]),
+            ("captured, worst", character.captured[names[-1]][Tone.GRAY]),
+            ("blue: mean of all captured; orange: reference", overlay(reference, character.mean_ink())),
+        )
+        for axis, (text, image) in zip(axes, parts, strict=True):
+            show_picture(axis, image, text, fontsize=8)
+    save_picture(figure, path)
+
+
+def _tables(table: Sequence[Table3Row]) -> list[dict[str, Any]]:
+    """A table for each alignment and tone, with both polarities."""
+    out: list[dict[str, Any]] = []
+    for tone, alignment in itertools.product(Tone, (Alignment.SIZE_NORMALISED, Alignment.MM)):
+        rows = [row for row in table if (row.alignment, row.tone) == (alignment, tone)]
+        rows.sort(key=lambda row: (PAIRS.index(row.pair), row.polarity is Polarity.PAPER))
+        out.append({"alignment": alignment, "tone": tone, "rows": rows})
+    return out
+
+
+def _character(plan: PlanRecord, character: Character) -> dict[str, Any]:
+    """A character as the page shows it."""
+    reference, figure = character.reference[Tone.GRAY], plan.figure(character.name)
+    rounds = [] if figure is None else [*figure.rounds, round_of(figure, character, plan.cell_mm)]
+    return {
+        "rounds": rounds,
+        "phases": [str(phase) for phase in Phase if any(phase in each.lost_percent for each in rounds)],
+        "name": character.name,
+        "reference_name": character.reference_name,
+        "reference": ink_uri(reference),
+        "simulated": ink_uri(character.simulated[Tone.GRAY]),
+        "mean": overlay_uri(character.mean_ink(), reference),
+        "captured": [(name, ink_uri(character.captured[name][Tone.GRAY])) for name in character.ranked()],
+    }
