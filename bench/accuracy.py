@@ -36,9 +36,8 @@ from bench.harness import BenchError, Result, at_most, brushloop, machine, round
 from bench.prior import BRISTLE
 from brushloop.calibrate.compare.place import TABLE_2, Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
-from brushloop.calibrate.fit.fit import fit_presses
+from brushloop.calibrate.fit.fit import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
-from brushloop.calibrate.fit.prior import Prior, learned
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, read_written
 from brushloop.drivers.sim.brush.spec import PAPER, load_brush

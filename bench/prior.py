@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
-from brushloop.calibrate.fit.fit import fit_presses
-from brushloop.calibrate.fit.prior import FILE, KnownBrush, KnownBrushes, about
+from brushloop.calibrate.fit.fit import FILE, KnownBrush, KnownBrushes, about, fit_presses
 from brushloop.model.fitted import chance_within, published
 
 BRISTLE = "bristle simulation"
@@ -74,7 +73,7 @@ class MadeUp:
         u = grid.x_mm - widest
         share = np.where(u > 0.0, u / heel, u / tip)
         edge = np.where(np.abs(share) < 1.0, half * self.shape(np.clip(share, -1.0, 1.0)), -1.0)
-        return Pressed(depth_mm, tilt_deg, chance_within(np.stack([edge, edge]), grid.y_mm, EDGE_MM))
+        return Pressed(depth_mm, tilt_deg, chance_within(edge, grid.y_mm, EDGE_MM))
 
 
 def made_up(family: str, number: int, seed: int = 0) -> MadeUp:

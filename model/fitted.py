@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.arrays import Array, as_batch, library, like
+from brushloop.model.arrays import Array, as_batch, as_numpy, library, like
 from brushloop.model.ccdbsm import DomainError, basic_lengths
 from brushloop.model.outline import Outline, closed
 from brushloop.model.strokes import StrokeModel
@@ -78,9 +78,9 @@ def published() -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """The mark of one press, mm: offset of the widest place from the point of touch, the two sides, the half width.
+    """The marks of presses, mm: offset of the widest place from the point of touch, the two sides, the half width.
 
-    One number each, or one for each brush of a batch.
+    All have the shape of the presses' depths, or of brushes and presses if the brush is a batch.
     """
 
     widest: Floats
@@ -95,7 +95,7 @@ class FittedPress:
 
     `edges` (2, MODES, TERMS) are the residuals of the upper and the lower edge from the profile: sines along the mark,
     each with the terms of `command_terms`. `ends` (2, TERMS) are those of the lengths of the tip's and the heel's side.
-    With `values` (K, 17) it is a batch of K brushes, whose widths and edges come as (K, ...).
+    `values` of shape (K, 1, 17) are those of a batch of K brushes, whose sizes and widths come as (K, ...).
     """
 
     radius_mm: float
@@ -104,67 +104,76 @@ class FittedPress:
     edges: Floats = field(default_factory=lambda: np.zeros((2, MODES, TERMS)))
     ends: Floats = field(default_factory=lambda: np.zeros((2, TERMS)))
 
-    def sizes(self, depth_mm: float, tilt_deg: float) -> Sizes:
-        """The mark's sizes. Raises DomainError outside the domain: h <= 0, or a tilt outside [0, 80) deg."""
+    def sizes(self, depth_mm: Array, tilt_deg: Array, further_mm: Array = 0.0) -> Sizes:
+        """The sizes of marks at depths and tilts of one shape, numbers or (N,).
+
+        `further_mm` (..., 2) is added to the sides of the tip and the heel. Raises DomainError outside the domain:
+        h <= 0, or a tilt outside [0, 80) deg.
+        """
         p = dict(zip(NAMES, np.moveaxis(self.values, -1, 0), strict=True))
         h = depth_mm + p["h0_mm"]
-        if not (np.all(h > 0.0) and depth_mm > 0.0):
-            starts_mm = max(0.0, -float(np.min(p["h0_mm"])))
-            raise DomainError("depth_mm", depth_mm, f"({starts_mm:g}, inf)", "the fitted brush starts to mark there")
-        if not 0.0 <= tilt_deg < 80.0:
-            raise DomainError("tilt_deg", tilt_deg, "[0, 80)")
-        alpha = math.radians(tilt_deg)
-        o3a, o3c, o4o3 = basic_lengths(h, alpha, self.radius_mm, self.length_mm, math)
+        if not (np.all(h > 0.0) and np.all(np.greater(depth_mm, 0.0))):
+            allowed = f"({max(0.0, -float(np.min(p['h0_mm']))):g}, inf)"
+            raise DomainError("depth_mm", float(np.min(depth_mm)), allowed, "the fitted brush starts to mark there")
+        outside = np.atleast_1d(tilt_deg)[~np.atleast_1d(np.less_equal(0.0, tilt_deg) & np.less(tilt_deg, 80.0))]
+        if len(outside):
+            raise DomainError("tilt_deg", float(outside[0]), "[0, 80)")
+        alpha = np.radians(tilt_deg)
+        o3a, o3c, o4o3 = basic_lengths(h, alpha, self.radius_mm, self.length_mm, np)
         share = h / DEPTH_MM
         long = share ** (p["length_power"] - 1.0) * np.maximum(0.05, 1.0 + p["length_tilt"] * tilt_deg)
         wide = share ** (p["width_power"] - 1.0) * np.maximum(0.05, 1.0 + p["width_tilt"] * tilt_deg)
-        widest = p["lean"] * depth_mm * math.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
+        widest = p["lean"] * depth_mm * np.tan(alpha) + p["origin_mm"] + p["origin_gain"] * h
         heel = p["heel_gain"] * o3a * long * np.maximum(0.05, 1.0 + p["heel_tilt"] * tilt_deg)
         tip = p["tip_gain"] * o4o3 * long
-        if self.ends.any():
-            further = self.ends @ command_terms(depth_mm, tilt_deg)
-            tip, heel = (np.maximum(side + add, 0.3 * side) for side, add in zip((tip, heel), further, strict=True))
+        further = np.moveaxis(command_terms(depth_mm, tilt_deg) @ self.ends.T + further_mm, -1, 0)
+        tip, heel = (np.maximum(side + add, 0.3 * side) for side, add in zip((tip, heel), further, strict=True))
         return Sizes(widest, tip, heel, p["lam"] * o3c * wide)
 
-    def half_width(self, depth_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
-        """Half width of the profile at x (N,) from the point of touch, mm; beyond an end, minus the distance to it."""
-        s = self.sizes(depth_mm, tilt_deg)
+    def half_width(self, sizes: Sizes, x_mm: Floats) -> Floats:
+        """Half width (..., N) of the profile of marks at x (N,) from the point of touch, mm.
+
+        Beyond an end it is minus the distance to it.
+        """
         heel_power, heel_round, tip_power, tip_round, core = np.moveaxis(self.values[..., 6:11, None], -2, 0)
-        u = x_mm - s.widest[..., None]
+        u = x_mm - sizes.widest[..., None]
         at_heel = u > 0.0
-        long = np.where(at_heel, s.heel[..., None], s.tip[..., None])
+        long = np.where(at_heel, sizes.heel[..., None], sizes.tip[..., None])
         share = np.minimum(np.abs(u) / long, 1.0)
         fall = 1.0 - share ** np.where(at_heel, heel_round, tip_round)
-        width = s.half[..., None] * fall ** np.where(at_heel, heel_power, tip_power)
-        return width + core * np.sqrt(1.0 - (share * share) ** 3) - np.maximum(np.abs(u) - long, 0.0)
+        width = sizes.half[..., None] * fall ** np.where(at_heel, heel_power, tip_power)
+        blunt = np.sqrt(1.0 - np.square(share) * np.square(np.square(share)))
+        return width + core * blunt - np.maximum(np.abs(u) - long, 0.0)
 
-    def edges_at(self, depth_mm: float, tilt_deg: float, x_mm: Floats) -> Floats:
-        """Distance of the upper and the lower edge from the axis at x (N,), (2, N) mm, as `half_width`."""
-        width = self.half_width(depth_mm, tilt_deg, x_mm)[..., None, :]
-        if not self.edges.any():
-            return width.repeat(2, axis=-2)
+    def edges_at(self, depth_mm: Array, tilt_deg: Array, x_mm: Floats) -> Floats:
+        """Distances of the upper and the lower edge from the axis, (..., 2, N) mm, as `half_width`."""
         s = self.sizes(depth_mm, tilt_deg)
-        waves = modes((x_mm - (s.widest - s.tip)[..., None]) / (s.tip + s.heel)[..., None])
-        return width + np.moveaxis(waves @ (self.edges @ command_terms(depth_mm, tilt_deg)).T, -1, -2)
+        share = (x_mm - (s.widest - s.tip)[..., None]) / (s.tip + s.heel)[..., None]
+        sines = np.einsum("smt,...t->...sm", self.edges, command_terms(depth_mm, tilt_deg))
+        return self.half_width(s, x_mm)[..., None, :] + sines @ np.swapaxes(modes(share), -1, -2)
 
     def chance(self, depth_mm: float, tilt_deg: float, x_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
         """The probability of ink (len(y_mm), len(x_mm)) if edges vary by `spread_mm`; y upward from the touch."""
-        return chance_within(self.edges_at(depth_mm, tilt_deg, x_mm), y_mm, spread_mm)
+        edge_mm = np.where(y_mm[:, None] > 0.0, *self.edges_at(depth_mm, tilt_deg, x_mm))
+        return chance_within(edge_mm, y_mm, spread_mm)
 
-    def outline(self, depth_mm: float, tilt_deg: float, points: int = 97) -> Outline:
-        """The boundary through `points` points of each edge (an odd number), x from the point of touch, y upward."""
-        s = self.sizes(depth_mm, tilt_deg)
+    def outline(self, depth_mm: Array, tilt_deg: Array, points: int = 97) -> Outline:
+        """The boundaries through `points` points of each edge (an odd number), x from the point of touch, y upward."""
+        depth, tilt = as_batch(depth_mm, tilt_deg)
+        s = self.sizes(depth, tilt)
         # Points are denser at both ends, where the outline turns fastest.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, points))
-        x = s.widest - s.tip + share * (s.tip + s.heel)
-        top, bottom = np.maximum(self.edges_at(depth_mm, tilt_deg, x), 0.0)
-        return closed(np.column_stack([x, -bottom])[None], np.column_stack([x, top])[None, ::-1])
+        x = (s.widest - s.tip)[:, None] + share * (s.tip + s.heel)[:, None]
+        top, bottom = np.moveaxis(np.maximum(self.edges_at(depth, tilt, x), 0.0), 1, 0)
+        return closed(np.stack([x, -bottom], axis=-1), np.stack([x, top], axis=-1)[:, ::-1])
 
 
-def chance_within(edges_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
-    """The probability of ink (len(y_mm), N) between edges (2, N) that vary by `spread_mm`, the scale of a logistic."""
-    upper, lower = edges_mm
-    inside = np.where(y_mm[:, None] > 0.0, upper, lower) - np.abs(y_mm)[:, None]
+def chance_within(edge_mm: Floats, y_mm: Floats, spread_mm: float) -> Floats:
+    """The probability of ink (len(y_mm), N) within an edge, whose distance from the axis varies by `spread_mm`.
+
+    `edge_mm` is (N,), or (len(y_mm), N) where it is not the same on both sides; the spread is the scale of a logistic.
+    """
+    inside = edge_mm - np.abs(y_mm)[:, None]
     return 1.0 / (1.0 + np.exp(-np.clip(inside / spread_mm, -30.0, 30.0)))
 
 
@@ -173,10 +182,10 @@ def modes(share: Floats) -> Floats:
     return np.sin(np.pi * np.clip(share, 0.0, 1.0)[..., None] * np.arange(1, MODES + 1))
 
 
-def command_terms(depth_mm: float, tilt_deg: float) -> Floats:
-    """The terms of a residual, (TERMS,): 1, depth, tilt, their product and their squares, centred on their middles."""
+def command_terms(depth_mm: Array, tilt_deg: Array) -> Floats:
+    """The terms of a residual, (..., TERMS): 1, depth, tilt, their product and their squares, about their middles."""
     h, a = (depth_mm - DEPTH_MM) / DEPTH_SPAN_MM, (tilt_deg - TILT_DEG) / TILT_DEG
-    return np.array([1.0, h, a, h * a, h * h, a * a])
+    return np.stack([np.ones_like(h), h, a, h * a, h * h, a * a], axis=-1)
 
 
 def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeModel:
@@ -187,10 +196,10 @@ def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeMod
 
     def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
         depth, tilt = as_batch(depth_mm, tilt_deg)
-        marks: list[Floats] = []
-        for h, a in zip(depth.tolist(), tilt.tolist(), strict=True):
-            marks.append(press.outline(h, a).points[0] - [h * math.tan(math.radians(a)), 0.0])
-        points = like(np.array(marks), depth)
+        h, a = as_numpy(depth), as_numpy(tilt)
+        points = press.outline(h, a).points
+        points[..., 0] -= (h * np.tan(np.radians(a)))[:, None, None]
+        points = like(points, depth)
         return Outline(points, library(points).ones_like(points[..., 0, 0]))
 
     definition = "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes."

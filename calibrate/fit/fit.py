@@ -9,24 +9,50 @@ the profile. Over the strokes, each of these numbers is a polynomial in depth an
 The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest marginal
 likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit smooths
 strokes that repeat badly and follows strokes that repeat well.
+
+The prior is the mean and covariance of the parameters over known brushes. `prior.json` holds those of brushes of
+several families of shape, each fitted to many strokes (`python -m bench.prior` makes it). Each family counts with the
+square root of its number of brushes, so that one large family does not make the others implausible. The covariance is
+shrunk toward its diagonal, because there are few brushes, and it has a floor, because the next brush may belong to none
+of the families.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from operator import itemgetter
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from brushloop.calibrate.fit.captures import SPREAD_MM, Grid, Pressed
-from brushloop.calibrate.fit.prior import Prior, learned, spreads
+from brushloop.calibrate.artefact import Frozen
+from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Grid, Pressed, by_cell
 from brushloop.model.damped import Damping, Equations, descend
-from brushloop.model.fitted import MODES, NAMES, PARAMETERS, TERMS, FittedPress, chance_within, command_terms, modes
+from brushloop.model.fitted import (
+    MODES,
+    NAMES,
+    PARAMETERS,
+    TERMS,
+    FittedPress,
+    Sizes,
+    chance_within,
+    command_terms,
+    modes,
+    published,
+)
 
 Floats = NDArray[np.float64]
+
+FILE = Path(__file__).with_name("prior.json")
+SHRINKAGE = 0.3
+FLOOR = 0.15
+"""Least standard deviation of a parameter, in units of its spread."""
 
 ALL = tuple(range(len(NAMES)))
 SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
@@ -51,6 +77,70 @@ END_MM = 1.5
 END_NOISE = 4.0
 """Variance of a pixel times the number of pixels whose errors are correlated, where an end is sought."""
 END_STEP_MM, END_ROUNDS = 0.05, 4
+
+
+class KnownBrush(Frozen):
+    """A brush of the prior: its parameters, in the order of `NAMES`."""
+
+    name: str
+    family: str
+    values: tuple[float, ...] = Field(min_length=len(NAMES), max_length=len(NAMES))
+
+
+class KnownBrushes(Frozen):
+    """The contents of `prior.json`."""
+
+    brushes: tuple[KnownBrush, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A normal distribution of the parameters over their spreads: `mean` (17,) and `precision` (17, 17)."""
+
+    mean: Floats
+    precision: Floats
+
+    @property
+    def values(self) -> Floats:
+        """The mean in the parameters' own units, within their bounds."""
+        low, high = (np.array([getattr(p, end) for p in PARAMETERS]) for end in ("low", "high"))
+        return np.clip(published() + spreads() * self.mean, low, high)
+
+    def off(self, values: Floats) -> Floats:
+        """Distance of parameters from the mean, over their spreads, (17,)."""
+        return (values - published()) / spreads() - self.mean
+
+
+def spreads() -> Floats:
+    """The plausible spread of each parameter, (17,)."""
+    return np.array([parameter.spread for parameter in PARAMETERS])
+
+
+def about(values: Floats) -> Prior:
+    """A prior that holds only the plausible spread of each parameter about these values (17,)."""
+    return Prior((values - published()) / spreads(), np.eye(len(NAMES)))
+
+
+@cache
+def learned(without_families: tuple[str, ...] = ()) -> Prior:
+    """The prior from `prior.json`; a bench leaves out the family that it scores."""
+    known = KnownBrushes.model_validate(json.loads(FILE.read_text(encoding="utf-8"))).brushes
+    return of_brushes([b for b in known if b.family not in without_families])
+
+
+def of_brushes(known: Sequence[KnownBrush]) -> Prior:
+    """The prior from these brushes. Raises ValueError for fewer than two."""
+    if len(known) < 2:
+        raise ValueError("a prior needs at least two brushes")
+    families = [brush.family for brush in known]
+    weights = np.array([families.count(family) ** -0.5 for family in families])
+    weights /= weights.sum()
+    off = (np.array([brush.values for brush in known]) - published()) / spreads()
+    mean = weights @ off
+    covariance = (off - mean).T @ ((off - mean) * weights[:, None]) / (1.0 - np.sum(weights**2))
+    covariance += SHRINKAGE * (np.diag(np.diag(covariance)) - covariance)
+    widened = np.asarray(covariance + FLOOR**2 * np.eye(len(mean)), np.float64)
+    return Prior(mean, np.asarray(np.linalg.solve(widened, np.eye(len(mean))), np.float64))
 
 
 def fit_presses(
@@ -81,43 +171,42 @@ def fit_presses(
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A press as a brush predicts it, with the derivatives by its parameters over their spreads.
+    """A mark as a brush without residuals predicts it, with its derivatives by P numbers.
 
-    A parameter moves the two edges of the mark, and the ink of a pixel depends only on the edge on its side. So the
-    Jacobian J of the image is d ink / d edge, one image, times the derivatives of the edges, and J'J and J'r are sums
-    over columns. Matrices of that size are also too small for a matrix library to start threads for them.
+    Such a number moves both edges of the mark, and the ink of a pixel depends only on the edge on its side. So the
+    Jacobian J of the image is d ink / d half width, one image, times the derivatives of the half width, and J'J and J'r
+    are sums over columns. Matrices of that size are also too small for a matrix library to start threads for them.
     """
 
     ink: Floats
     """Probability of ink (len(y_mm), len(x_mm))."""
-    by_edge: Floats
-    """Its derivative by the edge on the pixel's side, 1/mm."""
-    above: NDArray[np.bool_]
-    """Rows (len(y_mm),) on the upper side."""
-    edges: Floats
-    """Derivatives of the edges by P parameters, (P, 2 len(x_mm)): the upper edge, then the lower, mm."""
+    by_width: Floats
+    """Its derivative by the half width, 1/mm."""
+    widths: Floats
+    """Derivatives of the half width (P, len(x_mm)), mm."""
+
+    @classmethod
+    def of(cls, width: Floats, widths: Floats, y_mm: Floats) -> Drawn:
+        """The mark of half width (N,) with these derivatives."""
+        ink = chance_within(width, y_mm, SPREAD_MM)
+        return cls(ink, ink * (1.0 - ink) / SPREAD_MM, widths)
 
     def square(self) -> Floats:
         """J'J, (P, P)."""
-        return (self.edges * self._by_side(self.by_edge**2)) @ self.edges.T
+        return (self.widths * np.einsum("yx,yx->x", self.by_width, self.by_width)) @ self.widths.T
 
-    def pull(self, residual: Floats) -> Floats:
-        """J'r, (P,), of an image's residual r."""
-        return self.edges @ self._by_side(self.by_edge * residual)
-
-    def _by_side(self, image: Floats) -> Floats:
-        """Sums of an image over each side's rows, (2 len(x_mm),)."""
-        return np.concatenate([image[self.above].sum(axis=0), image[~self.above].sum(axis=0)])
+    def pull(self, residuals: Floats) -> Floats:
+        """J'r, (n, P), of n images of residuals."""
+        return np.einsum("yx,nyx->nx", self.by_width, residuals) @ self.widths.T
 
 
-def draw(press: FittedPress, depth_mm: float, tilt_deg: float, grid: Grid, free: Sequence[int] = ALL) -> Drawn:
-    """Draw a press with its derivatives by the free parameters; the edges are moved by a small step of each."""
-    values = press.values + STEP * np.diag(spreads())[list(free)]
-    values = np.concatenate([press.values[None], values])
-    edges = replace(press, values=values).edges_at(depth_mm, tilt_deg, grid.x_mm)
-    ink = chance_within(edges[0], grid.y_mm, SPREAD_MM)
-    moved = (edges[1:] - edges[0]) / STEP
-    return Drawn(ink, ink * (1.0 - ink) / SPREAD_MM, grid.y_mm > 0.0, moved.reshape(len(free), -1))
+def draw(press: FittedPress, cells: Floats, grid: Grid, free: Sequence[int] = ALL) -> list[Drawn]:
+    """Draw presses at C depths and tilts (C, 2), with derivatives by the free parameters over their spreads."""
+    moved = press.values + np.concatenate([np.zeros((1, len(NAMES))), STEP * np.diag(spreads())[list(free)]])
+    batch = replace(press, values=moved[:, None])
+    width, *others = batch.half_width(batch.sizes(*cells.T), grid.x_mm)
+    by_parameter = (np.stack(others, axis=1) - width[:, None]) / STEP
+    return [Drawn.of(*of_cell, grid.y_mm) for of_cell in zip(width, by_parameter, strict=True)]
 
 
 def _minimise(
@@ -127,6 +216,7 @@ def _minimise(
     costs as much as a pixel of wrong ink."""
     if not strokes:
         raise ValueError("a fit needs at least one stroke")
+    inks = {cell: np.array([s.ink for s in group], np.float64) for cell, group in by_cell(strokes).items()}
     at = list(free)
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
 
@@ -137,11 +227,11 @@ def _minimise(
 
     def equations(vector: Floats) -> Equations:
         trial = at_values(vector)
-        squares, gradients, cost = _normal(trial, at, strokes, grid)
+        square, gradient, cost = _normal(trial, at, inks, grid)
         pull = prior.precision @ prior.off(trial.values)
         cost += 0.5 * float(prior.off(trial.values) @ pull)
-        square = squares.sum(axis=0) + prior.precision[np.ix_(at, at)]
-        gradient = gradients.sum(axis=0) + pull[at]
+        square += prior.precision[np.ix_(at, at)]
+        gradient += pull[at]
         # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
         held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
         square[held], square[:, held], gradient[held] = 0.0, 0.0, 0.0
@@ -168,42 +258,35 @@ def _minimise(
 
 
 def _normal(
-    press: FittedPress, at: Sequence[int], strokes: Sequence[Pressed], grid: Grid
+    press: FittedPress, at: Sequence[int], inks: Mapping[Cell, Floats], grid: Grid
 ) -> tuple[Floats, Floats, float]:
-    """J'J (P, P) and J'r (P,) of each stroke by the P parameters `at`, and half the sum of squares.
+    """J'J (P, P) and J'r (P,) by the P parameters `at`, and half the sum of squares, over all strokes.
 
-    Strays are integrated out. A cell is drawn once for all its strokes.
+    `inks` (n, len(y_mm), len(x_mm)) are the strokes of each cell. Strays are integrated out.
     """
     strays = [NAMES.index(name) for name in STRAYS]
     sizes = np.array(list(STRAYS.values())) / spreads()[strays]
     free = sorted({*at, *strays})
     stray, kept = ([free.index(k) for k in chosen] for chosen in (strays, at))
-    drawn: dict[tuple[float, float], tuple[Drawn, Floats, Floats, Floats]] = {}
-    squares: list[Floats] = []
-    gradients: list[Floats] = []
-    cost = 0.0
-    for stroke in strokes:
-        cell = (stroke.depth_mm, stroke.tilt_deg)
-        if cell not in drawn:
-            mark = draw(press, *cell, grid, free)
-            square = mark.square()
-            inverse = np.asarray(np.linalg.inv(square[np.ix_(stray, stray)] + np.diag(sizes**-2.0)), np.float64)
-            taken = inverse @ square[stray]
-            drawn[cell] = mark, square - square[:, stray] @ taken, taken, inverse
-        mark, square, taken, inverse = drawn[cell]
-        miss = mark.ink - stroke.ink
-        pull = mark.pull(miss)
-        squares.append(square[np.ix_(kept, kept)])
-        gradients.append((pull - taken.T @ pull[stray])[kept])
-        cost += 0.5 * float(np.vdot(miss, miss) - pull[stray] @ inverse @ pull[stray])
-    return np.array(squares), np.array(gradients), cost
+    squares, gradient, cost = np.zeros((len(free), len(free))), np.zeros(len(free)), 0.0
+    for drawn, ink in zip(draw(press, np.array(list(inks)), grid, free), inks.values(), strict=True):
+        square, miss = drawn.square(), drawn.ink - ink
+        pull, by_stray = drawn.pull(miss), square[stray]
+        taken = np.linalg.solve(by_stray[:, stray] + np.diag(sizes**-2.0), np.column_stack([by_stray, pull.T[stray]]))
+        squares += len(ink) * (square - by_stray.T @ taken[:, : len(free)])
+        shift = taken[:, len(free) :]
+        gradient += (pull.T - by_stray.T @ shift).sum(axis=1)
+        # Not a dot product, which would start the matrix library's threads.
+        cost += 0.5 * float(np.einsum("nyx,nyx->", miss, miss) - np.sum(pull.T[stray] * shift))
+    return squares[np.ix_(kept, kept)], gradient[kept], cost
 
 
 def fit_residual(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
     """The brush with the residuals of its ends and edges; `press` has none."""
-    terms = np.array([command_terms(s.depth_mm, s.tilt_deg) for s in strokes])
-    ends = np.array([_ends(press, s, grid) for s in strokes])
-    sides = np.array([_sines(press, s, end, grid) for s, end in zip(strokes, ends, strict=True)])
+    depths, tilts = np.array([s.depth_mm for s in strokes]), np.array([s.tilt_deg for s in strokes])
+    inks, terms = np.array([s.ink for s in strokes], np.float64), command_terms(depths, tilts)
+    ends = _ends(press, depths, tilts, inks, grid)
+    sides = _sines(press, press.sizes(depths, tilts, ends), inks, grid)
     falling = 1.0 / np.arange(1, MODES + 1)
     # Half the sum of the edges is a mark's width, half the difference a bow: each has scales of its own.
     width, bow = (regress(0.5 * (sides[:, 0] + way * sides[:, 1]), terms, falling) for way in (1.0, -1.0))
@@ -230,41 +313,35 @@ def regress(seen: Floats, terms: Floats, scale: Floats) -> Floats:
     return (size[best, :, None] * found[best]).T * scale[:, None]
 
 
-def _ends(press: FittedPress, stroke: Pressed, grid: Grid) -> Floats:
-    """By how much the stroke's tip and heel reach beyond the lengths of the brush, (2,) mm, by Gauss-Newton."""
+def _ends(press: FittedPress, depths_mm: Floats, tilts_deg: Floats, inks: Floats, grid: Grid) -> Floats:
+    """By how much the tip and heel of strokes reach beyond the brush's lengths, (strokes, 2) mm, by Gauss-Newton."""
 
-    def image(further: Floats) -> Floats:
-        return _stretched(press, further).chance(stroke.depth_mm, stroke.tilt_deg, grid.x_mm, grid.y_mm, SPREAD_MM)
+    def width(further: Floats) -> Floats:
+        return press.half_width(press.sizes(depths_mm, tilts_deg, further), grid.x_mm)
 
-    sizes = press.sizes(stroke.depth_mm, stroke.tilt_deg)
-    reach = np.array([float(sizes.tip), float(sizes.heel)])
+    sizes = press.sizes(depths_mm, tilts_deg)
+    reach = np.stack([sizes.tip, sizes.heel], axis=-1)
     weight = END_NOISE / END_MM**2
-    found = np.zeros(2)
+    ends = np.zeros_like(reach)
     for _ in range(END_ROUNDS):
-        here = image(found)
-        by_end = np.array([(image(found + END_STEP_MM * way) - here).ravel() / END_STEP_MM for way in np.eye(2)])
-        pull = by_end @ (stroke.ink - here).ravel() - weight * found
-        step = np.linalg.solve(by_end @ by_end.T + weight * np.eye(2), pull)
-        found = np.clip(found + np.clip(step, -0.7, 0.7), -0.5 * reach, reach)
-    return found
+        here = width(ends)
+        by_end = np.stack([(width(ends + END_STEP_MM * way) - here) / END_STEP_MM for way in np.eye(2)], axis=1)
+        for k, ink in enumerate(inks):
+            drawn = Drawn.of(here[k], by_end[k], grid.y_mm)
+            pull = drawn.pull((ink - drawn.ink)[None])[0] - weight * ends[k]
+            step = np.asarray(np.linalg.solve(drawn.square() + weight * np.eye(2), pull), np.float64)
+            ends[k] = np.clip(ends[k] + np.clip(step, -0.7, 0.7), -0.5 * reach[k], reach[k])
+    return ends
 
 
-def _sines(press: FittedPress, stroke: Pressed, ends: Floats, grid: Grid) -> Floats:
-    """The sines (2, MODES) by which the stroke's upper and lower edge differ from the profile between its ends, mm."""
-    own = _stretched(press, ends)
-    sizes = own.sizes(stroke.depth_mm, stroke.tilt_deg)
-    share = (grid.x_mm - sizes.widest + sizes.tip) / (sizes.tip + sizes.heel)
-    on = (share > 0.0) & (share < 1.0)
-    waves = modes(share[on])
-    width = np.maximum(own.half_width(stroke.depth_mm, stroke.tilt_deg, grid.x_mm[on]), 0.0)
+def _sines(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
+    """The sines (strokes, 2, MODES) by which strokes' upper and lower edges differ from the profile, mm."""
+    share = (grid.x_mm - (sizes.widest - sizes.tip)[:, None]) / (sizes.tip + sizes.heel)[:, None]
+    waves = modes(share)  # 0 beyond the ends
+    width = np.maximum(press.half_width(sizes, grid.x_mm), 0.0)
     above = grid.y_mm > 0.0
-    edges = np.array([stroke.ink[rows][:, on].sum(axis=0) * grid.px_mm - width for rows in (above, ~above)])
-    little = 0.005 * len(waves) * np.eye(MODES)
-    return np.asarray(np.linalg.solve(waves.T @ waves + little, waves.T @ edges.T).T, np.float64)
-
-
-def _stretched(press: FittedPress, further: Floats) -> FittedPress:
-    """The brush with ends further out by constants."""
-    ends = np.zeros((2, TERMS))
-    ends[:, 0] = further
-    return replace(press, ends=ends)
+    edges = [inks[:, rows].sum(axis=1) * grid.px_mm - width for rows in (above, ~above)]
+    little = 0.005 * ((share > 0.0) & (share < 1.0)).sum(axis=1)[:, None, None] * np.eye(MODES)
+    across = waves.swapaxes(1, 2)
+    sines = np.asarray(np.linalg.solve(across @ waves + little, across @ np.stack(edges, axis=-1)), np.float64)
+    return sines.swapaxes(1, 2)
