@@ -150,8 +150,8 @@ def _collect(folder: Path) -> None:
 @contextlib.contextmanager
 def _watching(spans: Spans) -> Iterator[None]:
     """Note when each part begins and ends."""
-    from brushloop.collect.engine.perform import Performer
     from brushloop.collect.engine.recorder import Recorder
+    from brushloop.collect.engine.run import Run
     from brushloop.collect.engine.steps import capture as capturing
     from brushloop.drivers.arcs.robot import AuboArcs
     from brushloop.drivers.camera import OpenCvCamera
@@ -177,7 +177,7 @@ def _watching(spans: Spans) -> Iterator[None]:
         return later if asyncio.iscoroutinefunction(function) else at_once
 
     watched: list[tuple[Any, str, str | None]] = [
-        (Performer, "perform", None),  # by the kind of its step
+        (Run, "perform", None),  # by the kind of its step
         (AuboArcs, "move", "move"),
         (OpenCvCamera, "fresh", FRAME),
         (InkStation, "replenish", INK),

@@ -21,8 +21,8 @@ import numpy as np
 
 from bench.harness import ROOT, BenchError, Result, at_most, machine, rounds_of, tell
 from brushloop.collect.engine.control import State
+from brushloop.collect.engine.live import Telemetry
 from brushloop.collect.engine.snapshot import CellCount, Picture, Snapshot
-from brushloop.collect.engine.telemetry import Telemetry
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.sessions.records import Condition

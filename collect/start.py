@@ -11,8 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from brushloop.collect.engine.dry_run import DryRunEngine
-from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.engine import DryRunEngine, Engine
 from brushloop.collect.engine.live import LiveView
 from brushloop.collect.engine.open_or_resume import Opening, find_resumable, open_store
 from brushloop.collect.headless import run_headless

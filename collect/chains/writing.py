@@ -15,7 +15,7 @@ from brushloop.collect.chains.commands import Say, collected_session, finished_s
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import CollectRequest
 from brushloop.sessions.terminal import show_work

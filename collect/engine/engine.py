@@ -18,15 +18,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from brushloop.collect.engine.control import FINAL, RunControl, State
-from brushloop.collect.engine.live import LiveView, watching
-from brushloop.collect.engine.perform import Performer
-from brushloop.collect.engine.policy import resume_question
+from brushloop.collect.engine.live import LiveView, Telemetry, noting_targets, previewing, watching
+from brushloop.collect.engine.policy import board_first, resume_question
 from brushloop.collect.engine.progress import Progress
 from brushloop.collect.engine.run import Run
-from brushloop.collect.engine.set_up import board_first
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.engine.steps.context import RunContext, uninterrupted
-from brushloop.collect.engine.telemetry import Telemetry, noting_targets, previewing
 from brushloop.collect.errors import (
     NOT_AT_REST,
     CollectAborted,
@@ -35,7 +32,7 @@ from brushloop.collect.errors import (
     describe,
     rest_is_unknown,
 )
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
 from brushloop.collect.planning.walk import layout_of, sheet_of, steps_on
 from brushloop.collect.protocols.config import ProtocolConfig
@@ -56,6 +53,9 @@ UNCHECKED = (
     "camera and configuration agree"
 )
 
+BEGUN_DRY = "dry run: nothing is pressed, dipped or kept"
+OVER_DRY = "dry run: every move was made"
+
 ARM = Choice("a", "arm it: I am looking at the robot cell, my hand is at the emergency stop")
 LEAVE = Choice("x", "do not arm it")
 
@@ -67,7 +67,7 @@ class Engine:
     """Runs one session. Call `start`, look at `snapshot` until `finished`, then call `join`."""
 
     presses: ClassVar[bool] = True
-    """False for a dry run. A real run warns when it has no self-check."""
+    """False for a dry run. A real run warns when it has no self-check, and its log names the session's folder."""
 
     def __init__(
         self,
@@ -248,7 +248,9 @@ class Engine:
             await self._permitted(rig)
             store = self._store = self._open_store(rig)
             try:
-                self._progress.opened(store)
+                strokes = self._progress.opened(store)
+                begun = f"resumed with {strokes} strokes" if strokes else "session"
+                self._progress.log(f"{begun}: {store.folder}" if self.presses else BEGUN_DRY)
                 if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
                     self._progress.log(UNCHECKED, warning=True)
                 async with (
@@ -259,7 +261,7 @@ class Engine:
                 self._control.begin_closing()
                 self._progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
-                self._progress.closed(f"closed: {final}")
+                self._progress.closed(f"closed: {final}" if self.presses else OVER_DRY)
             finally:
                 with contextlib.suppress(DeviceError):
                     self._see_tip(rig)
@@ -308,7 +310,7 @@ class Engine:
             self._protocol_config,
             self._requests,
         )
-        run = Run(context, Performer(context, self._live, self._telemetry), self._control, self._guided)
+        run = Run(context, self._control, self._telemetry, self._live, self._guided)
         steps = steps_on(self._rig_config, self._protocol_config)
         await run.protocol(board_first(steps) if self._guided else steps)
 
@@ -325,3 +327,9 @@ class Engine:
         if self._store is not None:
             with contextlib.suppress(SessionError):
                 self._store.ended(describe(error))
+
+
+class DryRunEngine(Engine):
+    """Engine that makes each move of a run with a lifted rig (`Opening.load`), in a folder that will be deleted."""
+
+    presses = False

@@ -12,7 +12,7 @@ from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify
-from brushloop.collect.quality.verdict import Verdict
+from brushloop.collect.quality.checks import Verdict
 from brushloop.collect.rig.paper import Patch
 from brushloop.model.fitted import FittedPress
 from brushloop.model.similarity import csim
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from brushloop.calibrate.stroke import Gray
 
 FIELD = Field()
-FINE = 8
-"""Points per pixel and axis at which the model's mark is evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +63,14 @@ def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | Non
     A brush of which only radius and length are given leaves the mark of CCD-BSM as published.
     """
     left, top = FIELD.anchor_mm
-    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
+    centres_mm = (np.arange(SIZE_PX) + 0.5) * FIELD.mm_per_px
     try:
-        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres - left, np.float64))
+        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres_mm - left, np.float64))
     except ValueError:
         return None
-    up_mm = (top - centres)[:, None]
+    up_mm = (top - centres_mm)[:, None]
     edge_mm = np.asarray(np.where(up_mm > 0.0, upper, lower), np.float64)
-    fine = np.abs(up_mm) <= edge_mm
-    return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
+    return np.asarray(np.abs(up_mm) <= edge_mm)
 
 
 def cell_raster(image: Gray, plane: Plane, patch: Patch) -> tuple[Gray, tuple[float, float], tuple[int, int, int, int]]:

@@ -15,10 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
-from brushloop.collect.engine.dry_run import lifted
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.rig.config import RigConfig, load_rig, overrides
+from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConfig, load_rig, overrides
 from brushloop.collect.rig.devices import Rig
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.host import Clock
@@ -44,6 +43,8 @@ MACHINE_NAMES = {
     "ink": {"device": {"port"}},
 }
 """Fields that may differ between two runs of one session: where the devices are, not what they do."""
+CLEAR_MM = 5.0
+"""Least distance of the tip from the paper at the deepest point of a dry run."""
 ABSENT = object()
 """Placeholder for the value of a field that one of the two configurations does not have."""
 
@@ -85,7 +86,7 @@ class Opening:
         rig, protocol = load_rig(rig_path), load_protocol(protocol_path)
         left_out, rig = rig.self_check.enabled is None, rig.settled(armed)
         if dry_run_mm is not None:
-            rig = lifted(rig, protocol, dry_run_mm)
+            rig = _lifted(rig, protocol, dry_run_mm)
         snapshots = {
             "rig.toml": rig_path.read_text(encoding="utf-8"),
             "protocol.toml": protocol_path.read_text(encoding="utf-8"),
@@ -110,6 +111,36 @@ class Opening:
 
 def _effective(rig: RigConfig) -> str:
     return rig.model_dump_json(indent=2, exclude=MACHINE_NAMES) + "\n"
+
+
+def _lifted(rig: RigConfig, protocol: ProtocolConfig, by_mm: float) -> RigConfig:
+    """The rig with paper and ink `by_mm` higher, and without touch, doses, self-check or judgement of captures.
+
+    Raises `ConfigError`, with the allowed range, if the brush would still meet the paper or travel too low.
+    """
+    deepest_mm = max((stroke.condition.depth_mm for stroke in protocol.planned()), default=0.0)
+    low_mm = deepest_mm + CLEAR_MM
+    high_mm = rig.motion.safe_z_mm - rig.paper.touch_z_mm - TRAVEL_CLEARANCE_MM
+    if not low_mm <= by_mm <= high_mm:
+        raise ConfigError(
+            "--dry-run",
+            "",
+            f"{by_mm:g} mm is outside [{low_mm:g}, {high_mm:g}] mm: above the deepest press, below travel",
+        )
+    return rig.checking_itself(False).model_copy(
+        update={
+            "paper": rig.paper.model_copy(update={"touch_z_mm": rig.paper.touch_z_mm + by_mm}),
+            "ink": _lifted_ink(rig.ink, by_mm),
+            "touch": rig.touch.model_copy(update={"method": "taught", "points_mm": []}),
+            "quality": rig.quality.model_copy(update={"enabled": False}),
+        }
+    )
+
+
+def _lifted_ink(ink: InkConfig, by_mm: float) -> InkConfig:
+    wipe = None if ink.wipe is None else ink.wipe.model_copy(update={"z_mm": ink.wipe.z_mm + by_mm})
+    wash = None if ink.wash is None else ink.wash.model_copy(update={"dip_z_mm": ink.wash.dip_z_mm + by_mm})
+    return ink.model_copy(update={"dip_z_mm": ink.dip_z_mm + by_mm, "wipe": wipe, "wash": wash, "device": None})
 
 
 def find_resumable(opening: Opening) -> Path | None:

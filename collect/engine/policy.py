@@ -1,9 +1,12 @@
-"""What follows a failed step: try again, ask a person, or stop the run; and the question that is then asked."""
+"""What follows a failed step: try again, ask a person, or stop the run; and every question about a step."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from brushloop.calibrate.board.pix2len import WORST_RMS_PX
 from brushloop.collect.errors import (
     BadPicture,
     ForceTooHigh,
@@ -15,7 +18,8 @@ from brushloop.collect.errors import (
     describe,
 )
 from brushloop.collect.operator import Choice, Prompt
-from brushloop.collect.protocols.steps import Step
+from brushloop.collect.protocols.steps import BoardStep, Protocol, Step, ZeroTouchStep
+from brushloop.collect.rig.config import RigConfig
 from brushloop.drivers.errors import (
     ArmMoved,
     DeviceError,
@@ -28,7 +32,7 @@ from brushloop.drivers.errors import (
     Stuck,
 )
 from brushloop.drivers.ink.port import DoseLost, InkRefused
-from brushloop.sessions.events import StepKind
+from brushloop.sessions.events import BoardResult, SelfCheckResult, StepKind, StepResult, ZeroTouchResult
 
 MAX_FAILURES = 3
 """Failures of one step after which a person decides: so many are no coincidence."""
@@ -114,3 +118,135 @@ def question(error: StepError | DeviceError, sheet: int) -> Prompt:
         case _:
             go_on = "the cause is removed: try again"
     return Prompt(text, (Choice(GO_ON, go_on), STOP), STOP.key)
+
+
+AGAIN = Choice("a", "measure again")
+BY_JOG, BY_FORCE = Choice("b", "measure by jog"), Choice("f", "measure by force")
+METHODS = {BY_JOG.key: "jog", BY_FORCE.key: "force", KEEP: "kept"}
+TITLES = {
+    StepKind.BOARD: "Camera, board, scale",
+    StepKind.ZERO_TOUCH: "Zero touch and plane",
+    StepKind.SELF_CHECK: "Self-check",
+}
+"""Steps of the set-up, in their order."""
+NAME = 20
+"""Columns of a fact's name."""
+
+
+def in_set_up(step: Step) -> bool:
+    """Whether this is a step of the set-up: the board is also looked at between strokes, and the paper found again."""
+    return step.kind in TITLES and step.index == 0
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One measured value of a set-up step."""
+
+    name: str
+    value: str
+    limit: str = ""
+    good: bool | None = None
+    """Whether the value is within its limit; None without one."""
+
+    def __str__(self) -> str:
+        """A line such as `✓ residual of corners  0.11 px  (at most 1)`."""
+        sign = {True: "✓", False: "!", None: " "}[self.good]
+        return f"{sign} {self.name:<{NAME}} {self.value}" + (f"  ({self.limit})" if self.limit else "")
+
+
+def facts_of(result: StepResult, config: RigConfig) -> tuple[Fact, ...]:
+    """What a finished set-up step measured, from its result in the journal."""
+    match result:
+        case BoardResult():
+            return _board(result, config)
+        case ZeroTouchResult():
+            return _touch(result, config)
+        case SelfCheckResult():
+            return _self_check(result, config)
+        case _:
+            return ()
+
+
+def accept_question(result: StepResult, config: RigConfig) -> Prompt:
+    """Ask whether the result is good enough. The default is to stop: nothing goes on without an answer."""
+    facts = facts_of(result, config)
+    good = all(fact.good is not False for fact in facts)
+    verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not all is within limits.")
+    text = "\n".join([verdict, *map(str, facts)])
+    choices = [Choice(GO_ON, "good, go on" if good else "go on anyway"), AGAIN]
+    if isinstance(result, ZeroTouchResult):
+        choices += [BY_JOG, *([BY_FORCE] if config.force is not None else [])]
+    return Prompt(text, (*choices, STOP), STOP.key)
+
+
+def by_method(step: Step, answer: str) -> Step:
+    """Return the same step; a zero touch by the method that the answer names, if any."""
+    return replace(step, method=METHODS[answer]) if isinstance(step, ZeroTouchStep) and answer in METHODS else step
+
+
+def board_first(protocol: Protocol) -> Protocol:
+    """Yield a board step, then the same steps, so that the board is seen before the brush comes down. Both board steps
+    have the same key, so the later one is then done already."""
+    yield BoardStep(0)
+    yield from protocol
+
+
+def _board(result: BoardResult, config: RigConfig) -> tuple[Fact, ...]:
+    rms_px = result.rms_px
+    facts = [
+        Fact("corners seen", str(result.corners)),
+        Fact("scale (pix2len)", f"{result.mm_per_px:.4f} mm/px"),
+        Fact("residual of corners", f"{rms_px:.2f} px", f"at most {WORST_RMS_PX:g}", rms_px <= WORST_RMS_PX),
+    ]
+    for name, value_ms, limit_ms in (
+        ("delay of the camera", result.camera_delay_ms, config.camera.max_delay_ms),
+        ("variation of the delay", result.camera_jitter_ms, config.camera.max_jitter_ms),
+    ):
+        if value_ms is not None:
+            facts.append(Fact(name, f"{value_ms:.0f} ms", f"at most {limit_ms:g}", value_ms <= limit_ms))
+    for check in result.checks:
+        score = check.score or 0.0
+        if check.name == "blurred":
+            facts.append(Fact("focus: blur", f"{score:.2f} mm", f"at most {check.threshold:g}", check.passed))
+        elif check.name == "exposure":
+            facts.append(Fact("light: paper", f"level {score:.0f}", "", check.passed))
+    return tuple(facts)
+
+
+def _touch(result: ZeroTouchResult, config: RigConfig) -> tuple[Fact, ...]:
+    touch, method = config.touch, result.method
+    named = {"taught": "taught height, visited", "kept": "none: the previous height is kept"}
+    facts = [Fact("method", named.get(method, method))]
+    for number, point in enumerate(result.points, 1):
+        where = f"point {number} ({point.x_mm:.0f}, {point.y_mm:.0f})"
+        if method in named:
+            facts.append(Fact(where, f"{'rests' if method == 'taught' else 'is'} at {point.z_mm:.2f} mm"))
+            continue
+        span_mm, limit_mm = point.span_mm, touch.repeatability_mm
+        facts.append(Fact(where, f"{point.z_mm:.3f} mm", "", None))
+        facts.append(Fact("  its touches span", f"{span_mm:.3f} mm", f"at most {limit_mm:g}", span_mm <= limit_mm))
+    if method not in named:
+        near = abs(result.moved_mm) <= touch.moved_mm
+        facts.append(Fact("from the height before", f"{result.moved_mm:+.3f} mm", f"at most {touch.moved_mm:g}", near))
+    residuals = [abs(residual_mm) for residual_mm in result.residuals_mm]
+    if len(residuals) > 3:
+        worst_mm = max(residuals)
+        facts.append(
+            Fact("off the plane", f"{worst_mm:.3f} mm", f"at most {touch.residual_mm:g}", worst_mm <= touch.residual_mm)
+        )
+    plane = "level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
+    facts.append(Fact("plane", plane))
+    return tuple(facts)
+
+
+def _self_check(result: SelfCheckResult, config: RigConfig) -> tuple[Fact, ...]:
+    limits = config.self_check
+    off_mm, turn_deg = math.hypot(*result.offset_mm), result.turn_deg
+    scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
+    worst_mm = max(result.residuals_mm)
+    return (
+        Fact("marks lie off by", f"{off_mm:.2f} mm", f"at most {limits.offset_mm:g}", off_mm <= limits.offset_mm),
+        Fact("turned by", f"{turn_deg:+.2f}°", f"at most {limits.turn_deg:g}", abs(turn_deg) <= limits.turn_deg),
+        Fact("lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y"),
+        Fact("left over", f"{worst_mm:.2f} mm"),
+    )

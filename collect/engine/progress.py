@@ -56,13 +56,12 @@ class Progress:
         self._messages: deque[str] = deque(maxlen=LOG_LINES)
         self._last: LastCapture | None = None
 
-    def opened(self, store: SessionStore) -> None:
-        """Begin with what a new or resumed session holds."""
+    def opened(self, store: SessionStore) -> int:
+        """Begin with what a new or resumed session holds; returns how many strokes of it count."""
         with self._lock:
             self._store = store
             self._count()
-            done = self._tally.done.total()
-        self.log(f"{f'resumed with {done} strokes' if done else 'session'}: {store.folder}")
+            return self._tally.done.total()
 
     def doing(self, what: str) -> None:
         """Say what the run is doing, in words."""

@@ -1,28 +1,58 @@
-"""Walks a protocol from the first retreat to the last stroke, and does what the policy says when a step fails."""
+"""Carries out a protocol from the first retreat to the last stroke: each step is an attempt that ends done or void, and
+the policy says what follows one that failed.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
 from dataclasses import dataclass, field
 
 from brushloop.collect.engine.control import RunControl, State
-from brushloop.collect.engine.perform import Performer
-from brushloop.collect.engine.policy import GO_ON, STOP, Action, decide, question
-from brushloop.collect.engine.set_up import by_method, in_set_up
-from brushloop.collect.engine.set_up import question as set_up_question
-from brushloop.collect.engine.steps.context import RunContext
-from brushloop.collect.engine.steps.retake import marked_bad
-from brushloop.collect.errors import NeedsOperator, Parked, SheetFull, StepError, arm_at_fault, describe
+from brushloop.collect.engine.live import LiveView, Telemetry
+from brushloop.collect.engine.policy import (
+    GO_ON,
+    STOP,
+    Action,
+    accept_question,
+    by_method,
+    decide,
+    in_set_up,
+    question,
+)
+from brushloop.collect.engine.recorder import ForceGuard, Recorder
+from brushloop.collect.engine.steps import capture, press, touch
+from brushloop.collect.engine.steps.capture import marked_bad
+from brushloop.collect.engine.steps.context import RunContext, StepContext, uninterrupted
+from brushloop.collect.errors import NeedsOperator, Parked, PosesLate, SheetFull, StepError, arm_at_fault, describe
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
+from brushloop.collect.planning.walk import patches_of
 from brushloop.collect.protocols.plan import takes
-from brushloop.collect.protocols.steps import DipStep, Protocol, ReviewStep, Step, ZeroTouchStep
+from brushloop.collect.protocols.steps import (
+    MARKING,
+    BoardStep,
+    CaptureStep,
+    DipStep,
+    DrawStep,
+    PressStep,
+    Protocol,
+    ReviewStep,
+    SelfCheckStep,
+    Step,
+    TouchStep,
+    ZeroTouchStep,
+    press_of,
+)
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.events import ReviewResult, StepResult
+from brushloop.sessions.events import DipResult, ReviewResult, StepKind, StepResult
+from brushloop.sessions.store import Attempt, step_message
 
 KEEP_SHEET = Choice("o", "keep the old sheet")
+HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
+"""Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +60,11 @@ class Run:
     """One run of a protocol in one process."""
 
     context: RunContext
-    performer: Performer
     control: RunControl
+    telemetry: Telemetry
+    """Gets every force."""
+    live: LiveView | None = None
+    """Is shown every message that is recorded."""
     guided: bool = False
     """A person accepts what each set-up step measured before it counts."""
     done: set[str] = field(default_factory=set[str])
@@ -85,7 +118,7 @@ class Run:
         while True:
             await self._between(step)
             try:
-                result = await self.performer.perform(step)
+                result = await self.perform(step)
                 answer = await self._ask_about(result) if asked else GO_ON
                 if answer == GO_ON:
                     self.done.add(step.key)
@@ -159,7 +192,7 @@ class Run:
         touch = ZeroTouchStep(step.index + 1, method="jog", between_strokes=True)
         released = False
         try:
-            await self.performer.perform(touch)
+            await self.perform(touch)
         except (StepError, DeviceError) as error:
             self.context.progress.log(
                 f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True
@@ -171,7 +204,7 @@ class Run:
 
     async def _ask_about(self, result: StepResult) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
-        answer = await self.context.asker.ask_or_default(set_up_question(result, self.context.rig.config))
+        answer = await self.context.asker.ask_or_default(accept_question(result, self.context.rig.config))
         if answer == STOP.key:
             await self._park()
         return answer
@@ -212,5 +245,89 @@ class Run:
             await self.context.rig.robot.confirm()
         except ArmMoved as moved:
             self.context.progress.log(describe(moved), warning=True)  # logged before the arm moves
-        await self.performer.retreat()
+        self.context.left_ink_ns = None
+        await self.context.procedures.retreat()
         self.control.go_on()
+
+    async def perform(self, step: Step) -> StepResult:
+        """Do the step once. If it is cut short, the attempt is void and its patch stays used.
+
+        Raises `SheetFull` before anything is begun.
+        """
+        run, store, press = self.context, self.context.store, press_of(step)
+        run.progress.doing(step.kind.replace("_", " ") if press is None else f"{step.kind} {press.stroke_id}")
+        used, sheet = run.used_patches(), store.state.sheet + 1
+        if isinstance(step, DipStep):
+            run.sheet.free(used, sheet)  # a brush full of ink does not wait for a fresh sheet
+        patches = patches_of(step, run.sheet, used, sheet)
+        attempt = store.begin(step.key, step.kind, patches=tuple(patch.index for patch in patches), press=press)
+        run.progress.begun(step)
+        try:
+            with self._observed(attempt) as (recorder, guard):
+                result = await self._do(step, StepContext(run, patches, attempt, recorder, guard))
+                lag_ms = await self._checked_lag_ms(step)
+            recorder.cadence(lag_ms)
+        except BaseException as error:
+            run.left_ink_ns = None
+            why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
+            await uninterrupted(store.void, attempt, why)
+            run.progress.finished()
+            raise
+        if isinstance(result, DipResult) and run.requests.take(OperatorRequest.SKIP):
+            left_out = run.progress.planned(step.index).press()
+            result = result.model_copy(update={"skipped": left_out})
+            run.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
+        await uninterrupted(store.done, attempt, result)
+        run.progress.finished()
+        return result
+
+    @contextlib.contextmanager
+    def _observed(self, attempt: Attempt) -> Generator[tuple[Recorder, ForceGuard]]:
+        """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
+        rig, show = self.context.rig, None if self.live is None else self.live.offer
+        force = rig.config.force
+        recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, show)
+        if show is not None:
+            show(step_message(attempt.begin))
+        guard = ForceGuard(rig, recorder.force)
+        try:
+            rig.robot.listen(recorder.pose)
+            guard.listen()
+            with guard.also(self.telemetry.force):
+                yield recorder, guard
+        finally:
+            guard.deafen()
+            rig.robot.listen(None)
+
+    async def _checked_lag_ms(self, step: Step) -> float | None:
+        """How late poses came, in ms. Raises `PosesLate` if the heights of the step do not count for that, and
+        `DeviceError` if the tool is not the one that was set."""
+        robot, limit_ms = self.context.rig.robot, self.context.rig.config.robot.max_pose_lag_ms
+        if step.kind in HEIGHTS:
+            with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
+                await robot.confirm()
+        lag_ms = robot.pose_lag_ms()
+        if step.kind in HEIGHTS and lag_ms is not None and lag_ms > limit_ms:
+            raise PosesLate(lag_ms, limit_ms)
+        return lag_ms
+
+    async def _do(self, step: Step, context: StepContext) -> StepResult:
+        match step:
+            case ZeroTouchStep():
+                return await touch.zero_touch(context, step)
+            case TouchStep():
+                return await touch.touch(context, step)
+            case SelfCheckStep():
+                return await touch.check_rig(context)
+            case BoardStep():
+                return await capture.board(context)
+            case DipStep():
+                return await press.dip(context)
+            case PressStep():
+                return await press.press(context, step)
+            case DrawStep():
+                return await press.draw(context, step)
+            case CaptureStep():
+                return await capture.capture(context, step)
+            case ReviewStep():
+                return await capture.review(context.run)

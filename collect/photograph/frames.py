@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.photograph.delay import FrameChange
 from brushloop.collect.rig.optics import gray
 from brushloop.drivers.devices import Camera, Frame, Stamp
 
@@ -35,6 +34,15 @@ def changed_share(now: Thumbnail, before: Thumbnail) -> float:
         return 1.0
     light = float(np.median((now + 1.0) / (before + 1.0)))
     return float(np.mean(np.abs(now - light * before) > CHANGED_LEVELS))
+
+
+@dataclass(frozen=True, slots=True)
+class FrameChange:
+    """How far one frame differs from the view without the arm."""
+
+    arrival_s: float
+    changed: float
+    """Share of the picture, 0 to 1."""
 
 
 ARM_SHARE = 0.02

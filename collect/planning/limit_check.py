@@ -6,18 +6,16 @@ Poses are checked on every patch, because a void press moves all later ones to o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from brushloop.collect.errors import ConfigError, StepError
-from brushloop.collect.motion.moves import park_moves
-from brushloop.collect.planning.walk import as_planned, moves_of, sheet_of, steps_on
-from brushloop.collect.protocols.calibration import CalibrationConfig
+from brushloop.collect.motion import park_moves
+from brushloop.collect.planning.walk import moves_of, placed_steps, sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.protocols.kinds import CalibrationConfig, GridConfig, WriteConfig
 from brushloop.collect.protocols.steps import MARKING, CaptureStep, DrawStep, PressStep, SelfCheckStep, Step, press_of
-from brushloop.collect.protocols.write import WriteConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
@@ -44,18 +42,12 @@ def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol
 
 def distinct_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Step]:
     """The steps, without those that make the same moves as an earlier one."""
-    generator = steps_on(config, protocol)
     seen: set[tuple[object, ...]] = set()
-    try:
-        step = next(generator)
-        while True:
-            asked = step.kind, _moved(step)
-            if asked not in seen:
-                seen.add(asked)
-                yield step
-            step = generator.send(as_planned(step, 0, 0))
-    except StopIteration:
-        return
+    for placed in placed_steps(config, protocol):
+        kind_and_moves = placed.step.kind, _moved(placed.step)
+        if kind_and_moves not in seen:
+            seen.add(kind_and_moves)
+            yield placed.step
 
 
 def _moved(step: Step) -> object:
@@ -157,9 +149,9 @@ def check_poses(rig_path: Path, rig: RigConfig, protocol: ProtocolConfig, plane:
     _check(rig_path, rig, all_poses(rig, protocol, plane))
 
 
-def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step) -> None:
-    """Check the poses of a step that the operator asked for and that needs no patch. Raises `ConfigError`."""
-    _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, None).poses))
+def check_step(rig_path: Path, rig: RigConfig, plane: PaperPlane, step: Step, patches: Sequence[Patch] = ()) -> None:
+    """Check the poses of one step on the patches that it marks. Raises `ConfigError`."""
+    _check(rig_path, rig, ((*pose, step.kind) for pose in moves_of(rig, plane, step, patches).poses))
 
 
 def _check(rig_path: Path, rig: RigConfig, poses: Iterable[tuple[Pose, float, str]]) -> None:
@@ -187,22 +179,22 @@ def all_poses(
     # Assume that a wash is due in every step: when one is due depends on the step at which the process starts.
     dips = 0 if rig.ink.wash is None else rig.ink.wash.every_dips - 1
     for step in distinct_steps(rig, protocol):
-        for patch, more in _places(step, patches):
+        for marked in _places(step, patches):
             name = str(step.kind) if (press := press_of(step)) is None else press.stroke_id
-            where = f"{name} on patch {patch.index}" if patch is not None else name
-            moves = moves_of(rig, plane, step, patch, more, dips=dips)
+            where = f"{name} on patch {marked[0].index}" if marked else name
+            moves = moves_of(rig, plane, step, marked, dips=dips)
             yield from ((pose, speed, where) for pose, speed in moves.poses)
 
 
-def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch | None, tuple[Patch, ...]]]:
-    """Cells that a step may mark, as arguments of `moves_of`; the self-check marks one patch, or three."""
+def _places(step: Step, patches: list[Patch]) -> Iterator[tuple[Patch, ...]]:
+    """The sets of patches that a step may mark; the self-check marks one patch, or three."""
     if step.kind not in MARKING:
-        yield None, ()
+        yield ()
         return
     for patch in patches:
-        yield patch, ()
+        yield (patch,)
         if isinstance(step, SelfCheckStep):
-            yield patch, (patch, patch)
+            yield (patch, patch, patch)
 
 
 DEVICE = "robot"

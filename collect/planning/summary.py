@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any
@@ -12,19 +13,118 @@ from rich.table import Table
 from rich.text import Text
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.motion.moves import park_moves
-from brushloop.collect.planning.estimate import OMITTED, InkNeed, ink_need, reach_of, step_s
-from brushloop.collect.planning.walk import StepMoves, Walked, sheet_of, walk
+from brushloop.collect.motion import Path, park_moves
+from brushloop.collect.planning.walk import StepMoves, Walked, placed_steps, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.presses import ReplayConfig
+from brushloop.collect.protocols.kinds import ReplayConfig, WriteConfig
 from brushloop.collect.protocols.steps import MARKING, DrawStep, PressStep, SelfCheckStep, TouchStep
-from brushloop.collect.protocols.write import WriteConfig
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config import BrushConfig, RigConfig
+from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
 from brushloop.drivers.devices import Pose
+from brushloop.drivers.geometry import distance
+from brushloop.drivers.limits import Limits
+from brushloop.model.ccdbsm import basic_lengths
 from brushloop.sessions.events import Press
 from brushloop.sessions.records import Condition
+
+SETTLE_S = 0.12
+"""Time from the end of a ramp to the next command: the controller's lag in reporting rest, half a poll, the calls.
+Measured on the loopback rig; for a real controller it is not known."""
+FRAME_S = 0.1
+"""Period of 10 frames a second: a photograph is the second frame that begins after the arm rests."""
+IN_PLACE_MM = 1.0
+"""For a line shorter than this, ARCS reads the speed as that of the rotation: mm/s as thousandths of rad/s."""
+OMITTED = (
+    "connecting, power on, doses of ink, touches that measure the height, quality checks, writing to disk, "
+    "sheet changes, pauses, and repeated presses"
+)
+
+
+def trapezoid_s(way: float, speed: float, acc: float) -> float:
+    """Seconds of a trapezoidal speed profile from rest to rest; triangular if the speed is not reached."""
+    return way / speed + speed / acc if way * acc >= speed * speed else 2.0 * math.sqrt(way / acc)
+
+
+def move_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float, limits: Limits) -> float:
+    """Seconds of a straight line, rest to rest, slower where the tool turns; a turn on the spot counts in rad."""
+    travel_mm, turn_deg = distance(start, target)
+    if travel_mm < IN_PLACE_MM and turn_deg > 0.01:
+        return trapezoid_s(math.radians(turn_deg), speed_mm_s / 1e3, acc_mm_s2 / 1e3)
+    if turn_deg > 0.01:
+        speed_mm_s = limits.turn_capped(start, target, speed_mm_s)
+    return trapezoid_s(travel_mm, speed_mm_s, acc_mm_s2)
+
+
+def path_s(start: Pose, path: Path, acc_mm_s2: float, limits: Limits) -> float:
+    """Seconds through poses without a halt: each line at its speed, one ramp up and one down; corners cost nothing."""
+    total_s, before = path.speed_mm_s / acc_mm_s2, start
+    for pose in path.poses:
+        total_s += math.dist(before.position_mm, pose.position_mm) / limits.turn_capped(before, pose, path.speed_mm_s)
+        before = pose
+    return total_s
+
+
+def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose]:
+    """(seconds of a step that begins at `here`, pose at its end)."""
+    limits, acc_mm_s2 = limits_of(config), config.motion.acc_mm_s2
+    total_s = moves.dwell_s + moves.captures * (config.camera.latency_ms / 1e3 + FRAME_S)
+    for segment in moves.segments:
+        if isinstance(segment, Path):
+            total_s += path_s(here, segment, acc_mm_s2, limits)
+            here = segment.poses[-1]
+        else:
+            # Of a region one descent: the number of descents of a measured touch is not known beforehand.
+            total_s += move_s(here, segment.poses[0], segment.speed_mm_s, acc_mm_s2, limits)
+            here = segment.poses[0]
+        total_s += SETTLE_S
+    return total_s, here
+
+
+HELD_SHARE = 0.3
+"""Share of a wet bundle's volume that is ink between the hairs. Assumed: weigh a dipped brush to know it."""
+
+
+@dataclass(frozen=True, slots=True)
+class InkNeed:
+    """Upper estimate of the ink, and what it is based on."""
+
+    ml: float
+    why: str
+
+
+def bundle_ml(brush: BrushConfig) -> float:
+    """Volume of the bundle as a cone of its largest radius and its length."""
+    return math.pi * brush.radius_mm**2 * brush.length_mm / 3.0 / 1e3
+
+
+def ink_need(config: RigConfig, dips: int) -> InkNeed:
+    """Count a full load per dip, as if each mark emptied the brush; for a pump that doses by count, its doses."""
+    device = config.ink.device
+    if device is not None and (doses_ml := device.doses_ml(dips)) is not None:
+        return InkNeed(doses_ml, f"what the {device.kind} doses in {dips} dips")
+    load_ml = HELD_SHARE * bundle_ml(config.brush)
+    return InkNeed(
+        dips * load_ml,
+        f"at most: every dip takes {load_ml:.2f} ml, {HELD_SHARE:.0%} of the bundle's volume (assumed)",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How far a mark reaches from its zero-touch point: along the heading, against it, and to either side."""
+
+    ahead_mm: float
+    behind_mm: float
+    side_mm: float
+
+
+def reach_of(brush: BrushConfig, condition: Condition) -> Reach:
+    """Estimate by the stroke model as published (Eq. 1-5, lambda = pi): good for a warning, not a measurement."""
+    depth_mm, alpha = max(condition.depth_mm, 0.0), math.radians(condition.tilt_deg)
+    o3a, o3c, o4o3 = basic_lengths(depth_mm, alpha, brush.radius_mm, brush.length_mm, math)
+    return Reach(o3a, o4o3, math.pi * o3c)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +178,11 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         poses += len(walked.moves.poses)
         if isinstance(step, TouchStep):
             touches.append((step.x_mm, step.y_mm))
-        if isinstance(step, PressStep | DrawStep) and walked.patch is not None:
+        if isinstance(step, PressStep | DrawStep):
             if placed and walked.sheet != sheets:
                 changes.append(step.press.stroke_id)
             sheets = walked.sheet
-            placed.append(step.press.model_copy(update={"sheet": sheets - 1, "patch": walked.patch.index}))
+            placed.append(step.press.model_copy(update={"sheet": sheets - 1, "patch": walked.patches[0].index}))
     return Plan(
         kind=protocol.kind,
         steps=dict(kinds),
@@ -104,7 +204,7 @@ def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Wal
     """Seconds that the arm waits over the patch for the ink; of a figure, before its first stroke."""
     if protocol.wait_after_dip_s is None or not isinstance(walked.step, PressStep | DrawStep):
         return 0.0
-    over_s, _ = step_s(config, here, StepMoves(walked.moves.parts[:1]))
+    over_s, _ = step_s(config, here, StepMoves(walked.moves.segments[:1]))
     return max(0.0, protocol.wait_after_dip_s - over_s)
 
 
@@ -144,11 +244,11 @@ def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
 def _sheets(config: RigConfig, protocol: ProtocolConfig) -> tuple[int, int]:
     """(sheets that are marked, patches of the first sheet that the self-check takes)."""
     sheets, taken = 1, 0
-    for walked in walk(config, protocol):
-        if walked.patch is not None and walked.step.kind in MARKING:
-            sheets = walked.sheet
-        if isinstance(walked.step, SelfCheckStep):
-            taken = 1 + len(walked.more_patches)
+    for placed in placed_steps(config, protocol):
+        if placed.step.kind in MARKING:
+            sheets = placed.sheet
+        if isinstance(placed.step, SelfCheckStep):
+            taken = len(placed.patches)
     return sheets, taken
 
 

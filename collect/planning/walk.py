@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from brushloop.collect.motion.moves import (
-    Part,
-    Room,
-    commanded,
+from brushloop.collect.motion import (
+    Region,
+    Segment,
     inking_moves,
     mark_moves,
     over,
@@ -16,7 +16,6 @@ from brushloop.collect.motion.moves import (
     press_moves,
     stroke_moves,
     visit_moves,
-    zero_touch_moves,
 )
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.steps import (
@@ -38,8 +37,7 @@ from brushloop.collect.protocols.steps import (
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import Layout, PaperPlane, Patch, Sheet
-from brushloop.collect.touch.heights import lowest_z_mm
-from brushloop.collect.touch.places import patch_spots, touch_rects
+from brushloop.collect.touch.heights import lowest_z_mm, patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import PressResult, StepKind, StepResult
@@ -49,30 +47,28 @@ from brushloop.sessions.events import PressResult, StepKind, StepResult
 class StepMoves:
     """The moves of a step in order, and what else in it takes time or ink."""
 
-    parts: list[Part] = field(default_factory=list[Part])
+    segments: list[Segment] = field(default_factory=list[Segment])
     dwell_s: float = 0.0
     captures: int = 0
     dips: int = 0
 
     @property
     def poses(self) -> list[tuple[Pose, float]]:
-        """Every pose that is commanded, with its speed; of a `Room`, the outermost poses."""
-        return commanded(self.parts)
+        """Every pose that is commanded, with its speed in mm/s; of a `Region`, the outermost poses."""
+        return [(pose, segment.speed_mm_s) for segment in self.segments for pose in segment.poses]
 
 
 def moves_of(
     config: RigConfig,
     plane: PaperPlane,
     step: Step,
-    patch: Patch | None,
-    more: tuple[Patch, ...] = (),
+    patches: Sequence[Patch] = (),
     *,
     dips: int = 0,
 ) -> StepMoves:
-    """The moves of a step, as the run makes them.
+    """The moves of a step, as the run makes them, on the patches that it marks.
 
-    `patch` is where a press or a figure goes; `more` are the further patches of a self-check. `dips` is the number of
-    dips before the step, which decides when the brush is washed.
+    `dips` is the number of dips before the step, which decides when the brush is washed.
     """
     match step:
         case ZeroTouchStep() | TouchStep():
@@ -86,19 +82,18 @@ def moves_of(
         case CaptureStep():
             return StepMoves([*photograph_moves(config), inking_moves(config, dips)[0]], captures=1)
         case PressStep(press=press, dwell_s=dwell_s):
-            assert patch is not None
+            [patch] = patches
             down, up = press_moves(config, plane, patch, press.condition)
             return StepMoves([*down, *up], dwell_s=dwell_s)
         case SelfCheckStep():
-            assert patch is not None
             moves = [
                 move
-                for number, place_mm in enumerate(triangle_on((patch, *more), config.self_check))
+                for number, place_mm in enumerate(triangle_on(patches, config.self_check))
                 for move in (*inking_moves(config, dips + number), *mark_moves(config, plane, *place_mm))
             ]
             return StepMoves([*photograph_moves(config), *moves, *photograph_moves(config)], dips=3, captures=2)
         case DrawStep(drawn=drawn):
-            assert patch is not None
+            [patch] = patches
             return _figure(config, plane, drawn, patch, dips)
 
 
@@ -117,46 +112,45 @@ def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchSt
     """A touch by force or jog decides how deep it goes; a touch by camera also chooses its next spot."""
     touch = touch_of(config, step)
     if touch.method == "taught":
-        [point] = touch.points_mm if isinstance(step, TouchStep) else [None]
-        return StepMoves([*zero_touch_moves(config)] if point is None else [*visit_moves(config, plane, *point)])
-    parts: list[Part] = []
+        if isinstance(step, TouchStep):
+            return StepMoves([*visit_moves(config, plane, step.x_mm, step.y_mm)])
+        return StepMoves([*visit_moves(config, PaperPlane(config.paper.touch_z_mm), *config.paper.touch_point_mm)])
+    segments: list[Segment] = []
     for rect_mm in touch_rects(config.paper, touch):
         x_mm, y_mm, *_ = rect_mm
         above = over(config, x_mm, y_mm)
         extent_mm = touch.camera.extent_mm if touch.method == "camera" else 0.0
         floor_mm = lowest_z_mm(config.paper, touch, x_mm, y_mm, extent_mm)
         speed_mm_s = max(config.motion.travel_speed_mm_s, config.motion.press_speed_mm_s, touch.speed_mm_s)
-        parts += [above, Room.over(config, rect_mm, floor_mm, speed_mm_s), above]
+        segments += [above, Region.over(config, rect_mm, floor_mm, speed_mm_s), above]
     if touch.method != "camera":
-        return StepMoves(parts)
+        return StepMoves(segments)
     count = sum(-(-spots // touch.camera.spots_per_dip) for spots in patch_spots(config.paper, touch))
     inked = [move for number in range(count) for move in inking_moves(config, dips + number)]
-    return StepMoves([*photograph_moves(config), *inked, *parts, *photograph_moves(config)], dips=count)
+    return StepMoves([*photograph_moves(config), *inked, *segments, *photograph_moves(config)], dips=count)
 
 
 def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, patch: Patch, dips: int) -> StepMoves:
-    parts: list[Part] = []
+    segments: list[Segment] = []
     made = 0
     for number, points in enumerate(drawn.strokes):
         if drawn.dips_before(number):
-            parts += inking_moves(config, dips + made)
+            segments += inking_moves(config, dips + made)
             made += 1
-        parts += stroke_moves(config, plane, patch, points, drawn.speed_mm_s).parts
-    return StepMoves(parts, dips=made)
+        segments += stroke_moves(config, plane, patch, points, drawn.speed_mm_s)
+    return StepMoves(segments, dips=made)
 
 
 @dataclass(frozen=True, slots=True)
 class Walked:
-    """One step of the walk."""
+    """One step of a plan."""
 
     step: Step
     sheet: int
     """From 1."""
-    patch: Patch | None
-    """Patch that the step marks or photographs."""
-    moves: StepMoves
-    more_patches: list[Patch] = field(default_factory=list[Patch])
-    """Further patches that the step marks."""
+    patches: tuple[Patch, ...]
+    """Patches that the step marks, or the one that it photographs."""
+    moves: StepMoves = field(default_factory=StepMoves)
 
 
 def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
@@ -190,35 +184,39 @@ def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:
             return None
 
 
-def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
-    """Every step in order, each mark on the next free patch, with a fresh sheet whenever one is full.
+def patches_of(step: Step, sheet: Sheet, used: set[int], number: int) -> tuple[Patch, ...]:
+    """Free patches that a step marks: one, or three for a self-check. Raises `SheetFull`, naming sheet `number`."""
+    if step.kind not in MARKING:
+        return ()
+    patch = sheet.free(used, number)
+    return (patch, *(partners(sheet, patch, used) if isinstance(step, SelfCheckStep) else ()))
+
+
+def placed_steps(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
+    """Every step in order, each mark on the next free patch, with a fresh sheet whenever one is full; without moves.
 
     The sheet must have room for at least one patch.
     """
-    plane, sheet = PaperPlane(config.paper.touch_z_mm), sheet_of(config, protocol)
-    number = dips = 0
-    used: set[int] = set()
+    sheet, used, number = sheet_of(config, protocol), set[int](), 0
     generator = steps_on(config, protocol)
-    try:
+    with contextlib.suppress(StopIteration):
         step = next(generator)
         while True:
-            answer: StepResult | None = None
-            patch, shown = None, number
-            more: tuple[Patch, ...] = ()
-            if step.kind in MARKING:
-                if len(used) == sheet.capacity:
-                    number += 1
-                    used.clear()
-                patch, shown = sheet.free(used, number + 1), number
-                more = partners(sheet, patch, used) if isinstance(step, SelfCheckStep) else ()
-                used |= {one.index for one in (patch, *more)}
-                answer = as_planned(step, number, patch.index)
-            elif isinstance(step, CaptureStep):
-                shown = step.press.sheet or 0
-                patch = sheet.patch(step.press.patch or 0)
-            moves = moves_of(config, plane, step, patch, more, dips=dips)
-            dips += moves.dips
-            yield Walked(step, shown + 1, patch, moves, list(more))
-            step = generator.send(answer)
-    except StopIteration:
-        return
+            if step.kind in MARKING and len(used) == sheet.capacity:
+                number += 1
+                used.clear()
+            patches, shown = patches_of(step, sheet, used, number + 1), number
+            used |= {patch.index for patch in patches}
+            if isinstance(step, CaptureStep):
+                patches, shown = (sheet.patch(step.press.patch or 0),), step.press.sheet or 0
+            yield Walked(step, shown + 1, patches)
+            step = generator.send(as_planned(step, number, patches[0].index if patches else 0))
+
+
+def walk(config: RigConfig, protocol: ProtocolConfig) -> Iterator[Walked]:
+    """Every step of `placed_steps` with its moves, over the taught plane."""
+    plane, dips = PaperPlane(config.paper.touch_z_mm), 0
+    for placed in placed_steps(config, protocol):
+        moves = moves_of(config, plane, placed.step, placed.patches, dips=dips)
+        dips += moves.dips
+        yield replace(placed, moves=moves)

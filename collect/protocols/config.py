@@ -15,10 +15,17 @@ from typing import Annotated, Any, TypeVar, cast, get_args
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.protocols.base import MAX_STROKES, ProtocolBase
-from brushloop.collect.protocols.calibration import CalibrationConfig
-from brushloop.collect.protocols.presses import FewStrokesConfig, GridConfig, ListConfig, ReplayConfig
-from brushloop.collect.protocols.write import MAX_POINTS, PointRow, WriteConfig
+from brushloop.collect.protocols.kinds import (
+    MAX_POINTS,
+    CalibrationConfig,
+    FewStrokesConfig,
+    GridConfig,
+    ListConfig,
+    PointRow,
+    ReplayConfig,
+    WriteConfig,
+)
+from brushloop.collect.protocols.plan import MAX_STROKES, ProtocolBase
 from brushloop.collect.rig.config_file import EARLIER_NAMES, read_text, read_toml, refusal
 from brushloop.sessions.disk import as_text, number
 

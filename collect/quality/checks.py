@@ -1,4 +1,4 @@
-"""The checks of a capture, in order, and the resulting verdict.
+"""The checks of a capture: a number, its limit, and what an operator should do; and the verdict that follows.
 
 A new check needs a name in `Failure`, a limit in `QualityConfig`, and a function here: listed in `MARK_CHECKS` if it
 judges the measured mark, called by `check_capture` if it judges the photograph or the ink.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -15,11 +16,104 @@ from brushloop.calibrate.board.pix2len import Plane
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
 from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.quality import measure
-from brushloop.collect.quality.ink import Ink, Point, Rect, around, mm2, on_sheet, take, tell_apart
-from brushloop.collect.quality.measure import Mark, measure_mark
-from brushloop.collect.quality.verdict import Check, Failure, Verdict
+from brushloop.collect.quality.measure import (
+    Ink,
+    Mark,
+    Point,
+    Rect,
+    around,
+    measure_mark,
+    mm2,
+    on_sheet,
+    take,
+    tell_apart,
+)
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
+
+
+class Family(StrEnum):
+    """What a failure makes useless, and therefore what must be done again."""
+
+    PICTURE = "picture"
+    """The photograph, not the stroke: remove the cause and photograph again; the stroke on paper may be sound."""
+    PLACE = "place"
+    """The ink is not where it belongs: press on a new patch."""
+    INK = "ink"
+    """Too little ink: dip again and press on a new patch."""
+    SHAPE = "shape"
+    """The hairs lay badly: comb or wipe the brush, dip, and press on a new patch."""
+
+
+class Failure(StrEnum):
+    """The failures in the order in which they are judged; the first that is found is the cause.
+
+    A stroke can be judged only in a sound picture and once it is distinguished from other ink; its place and tone,
+    only if the hairs carried ink; its shape comes last.
+    """
+
+    family: Family
+    """What it makes useless."""
+
+    def __new__(cls, value: str, family: Family) -> Failure:
+        """Make a member that equals its text and carries its family."""
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.family = family
+        return member
+
+    EXPOSURE = "exposure", Family.PICTURE
+    BLURRED = "blurred", Family.PICTURE
+    CUT = "cut", Family.PICTURE
+    GLARE = "glare", Family.PICTURE
+    NEIGHBOUR = "neighbour", Family.PLACE
+    BLANK = "blank", Family.INK
+    DRY = "dry", Family.INK
+    SMEARED = "smeared", Family.PLACE
+    MISPLACED = "misplaced", Family.PLACE
+    FAINT = "faint", Family.INK
+    SPLIT = "split", Family.SHAPE
+    BENT = "bent", Family.SHAPE
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One measured property of a capture."""
+
+    name: Failure
+    score: float
+    unit: str
+    threshold: float
+    passed: bool
+    reason: str
+    """What is wrong and what to do about it; empty where it passed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """All checks of one capture that could be measured, in the order of `Failure`."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the capture is sound."""
+        return self.cause is None
+
+    @property
+    def cause(self) -> Check | None:
+        """The dominant failure: the first in the order of `Failure`; None where all passed."""
+        return next((check for check in self.checks if not check.passed), None)
+
+    @property
+    def reason(self) -> str:
+        """The cause's reason, with the other failures named; empty where all passed."""
+        failed = [check for check in self.checks if not check.passed]
+        if not failed:
+            return ""
+        others = f" Also: {', '.join(check.name for check in failed[1:])}." if failed[1:] else ""
+        return failed[0].reason + others
+
 
 MARGIN_MM = 4.0
 """Margin around the patch in which a stroke that leaves it is looked for."""

@@ -9,8 +9,7 @@ import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from brushloop.collect.engine.dry_run import DryRunEngine
-from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.engine import DryRunEngine, Engine
 from brushloop.collect.engine.open_or_resume import Opening, open_store
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.planning.limit_check import check_protocol

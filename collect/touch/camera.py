@@ -1,4 +1,4 @@
-"""Zero touch by first ink: touch rows of fresh spots, each a little lower, and find where the ink begins."""
+"""Zero touch by first ink: touch rows of fresh spots, each a little lower, and find where the new ink begins."""
 
 from __future__ import annotations
 
@@ -6,19 +6,139 @@ import asyncio
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.board.lens import apply
+from brushloop.calibrate.board.pix2len import local_scale, see_board
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.stroke import PX_PER_MM
+from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.errors import StepError
-from brushloop.collect.photograph.new_ink import before_and_after, ink_at
+from brushloop.collect.motion import Dip, Move, Procedures, touching, up
+from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
-from brushloop.collect.rig.devices import Rig
+from brushloop.collect.rig.optics import Gray, undistorted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
-from brushloop.collect.touch.arm import Effector, TouchArm
 from brushloop.collect.touch.force import Floats
-from brushloop.collect.touch.heights import KnownHeights, PointTouches, Reach, Touch, at_one_point, lowest_z_mm
-from brushloop.collect.touch.places import SpotGrid, coarse_count, fine_count
+from brushloop.collect.touch.heights import (
+    KnownHeights,
+    PointTouches,
+    Reach,
+    SpotGrid,
+    Touch,
+    at_one_point,
+    coarse_count,
+    fine_count,
+    lowest_z_mm,
+)
 from brushloop.drivers.devices import Frame
+
+DARK_SHARE = 0.5
+"""Pixels darker than this share of the paper are not paper, and are ignored in measuring the change of light."""
+DARKER = 0.2
+"""Share of the paper's brightness that a pixel must have lost to belong to a mark."""
+JOIN_MM = 1.5
+"""Parts that lie closer together belong to one mark."""
+
+
+def before_and_after(config: RigConfig, before: Frame, after: Frame) -> tuple[Gray, Gray, Floats]:
+    """Return both photographs, gray and undistorted, and the (3, 3) map from the second one to the paper frame.
+
+    Raises `StepError` if the board is not seen.
+    """
+    first, second = (undistorted(config.camera, frame.image) for frame in (before, after))
+    try:
+        return first, second, see_board(second, config.board).homography
+    except CalibrationError as error:
+        raise StepError(f"the board is not seen: {error.what}") from None
+
+
+def _darkening(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.float32], float] | None:
+    """Return (gray levels by which each pixel became darker, level of the paper), corrected for the light.
+
+    None for pictures that show no paper.
+    """
+    paper = float(np.quantile(first, 0.9))
+    clean = first > DARK_SHARE * paper
+    if paper < 1.0 or not clean.any():
+        return None
+    light = float(np.median(second[clean] / first[clean]))
+    return np.asarray(first - second / max(light, 1e-3), np.float32), paper
+
+
+def new_ink(
+    before: Gray, after: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]
+) -> NDArray[np.float32]:
+    """How much darker a window (x, y, width, height in the paper frame) became, (h, w) at 20 px/mm.
+
+    As a share of the paper's brightness: 1 is paper turned black. Noise averages to 0.
+    """
+    first, second = (rectify(image, image_to_paper, window_mm).astype(np.float32) for image in (before, after))
+    found = _darkening(first, second)
+    if found is None:
+        return np.zeros(first.shape, np.float32)
+    darkening, paper = found
+    return np.asarray(darkening / paper, np.float32)
+
+
+def ink_at(
+    before: Gray, after: Gray, image_to_paper: Floats, spots_mm: list[tuple[float, float]], side_mm: float
+) -> Floats:
+    """New ink in a square around each spot, (n,) in mm2 of black."""
+    amounts: list[float] = []
+    for x, y in spots_mm:
+        # Larger by one side all around, so that the median sees paper.
+        window = (x - 1.5 * side_mm, y - 1.5 * side_mm, 3.0 * side_mm, 3.0 * side_mm)
+        darker = new_ink(before, after, image_to_paper, window)
+        third = darker.shape[0] // 3
+        amounts.append(float(darker[third : 2 * third, third : 2 * third].sum()) / PX_PER_MM**2)
+    return np.array(amounts, np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A mark of new ink: its centroid, weighted by darkness, in the paper frame, and its mm2 of black."""
+
+    x_mm: float
+    y_mm: float
+    ink_mm2: float
+
+
+def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
+    """New marks of at least `least_ink_mm2`, the largest first. The camera must not have moved in between."""
+    first, second = before.astype(np.float32), after.astype(np.float32)
+    found = _darkening(first, second)
+    if found is None:
+        return []
+    darkening, paper = found
+    darker = np.asarray(darkening / np.maximum(first, DARK_SHARE * paper), np.float32)
+    height, width = darker.shape
+    middle = np.array([0.5 * width, 0.5 * height])
+    reach_px = max(1, round(0.5 * JOIN_MM / local_scale(lambda at: apply(image_to_paper, at), middle)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1, 2 * reach_px + 1))
+    joined = cv2.dilate((darker > DARKER).astype(np.uint8), kernel)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    parts = np.asarray(labels, np.int32)
+    marks = [_mark(darker, parts, label, boxes[label], image_to_paper) for label in range(1, count)]
+    return sorted((m for m in marks if m.ink_mm2 >= least_ink_mm2), key=lambda m: -m.ink_mm2)
+
+
+def _mark(
+    darker: NDArray[np.float32], labels: NDArray[np.int32], label: int, box: cv2.typing.MatLike, image_to_paper: Floats
+) -> Mark:
+    x, y, width, height = (int(v) for v in box[:4])
+    part = (slice(y, y + height), slice(x, x + width))
+    # Noise averages to 0: without clipping, the margin that joining added has no weight.
+    weights = np.where(labels[part] == label, darker[part], 0.0).astype(np.float64)
+    total = float(weights.sum())
+    if total <= 0.0:
+        return Mark(0.0, 0.0, 0.0)
+    rows, columns = np.mgrid[y : y + height, x : x + width]
+    pixel = np.array([float((columns * weights).sum()), float((rows * weights).sum())]) / total
+    [[x_mm, y_mm]] = apply(image_to_paper, pixel[None])
+    return Mark(float(x_mm), float(y_mm), total * local_scale(lambda at: apply(image_to_paper, at), pixel) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,17 +178,11 @@ WINDOW_SHARE = 0.75
 class FirstInkTouch:
     """Touches by camera on one rig. The sheet must be blank where it touches."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        effector: Effector,
-        arm: TouchArm,
-        config: TouchConfig,
-    ) -> None:
-        self._rig = rig
-        self._effector = effector
-        self._arm = arm
+    def __init__(self, procedures: Procedures, config: TouchConfig, dip: Dip) -> None:
+        self._procedures = procedures
+        self._rig = procedures.rig
         self._config = config
+        self._dip = dip
         self._since_dip: int | None = None
         self._last: Frame | None = None
 
@@ -132,18 +246,18 @@ class FirstInkTouch:
 
     async def _touch(self, spot: Spot) -> None:
         if self._since_dip is None or self._since_dip >= self._config.camera.spots_per_dip:
-            await self._effector.dip()
+            await self._dip()
             self._since_dip = 0
         x, y, z = spot
-        await self._arm.over(x, y)
-        await self._arm.near(x, y, z + self._config.above_mm)
-        await self._arm.press(x, y, z)
+        await self._procedures.approach(x, y, z + self._config.above_mm)
+        down = Move(touching(self._rig.config, x, y, z), self._config.speed_mm_s)
+        await self._procedures.queue([down, up(self._rig.config, x, y)])
         self._since_dip += 1
         self._last = None
 
     async def _photograph(self) -> Frame:
         if self._last is None:
-            self._last = await self._effector.capture()
+            self._last = await self._procedures.capture()
         return self._last
 
     async def _ink(self, before: Frame, spots: list[Spot]) -> NDArray[np.float64]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
+import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -11,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.rig.config_touch import ForceTouchConfig
+from brushloop.collect.motion import Procedures
+from brushloop.collect.rig.config_touch import ForceTouchConfig, TouchConfig
 from brushloop.collect.touch.heights import Reach
+from brushloop.drivers.devices import ForceSample
 
 Floats = NDArray[np.float64]
 
@@ -278,3 +282,67 @@ async def _medium(probe: Probe, log: _Log, start_z_mm: float, lowest_z_mm: float
 
 def _felt_n(reading: Reading, config: ForceTouchConfig) -> float:
     return max(config.threshold_n, FELT_SIGMAS * reading.sd_n / math.sqrt(reading.samples))
+
+
+SILENT_S = 5.0
+"""A sensor that sends nothing for this long has stopped. The arm rests meanwhile, so a busy computer is given time;
+while the arm moves, `force.stale_ms` is the limit."""
+
+
+class ForceTap:
+    """Collects force samples while an average is asked for. Hand every sample to `take`, in the event loop."""
+
+    def __init__(self) -> None:
+        self._after_ns = 0
+        self._wanted: list[ForceSample] | None = None
+        self._came = asyncio.Event()
+
+    def take(self, sample: ForceSample) -> None:
+        """Accept one sample of the sensor."""
+        if self._wanted is not None and sample.stamp.host_ns > self._after_ns:
+            self._wanted.append(sample)
+        self._came.set()
+
+    async def average(
+        self, samples: int, push_axis: tuple[float, float, float], after_ns: int
+    ) -> tuple[float, float, int]:
+        """(mean push in N, standard deviation of one sample, samples) of the next ones received after `after_ns`.
+
+        Raises `StepError` if the sensor falls silent.
+        """
+        length = math.hypot(*push_axis)
+        self._after_ns, self._wanted = after_ns, []
+        wanted = self._wanted
+        try:
+            while len(wanted) < samples:
+                self._came.clear()
+                async with asyncio.timeout(SILENT_S):
+                    await self._came.wait()
+        except TimeoutError:
+            raise StepError(f"the force sensor fell silent after {len(wanted)} of {samples} samples") from None
+        finally:
+            self._wanted = None
+        pushes = [sum(f * a for f, a in zip(s.force_n, push_axis, strict=True)) / length for s in wanted]
+        return statistics.fmean(pushes), statistics.stdev(pushes), len(pushes)
+
+
+class RigProbe:
+    """`Probe` over one point of the sheet, on a rig's arm and force sensor."""
+
+    def __init__(self, procedures: Procedures, tap: ForceTap, at_mm: tuple[float, float], config: TouchConfig) -> None:
+        self._procedures = procedures
+        self._tap = tap
+        self._at_mm = at_mm
+        self._config = config
+        self._last_z_mm: float | None = None
+
+    async def rest(self, z_mm: float, samples: int) -> Reading:
+        """Go to the height from above, come to rest, and average this many samples."""
+        force, speed_mm_s = self._config.force, self._config.speed_mm_s
+        if self._last_z_mm is not None and z_mm > self._last_z_mm and force.clear_mm > 0.0:
+            await self._procedures.lower(*self._at_mm, z_mm + force.clear_mm, speed_mm_s)
+        rests_z_mm = await self._procedures.lower(*self._at_mm, z_mm, speed_mm_s)
+        self._last_z_mm = z_mm
+        after_ns = self._procedures.rig.clock.now_ns() + round(force.settle_s * 1e9)
+        force_n, sd_n, count = await self._tap.average(samples, force.push_axis, after_ns)
+        return Reading(rests_z_mm, force_n, count, sd_n)

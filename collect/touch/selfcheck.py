@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.collect.errors import StepError
-from brushloop.collect.motion.moves import CHECK_SPEED_MM_S, mark_moves
-from brushloop.collect.photograph.new_ink import before_and_after, new_marks
+from brushloop.collect.motion import Dip, Procedures, mark_moves
 from brushloop.collect.rig.config_touch import SelfCheckConfig
 from brushloop.collect.rig.devices import Rig
-from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
-from brushloop.collect.touch.arm import Effector, TouchArm
+from brushloop.collect.rig.paper import Patch, Sheet
+from brushloop.collect.touch.camera import before_and_after, new_marks
 from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import SelfCheckResult
 
@@ -87,24 +86,23 @@ def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
     return triangle_of(patches) if len(patches) == 3 else triangle_in(patches[0], config)
 
 
-async def self_check(rig: Rig, effector: Effector, places_mm: Triangle, plane: PaperPlane) -> SelfCheckResult:
+async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> SelfCheckResult:
     """Press the marks, photograph them and judge. The arm begins and ends at travel height; the patches are used up.
 
     Raises `StepError` with the figures if the marks are not found, mirrored, turned, stretched or displaced.
     """
+    rig, plane = procedures.rig, procedures.plane
     config, commanded = rig.config.self_check, np.array(places_mm, np.float64)
     if abs(float(np.linalg.det(commanded[1:] - commanded[0]))) < 1.0 or _second_best(commanded) < UNEVEN:
         raise StepError("the self-check's triangle is too even, or too flat, to tell a mirror image")
-    arm = TouchArm(rig, CHECK_SPEED_MM_S)
-    async with arm.lifted_after():
-        before = await effector.capture()
+    async with procedures.lifted_after():
+        before = await procedures.capture()
         for x_mm, y_mm in places_mm:
-            await effector.dip()
+            await dip()
             above, near, *pressing = mark_moves(rig.config, plane, x_mm, y_mm)
-            await arm.go(above)
-            await arm.go(near)
-            await arm.sequence(pressing)
-        after = await effector.capture()
+            await procedures.go(above, near)
+            await procedures.queue(pressing)
+        after = await procedures.capture()
     found_mm = await asyncio.to_thread(_find, rig, before, after, config)
     return judge(commanded, found_mm, config)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brushloop.collect.engine.last_capture import LastCapture
-    from brushloop.collect.quality.verdict import Check
+    from brushloop.collect.quality.checks import Check
     from brushloop.sessions import records
     from brushloop.sessions.events import Press
 

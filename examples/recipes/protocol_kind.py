@@ -10,8 +10,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from brushloop.collect.protocols.base import DeepMm, ProtocolBase, Repeats, check_count
-from brushloop.collect.protocols.plan import Planned
+from brushloop.collect.protocols.plan import DeepMm, Planned, ProtocolBase, Repeats, check_count
 from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.records import Condition
 

@@ -1,14 +1,14 @@
 """A quality check: a stroke whose ink is unusually dark.
 
 Put such a function into `collect/quality/checks.py` and its name into `MARK_CHECKS` there. A finding of its own needs a
-name in `Failure` (`collect/quality/verdict.py`), with the family that says what is done about it, and its limit belongs
+name in `Failure` there, with the family that says what is done about it, and its limit belongs
 in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig can set it. `docs/quality.md` says what it measures.
 """
 
 from __future__ import annotations
 
+from brushloop.collect.quality.checks import Check, Failure
 from brushloop.collect.quality.measure import Mark
-from brushloop.collect.quality.verdict import Check, Failure
 from brushloop.collect.rig.config_touch import QualityConfig
 
 DARKEST_TONE = 0.97

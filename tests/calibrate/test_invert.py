@@ -29,7 +29,7 @@ from brushloop.calibrate.invert import (
 )
 from brushloop.calibrate.presses import PrepareJob, prepare_job
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.presses import ReplayConfig
+from brushloop.collect.protocols.kinds import ReplayConfig
 from brushloop.model.ccdbsm import Brush, ccdbsm
 from brushloop.model.raster import coverage
 from brushloop.sessions.imports import ImportOptions, import_photographs

@@ -5,20 +5,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.engine.force_guard import ForceGuard
 from brushloop.collect.engine.progress import Progress
-from brushloop.collect.engine.recorder import Recorder
-from brushloop.collect.errors import BadPicture
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.engine.recorder import ForceGuard, Recorder
+from brushloop.collect.errors import BadPicture, ConfigError, StepError
+from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, OperatorRequests
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.devices import Rig
 from brushloop.collect.rig.paper import Patch, Sheet
-from brushloop.collect.touch.places import used_patches as touched_patches
+from brushloop.collect.touch.heights import used_patches as touched_patches
 from brushloop.drivers.host import finished
 from brushloop.sessions.store import Attempt, SessionStore
 
@@ -95,10 +95,8 @@ class StepContext:
     """One attempt at one step."""
 
     run: RunContext
-    patch: Patch | None
-    """Patch to press."""
-    more_patches: tuple[Patch, ...]
-    """Further patches that this step marks."""
+    patches: tuple[Patch, ...]
+    """Patches that this step marks."""
     attempt: Attempt
     recorder: Recorder
     guard: ForceGuard
@@ -123,3 +121,12 @@ async def uninterrupted(function: Callable[..., _R], *args: object) -> _R:
     An unfinished file operation is worse than one that ends a few milliseconds after the stop key.
     """
     return await finished(asyncio.to_thread(function, *args))
+
+
+async def within_limits(check: Callable[..., None], where: str, *arguments: object) -> None:
+    """Run a check of `planning.limit_check` in a thread: it takes seconds for a long protocol, and a stop takes effect
+    meanwhile. Raises `StepError`, which begins with `where`."""
+    try:
+        await asyncio.to_thread(check, Path("rig.toml"), *arguments)
+    except ConfigError as error:
+        raise StepError(f"{where}{error.what}") from None

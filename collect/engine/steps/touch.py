@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 
-from brushloop.collect.engine.steps.context import RunContext, StepContext
-from brushloop.collect.engine.steps.dip import fill_brush, set_light
-from brushloop.collect.errors import ConfigError, StepError
-from brushloop.collect.motion.moves import visit_moves
+from brushloop.collect.engine.steps.context import RunContext, StepContext, within_limits
+from brushloop.collect.engine.steps.press import fill_brush, set_light
+from brushloop.collect.errors import StepError
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.planning.limit_check import check_poses, check_step
 from brushloop.collect.planning.walk import touch_of
 from brushloop.collect.protocols.steps import TouchStep, ZeroTouchStep
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.collect.touch.arm import ForceTap
+from brushloop.collect.touch.force import ForceTap
 from brushloop.collect.touch.heights import PlaneResult, kept
 from brushloop.collect.touch.measure import asked, measure_plane
 from brushloop.collect.touch.selfcheck import self_check, triangle_on
-from brushloop.drivers.devices import Frame
 from brushloop.sessions.events import SelfCheckResult, TouchResult, ZeroTouchResult
 
 
@@ -36,9 +32,9 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
         found = kept(run.procedures.plane, rig.config.paper.touch_point_mm)
     else:
         if step.method is not None:
-            await _check(check_step, "", rig.config, run.procedures.plane, step)
+            await within_limits(check_step, "", rig.config, run.procedures.plane, step)
         found = await _measured(context, touch_of(rig.config, step))
-    await _check(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, found.plane)
+    await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, found.plane)
     moved_mm = _moved_mm(found, run.procedures.plane)
     if found.method == "kept":
         run.progress.log(f"zero touch was given up: {_height(run)} is kept", warning=True)
@@ -79,53 +75,27 @@ async def touch(context: StepContext, step: TouchStep) -> TouchResult:
     run = context.run
     config = touch_of(run.rig.config, step)
     if config.method == "taught":
-        [point] = config.points_mm
-        z_mm = await context.guard.guarded(_visited(run, point))
-        return TouchResult(method="taught", x_mm=point[0], y_mm=point[1], z_mm=z_mm)
+        visited = run.procedures.visit(run.procedures.plane, step.x_mm, step.y_mm)
+        z_mm = await context.guard.guarded(visited)
+        return TouchResult(method="taught", x_mm=step.x_mm, y_mm=step.y_mm, z_mm=z_mm)
     found = await _measured(context, config)
     x_mm, y_mm, z_mm = found.points[0].mean
     return TouchResult(method=found.method, x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, span_mm=found.points[0].span_mm)
 
 
-async def _visited(run: RunContext, point: tuple[float, float]) -> float:
-    """Move to where the surface should be, and return the height at which the arm rests there."""
-    *down, up = visit_moves(run.rig.config, run.procedures.plane, *point)
-    for move in down:
-        await run.procedures.go(move)
-    z_mm = (await run.rig.robot.where()).z_mm
-    await run.procedures.go(up)
-    return z_mm
-
-
 async def check_rig(context: StepContext) -> SelfCheckResult:
     """The SELF_CHECK step: a scalene triangle of marks shows whether the rig is mirrored, turned or stretched."""
-    run, patch = context.run, context.patch
-    assert patch is not None
-    patches = (patch, *context.more_patches)
+    run, patches = context.run, context.patches
     places_mm = triangle_on(patches, run.rig.config.self_check)
-    checked = await context.guard.guarded(self_check(run.rig, _Effector(context), places_mm, run.procedures.plane))
-    on = {"sheet": run.store.state.sheet, "patches": tuple(one.index for one in patches)}
-    return checked.model_copy(update=on)
+    checked = await context.guard.guarded(self_check(run.procedures, places_mm, partial(_fill_for_touch, context)))
+    place = {"sheet": run.store.state.sheet, "patches": tuple(patch.index for patch in patches)}
+    return checked.model_copy(update=place)
 
 
-class _Effector:
-    """The rig's procedures as touches and the self-check use them; a dip also keeps the well filled."""
-
-    def __init__(self, context: StepContext) -> None:
-        self._context = context
-
-    async def zero_touch(self) -> float:
-        """Visit the taught height."""
-        return await self._context.run.procedures.zero_touch()
-
-    async def dip(self) -> None:
-        """Fill the brush. The touch that follows takes ink, so the next press must dip again."""
-        await fill_brush(self._context)
-        self._context.run.left_ink_ns = None
-
-    async def capture(self) -> Frame:
-        """Park, and take a fresh frame."""
-        return await self._context.run.procedures.capture()
+async def _fill_for_touch(context: StepContext) -> None:
+    """Fill brush and well. The touch that follows takes ink, so the next press must dip again."""
+    await fill_brush(context)
+    context.run.left_ink_ns = None
 
 
 async def _measured(context: StepContext, config: TouchConfig) -> PlaneResult:
@@ -137,7 +107,8 @@ async def _measured(context: StepContext, config: TouchConfig) -> PlaneResult:
         def tell(doing: str) -> None:
             run.progress.doing(f"zero touch by {config.method}: {doing}")
 
-        measured = measure_plane(run.rig, _Effector(context), config, tap=tap, next_jog=jog, tell=tell)
+        dip = partial(_fill_for_touch, context)
+        measured = measure_plane(run.procedures, config, dip=dip, tap=tap, next_jog=jog, tell=tell)
         return await context.guard.guarded(measured)
 
 
@@ -146,11 +117,3 @@ def _height(run: RunContext) -> str:
     paper, plane = run.rig.config.paper, run.procedures.plane
     how = "taught height" if plane == PaperPlane(paper.touch_z_mm) else "height that was measured before"
     return f"the {how}, {plane.touch_z_mm(*paper.touch_point_mm):.2f} mm,"
-
-
-async def _check(check: Callable[..., None], where: str, *checked: object) -> None:
-    try:
-        # Takes seconds for a long protocol; runs in a thread, so that a stop takes effect meanwhile.
-        await asyncio.to_thread(check, Path("rig.toml"), *checked)
-    except ConfigError as error:
-        raise StepError(f"{where}{error.what}") from None

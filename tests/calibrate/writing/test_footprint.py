@@ -20,7 +20,7 @@ from brushloop.calibrate.writing.learn import (
 )
 from brushloop.calibrate.writing.record import recorded_figures
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.characters.plan import Reach, grid, without_tilt
 from brushloop.model.drag import NAMES, Drawings, Footprint, inked
 from brushloop.sessions.records import Header, Source

@@ -15,7 +15,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.writing.plan import PICTURE, PlanRequest, plan, pressed, read_wanted
 from brushloop.calibrate.writing.record import PROTOCOL, PlannedBy
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.characters.plan import Patch, Reach
 from brushloop.model.similarity import csim, ssim

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any, cast
 
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, make_robot
 from brushloop.collect.rig.paper import Sheet

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from brushloop.collect.errors import StepVoid
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import connected
 from brushloop.collect.rig.paper import Patch, Sheet, to_base

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from brushloop.collect.engine.progress import Progress
-from brushloop.collect.engine.steps import dip as dipping
+from brushloop.collect.engine.steps import press as dipping
 from brushloop.collect.engine.steps import touch as touching
 from brushloop.collect.planning.summary import make_plan
 from brushloop.collect.planning.walk import as_planned

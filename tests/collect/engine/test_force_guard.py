@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from brushloop.collect.engine.force_guard import ForceGuard
+from brushloop.collect.engine.recorder import ForceGuard
 from brushloop.collect.errors import ForceTooHigh, arm_at_fault, describe, rest_is_unknown
 from brushloop.drivers.devices import ForceSample, Stamp
 from brushloop.drivers.errors import DeviceError, MotionFailed

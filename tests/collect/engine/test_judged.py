@@ -11,8 +11,7 @@ import pytest
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.steps import capture as capturing
 from brushloop.collect.errors import CollectAborted, NeedsOperator, Parked
-from brushloop.collect.quality.checks import check_drawing
-from brushloop.collect.quality.verdict import Verdict
+from brushloop.collect.quality.checks import Verdict, check_drawing
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay

@@ -23,8 +23,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from brushloop.collect.engine.live import HOST, QUEUE_LIMIT, LiveView
-from brushloop.collect.engine.telemetry import FRAME_PERIOD_S
+from brushloop.collect.engine.live import FRAME_PERIOD_S, HOST, QUEUE_LIMIT, LiveView
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import CollectRequest, collect
 from brushloop.drivers.devices import Frame, Stamp

@@ -12,7 +12,7 @@ from brushloop.collect import headless
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.protocols.kinds import GridConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, make_robot
 from brushloop.collect.tui.app import OperatorApp

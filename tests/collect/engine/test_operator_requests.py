@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
-from brushloop.collect.engine.perform import Performer
+from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Mark
 from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
@@ -180,14 +180,14 @@ def test_the_paper_is_found_again_by_jog_between_two_strokes(lab: Lab) -> None:
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """Zero touch between strokes ends with this error."""
-    perform = Performer.perform
+    perform = Run.perform
 
-    async def performed(self: Performer, step: Step) -> StepResult:
+    async def performed(self: Run, step: Step) -> StepResult:
         if isinstance(step, ZeroTouchStep) and step.between_strokes:
             raise error
         return await perform(self, step)
 
-    monkeypatch.setattr(Performer, "perform", performed)
+    monkeypatch.setattr(Run, "perform", performed)
 
 
 def test_too_much_force_in_a_jog_between_strokes_is_looked_at_before_the_arm_moves(

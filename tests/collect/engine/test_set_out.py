@@ -12,7 +12,7 @@ from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.steps import capture as capturing
 from brushloop.collect.engine.steps.context import meanwhile
 from brushloop.collect.errors import BadPicture, CollectAborted
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures
 from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.motion.moves import dip_moves, wash_moves
+from brushloop.collect.motion import dip_moves, wash_moves
 from brushloop.collect.rig.config import RigConfig, load_rig
 from tests.collect.until import wait_for_end
 

@@ -10,8 +10,7 @@ from typing import Any, cast
 import pytest
 
 from brushloop.collect.errors import StepVoid
-from brushloop.collect.motion.moves import press_moves
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures, press_moves
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.rig.paper import Sheet

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brushloop.collect.photograph.delay import ArmPlace, CameraDelay, FrameChange, Look, look
+from brushloop.collect.photograph.frames import FrameChange
+from brushloop.collect.photograph.photographer import ArmPlace, CameraDelay, Look, look
 
 ENTERS = 0.4
 """The share of its way at which the arm comes into the picture; nothing below knows it."""

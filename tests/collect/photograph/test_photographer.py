@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brushloop.collect.errors import ArmInPicture, CameraLate
-from brushloop.collect.photograph.delay import CameraDelay, Look
+from brushloop.collect.photograph.photographer import CameraDelay, Look
 from brushloop.drivers.devices import Frame
 from tests.collect.photograph.theatre import OUT_MM, OVER_MM, PERIOD_S, Theatre
 

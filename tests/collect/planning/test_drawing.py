@@ -9,20 +9,21 @@ from typing import Any, cast
 
 import pytest
 
-from brushloop.collect.motion.moves import stroke_moves
-from brushloop.collect.motion.procedures import Procedures, check_drawn
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.motion import Procedures, stroke_moves
+from brushloop.collect.planning.limit_check import check_step
 from brushloop.collect.planning.walk import sheet_of, walk
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.steps import Drawn, DrawStep
 from brushloop.collect.rig.config import RigConfig, load_rig
-from brushloop.collect.rig.devices import Rig, limits_of, make_robot
+from brushloop.collect.rig.devices import Rig, make_robot
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.drivers.errors import LimitExceeded
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.world import World
+from brushloop.sessions.events import Condition, Press
 
 WRITE = Path(__file__).parents[3] / "examples" / "protocol-write.toml"
 PLANE = PaperPlane(120.0)
@@ -82,20 +83,21 @@ def test_a_stroke_may_come_down_on_its_way(config: RigConfig) -> None:
     """Points above the paper: a flying start. The brush is as far above it as asked when the way begins."""
     patch = sheet_of(config, load_protocol(WRITE)).patch(0)
     points = [(10.0, 10.0, -4.0, 3.0, 0.0), (20.0, 10.0, 5.0, 3.0, 0.0), (30.0, 10.0, -4.0, 3.0, 0.0)]
-    moves = stroke_moves(config, PLANE, patch, points, 15.0)
-    assert [move.target.z_mm for move in moves.down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
-    assert [pose.z_mm for pose in moves.way.poses] == pytest.approx([115.0, 124.0])
+    *down, path, _, _ = stroke_moves(config, PLANE, patch, points, 15.0)
+    assert [move.target.z_mm for move in down] == pytest.approx([180.0, 132.0, 132.0, 124.0])
+    assert [pose.z_mm for pose in path.poses] == pytest.approx([115.0, 124.0])
 
 
 def test_the_wrist_turns_where_the_brush_is_upright_and_high(config: RigConfig) -> None:
     patch = sheet_of(config, load_protocol(WRITE)).patch(0)
-    [high, clear, *_] = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0).down
+    [high, clear, *_] = stroke_moves(config, PLANE, patch, first_drawn(config).strokes[1], 15.0)
     assert high.target.quaternion == pytest.approx(clear.target.quaternion)
 
 
 def test_all_of_a_figure_is_checked(config: RigConfig) -> None:
-    drawn, sheet = first_drawn(config), sheet_of(config, load_protocol(WRITE))
-    check_drawn(config, PLANE, limits_of(config), sheet.corners, drawn)
+    drawn, patch = first_drawn(config), sheet_of(config, load_protocol(WRITE)).patch(0)
+    step = DrawStep(0, Press(stroke_id="yong", condition=Condition(10.0, 0.0)), drawn)
+    check_step(Path("rig.toml"), config, PLANE, step, [patch])
     drawn.strokes[1][-1] = (40.0, 12.0, 1.0, 20.0, 90.0)
-    with pytest.raises(LimitExceeded, match="tilt"):
-        check_drawn(config, PLANE, limits_of(config), sheet.corners, drawn)
+    with pytest.raises(ConfigError, match="tilt"):
+        check_step(Path("rig.toml"), config, PLANE, step, [patch])

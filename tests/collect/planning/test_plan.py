@@ -9,17 +9,26 @@ from pathlib import Path
 import pytest
 
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.motion.moves import Move, Way
-from brushloop.collect.planning.estimate import _apart, bundle_ml, ink_need, move_s, reach_of, trapezoid_s, way_s
+from brushloop.collect.motion import Move
+from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.planning.limit_check import all_poses, check_poses, check_protocol
-from brushloop.collect.planning.summary import Plan, make_plan
+from brushloop.collect.planning.summary import (
+    Plan,
+    bundle_ml,
+    ink_need,
+    make_plan,
+    move_s,
+    path_s,
+    reach_of,
+    trapezoid_s,
+)
 from brushloop.collect.planning.walk import moves_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.steps import MARKING, DrawStep, PressStep, StepKind
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane
-from brushloop.drivers.geometry import brush_pose, distance
+from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.sessions.records import Condition
@@ -189,7 +198,7 @@ def test_the_walk_goes_where_the_steps_say(tmp_path: Path) -> None:
     for before, after in itertools.pairwise(walked):
         if before.step.kind in MARKING:
             assert after.step.kind == StepKind.CAPTURE
-            assert (after.patch, after.sheet) == (before.patch, before.sheet)
+            assert (after.patches, after.sheet) == (before.patches, before.sheet)
     step, moves = next((w.step, w.moves) for w in walked if isinstance(w.step, PressStep))
     deepest = min(pose.z_mm for pose, _ in moves.poses)
     assert deepest == pytest.approx(config.paper.touch_z_mm - step.press.condition.depth_mm)
@@ -198,7 +207,7 @@ def test_the_walk_goes_where_the_steps_say(tmp_path: Path) -> None:
 def test_a_drawn_stroke_goes_through_its_points_at_its_depths(tmp_path: Path) -> None:
     config, wanted = rig(tmp_path), example("protocol-write.toml")
     [draw, *_] = [w for w in walk(config, wanted) if w.step.kind == StepKind.DRAW]
-    ways = [part for part in draw.moves.parts if isinstance(part, Way)]
+    ways = [part for part in draw.moves.segments if isinstance(part, MotionPath)]
     assert isinstance(draw.step, DrawStep)
     drawn = draw.step.drawn
     assert [len(way.poses) for way in ways] == [len(stroke) - 1 for stroke in drawn.strokes]
@@ -221,16 +230,9 @@ def test_a_turn_on_the_spot_is_read_in_radians(tmp_path: Path) -> None:
     limits = limits_of(rig(tmp_path))
     upright, tilted = brush_pose(300.0, 0.0, 200.0), brush_pose(300.0, 0.0, 200.0, tilt_deg=10.0)
     assert move_s(upright, tilted, 20.0, 800.0, limits) == pytest.approx(0.17453 / 0.02 + 0.025, abs=1e-3)
-    assert way_s(upright, Way([brush_pose(310.0, 0.0, 200.0), brush_pose(320.0, 0.0, 200.0)], 20.0), 800.0, limits) == (
-        pytest.approx(1.025)
-    )
-
-
-@pytest.mark.parametrize("turn_deg", [0.0, 0.05, 5.0, 90.0, 180.0])
-def test_the_quick_distance_is_the_distance(turn_deg: float) -> None:
-    a = brush_pose(300.0, 0.0, 200.0, heading_deg=10.0, tilt_deg=3.0)
-    b = brush_pose(310.0, 4.0, 190.0, heading_deg=10.0 + turn_deg, tilt_deg=3.0)
-    assert _apart(a, b) == pytest.approx(distance(a, b), abs=1e-5)
+    assert path_s(
+        upright, MotionPath([brush_pose(310.0, 0.0, 200.0), brush_pose(320.0, 0.0, 200.0)], 20.0), 800.0, limits
+    ) == (pytest.approx(1.025))
 
 
 def test_ink_is_an_upper_estimate_and_a_pump_knows_better(tmp_path: Path) -> None:
@@ -294,6 +296,6 @@ def test_a_plan_says_beforehand_what_the_self_check_of_an_armed_run_adds(tmp_pat
 def test_moves_of_a_touch_end_above_where_they_began(tmp_path: Path) -> None:
     config = rig(tmp_path)
     walked = next(w for w in walk(config, example("protocol-calibration.toml")) if w.step.kind == StepKind.TOUCH)
-    moves = [part for part in moves_of(config, PaperPlane(120.0), walked.step, None).parts if isinstance(part, Move)]
+    moves = [part for part in moves_of(config, PaperPlane(120.0), walked.step).segments if isinstance(part, Move)]
     assert moves[0].target == moves[-1].target
     assert min(move.target.z_mm for move in moves) == 120.0

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from brushloop.collect.engine.perform import Performer
+from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.steps.context import StepContext
-from brushloop.collect.motion.moves import inking_moves
+from brushloop.collect.motion import inking_moves
 from brushloop.collect.planning.limit_check import all_poses, check_protocol
 from brushloop.collect.planning.walk import moves_of
 from brushloop.collect.protocols.config import load_protocol
@@ -64,9 +64,9 @@ class Made:
 def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
     steps: list[Made] = []
     at_work: list[Made] = []
-    do = Performer._do
+    do = Run._do
 
-    async def noted(self: Performer, step: Step, context: StepContext) -> StepResult:
+    async def noted(self: Run, step: Step, context: StepContext) -> StepResult:
         procedures = context.run.procedures
         at_work.append(Made(step, context, procedures.plane, procedures._dips))
         try:
@@ -78,7 +78,7 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
         for one in at_work:
             one.sent.append(target)
 
-    monkeypatch.setattr(Performer, "_do", noted)
+    monkeypatch.setattr(Run, "_do", noted)
     noting(lab.rig.world.motion, added)
     return steps
 
@@ -106,11 +106,11 @@ def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:
     check_protocol(rig_path, path, config, protocol)
     last = [one for one in made if one.step.kind is StepKind.CAPTURE][-1:]
     for one in made:
-        patch, more = one.context.patch, one.context.more_patches
-        planned = moves_of(config, one.plane, one.step, patch, more, dips=one.dips)
+        patches = one.context.patches
+        planned = moves_of(config, one.plane, one.step, patches, dips=one.dips)
         # Where the ink had to wait, a press dips again.
         again = inking_moves(config, one.dips) if one.step.kind in MARKING else []
-        assert not not_checked(config, one.sent, [*planned.parts, *again]), one.step
+        assert not not_checked(config, one.sent, [*planned.segments, *again]), one.step
         if one not in last:  # after the last capture the arm does not set out for a dip
             assert not not_sent(config, planned, one.sent), one.step
         checked = {rounded(pose) for pose, _, _ in all_poses(config, protocol, one.plane, every_patch=True)}

@@ -6,8 +6,8 @@ from collections import defaultdict
 
 import pytest
 
+from brushloop.collect.protocols.kinds import GridConfig
 from brushloop.collect.protocols.plan import Planned
-from brushloop.collect.protocols.presses import GridConfig
 from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.records import Condition
 

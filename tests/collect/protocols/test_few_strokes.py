@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from brushloop.collect.protocols.presses import FewStrokesConfig
+from brushloop.collect.protocols.kinds import FewStrokesConfig
 
 GRID = {"kind": "few-strokes", "depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
 

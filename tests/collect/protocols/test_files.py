@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols import config as protocol_config
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.protocols.presses import GridConfig, ListConfig
-from brushloop.collect.protocols.write import WriteConfig
+from brushloop.collect.protocols.kinds import GridConfig, ListConfig, WriteConfig
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 LIST = 'kind = "list"\nfile = "p.csv"\n'

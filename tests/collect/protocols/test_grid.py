@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brushloop.collect.planning.walk import as_planned
-from brushloop.collect.protocols.presses import GridConfig
+from brushloop.collect.protocols.kinds import GridConfig
 from brushloop.collect.protocols.steps import CaptureStep, PressStep
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Sheet, to_base

@@ -12,9 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brushloop.collect.planning.walk import as_planned
-from brushloop.collect.protocols.calibration import CalibrationConfig
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
-from brushloop.collect.protocols.presses import GridConfig, ListConfig, PressRow, ReplayConfig, ReplayRow
+from brushloop.collect.protocols.kinds import (
+    CalibrationConfig,
+    DrawnStroke,
+    Figure,
+    GridConfig,
+    ListConfig,
+    PressRow,
+    ReplayConfig,
+    ReplayRow,
+    WriteConfig,
+)
 from brushloop.collect.protocols.steps import (
     MARKING,
     CaptureStep,
@@ -25,7 +34,6 @@ from brushloop.collect.protocols.steps import (
     TouchStep,
     press_of,
 )
-from brushloop.collect.protocols.write import DrawnStroke, Figure, WriteConfig
 from brushloop.collect.rig.paper import Layout
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

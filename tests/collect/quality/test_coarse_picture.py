@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.collect.quality.ink import Ink, Window
-from brushloop.collect.quality.measure import measure_mark
+from brushloop.collect.quality.measure import Ink, Window, measure_mark
 from brushloop.collect.rig.config_touch import QualityConfig
 
 

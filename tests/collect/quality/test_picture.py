@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.collect.quality.checks import check_capture, check_drawing, check_frame, patch_is_blank
+from brushloop.collect.quality.checks import Failure, Family, check_capture, check_drawing, check_frame, patch_is_blank
 from brushloop.collect.quality.measure import blur_px, glare, paper_level
-from brushloop.collect.quality.verdict import Failure, Family
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from tests.calibrate.given import flat_plane

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from brushloop.collect.motion.moves import photograph_moves
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures, photograph_moves
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import Rig, limits_of
-from brushloop.collect.touch.arm import ForceTap
+from brushloop.collect.touch.force import ForceTap
 from brushloop.drivers.devices import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig, Table, View
@@ -158,9 +157,8 @@ class BenchHands(Procedures):
 
     async def capture(self) -> Frame:
         """Without wires no picture is late: there is no delay to measure."""
-        for move in photograph_moves(self._rig.config):
-            await self.go(move)
-        return await self._rig.camera.fresh(Stamp(self._rig.clock.now_ns()))
+        await self.go(*photograph_moves(self.rig.config))
+        return await self.rig.camera.fresh(Stamp(self.rig.clock.now_ns()))
 
 
 class MakeBench(Protocol):

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.paper import Sheet
-from brushloop.collect.touch.heights import Touch, at_one_point
-from brushloop.collect.touch.places import used_patches
+from brushloop.collect.touch.heights import Touch, at_one_point, used_patches
 
 CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
 THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
@@ -35,7 +34,7 @@ PATCHES: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 40.0)],
 
 
 async def measured(bench: Bench, **config: Any) -> PlaneResult:
-    return await measure_plane(bench.rig, bench.effector, TouchConfig(**config), tap=bench.tap)
+    return await measure_plane(bench.effector, TouchConfig(**config), tap=bench.tap)
 
 
 def errors_mm(bench: Bench, result: PlaneResult) -> list[float]:
@@ -183,7 +182,7 @@ async def test_the_operator_jogs_until_it_touches(make_bench: MakeBench) -> None
     bench = make_bench((0.5, 0.5), paper_z_mm=120.4)
     operator = Operator(bench)
     config = TouchConfig(method="jog", **THREE)
-    result = await measure_plane(bench.rig, bench.effector, config, next_jog=operator)
+    result = await measure_plane(bench.effector, config, next_jog=operator)
     assert max(map(abs, errors_mm(bench, result))) < 0.021
     assert operator.asked > 9
     assert bench.lifted
@@ -200,7 +199,7 @@ async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench)
         return -1.0
 
     with pytest.raises(StepError, match="given up"):
-        await measure_plane(bench.rig, bench.effector, TouchConfig(method="jog"), next_jog=down)
+        await measure_plane(bench.effector, TouchConfig(method="jog"), next_jog=down)
     assert min(at.above_mm for at in seen) == pytest.approx(-2.0)
     assert [at.lowest for at in seen] == [at.above_mm < -1.99 for at in seen]
     assert {(at.number, at.of) for at in seen} == {(1, 3)}
@@ -212,7 +211,7 @@ async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBe
     config = TouchConfig(method="jog")
     nobody = asked(Asker(watched=False), config.jog)
     with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
-        await measure_plane(bench.rig, bench.effector, config, next_jog=nobody)
+        await measure_plane(bench.effector, config, next_jog=nobody)
     assert bench.lifted
 
 

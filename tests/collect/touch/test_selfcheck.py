@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.config_touch import SelfCheckConfig
-from brushloop.collect.rig.paper import PaperPlane, Sheet, to_base
+from brushloop.collect.rig.paper import Sheet, to_base
 from brushloop.collect.touch.selfcheck import (
     Triangle,
     judge,
@@ -93,7 +93,8 @@ def test_no_turn_passes_for_a_mirror_nor_a_mirror_for_a_turn(noise: int, turn_de
 
 
 async def checked(bench: Bench, places: Triangle = PLACES) -> SelfCheckResult:
-    return await self_check(bench.rig, bench.effector, places, PaperPlane(120.0))
+    bench.effector.rig = bench.rig  # with the board that the test gave it
+    return await self_check(bench.effector, places, bench.effector.dip)
 
 
 async def test_marks_on_the_loopback_sheet_are_found_and_pass(make_bench: MakeBench) -> None:

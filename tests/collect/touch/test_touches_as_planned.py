@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from conftest import Bench, MakeBench
 
 
-from brushloop.collect.motion.procedures import Procedures
+from brushloop.collect.motion import Procedures
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.devices import connected
-from brushloop.collect.touch.arm import ForceTap
+from brushloop.collect.touch.force import ForceTap
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.rig import LoopbackRig
@@ -64,12 +64,12 @@ async def test_no_touch_leaves_what_was_checked(make_bench: MakeBench, method: s
     asked = TouchConfig.model_validate({"method": method, "residual_mm": 9.0, **POINTS})
     config = bench.rig.config.model_copy(update={"touch": asked})
     sent = noted(bench, config)
-    await measure_plane(bench.rig, bench.effector, asked, tap=bench.tap, next_jog=down)
-    planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH, None)
+    await measure_plane(bench.effector, asked, tap=bench.tap, next_jog=down)
+    planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH)
     if method != "camera":  # whose spots of one patch lie beside each other
         beside = [(a, b) for a, b in pairwise(sent) if math.hypot(b.x_mm - a.x_mm, b.y_mm - a.y_mm) > 1.0]
         assert all(here.z_mm >= config.motion.safe_z_mm for here, _ in beside), "it was lifted before it travelled"
-    assert not not_checked(config, sent, planned.parts)
+    assert not not_checked(config, sent, planned.segments)
     assert not not_sent(config, planned, sent)
 
 
@@ -82,9 +82,9 @@ async def test_touches_that_each_find_the_paper_lower_do_not_add_up(make_bench: 
     )
     config = bench.rig.config.model_copy(update={"touch": asked})
     sent = noted(bench, config)
-    await measure_plane(bench.rig, bench.effector, asked, next_jog=down)
-    planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH, None)
-    assert not not_checked(config, sent, planned.parts)
+    await measure_plane(bench.effector, asked, next_jog=down)
+    planned = moves_of(config, PaperPlane(config.paper.touch_z_mm), TOUCH)
+    assert not not_checked(config, sent, planned.segments)
     assert lowest_mm(sent) > 120.0 - asked.travel_mm - 2.1  # what a lean of 1 deg over 116 mm may be
 
 
@@ -94,9 +94,9 @@ async def test_the_self_check_presses_as_deep_as_was_checked(make_bench: MakeBen
     sent, plane = noted(bench, config), PaperPlane(120.0)
     sheet = Sheet(config.paper)
     patches = (sheet.patch(0), *partners(sheet, sheet.patch(0), set()))
-    await self_check(bench.rig, bench.effector, triangle_on(patches, config.self_check), plane)
-    planned = moves_of(config, plane, CHECK, patches[0], patches[1:])
-    assert not not_checked(config, sent, planned.parts)
+    await self_check(bench.effector, triangle_on(patches, config.self_check), bench.effector.dip)
+    planned = moves_of(config, plane, CHECK, patches)
+    assert not not_checked(config, sent, planned.segments)
     assert not not_sent(config, planned, sent)
     assert lowest_mm(sent) == 120.0 - config.self_check.depth_mm
 
@@ -138,13 +138,13 @@ async def test_a_sheet_that_lies_lower_than_taught_is_found_and_the_brush_is_lif
             touch = TouchConfig(method="force", touches=2, force=QUICK)  # pyright: ignore[reportArgumentType]
             tap = ForceTap()
             rig.force.listen(tap.take)
-            result = await measure_plane(rig, Procedures(rig), touch, tap=tap)
+            result = await measure_plane(Procedures(rig), touch, tap=tap)
             at_mm = (await rig.robot.where()).position_mm
 
     asked = config.model_copy(update={"touch": touch})
-    planned = moves_of(asked, PaperPlane(config.paper.touch_z_mm), ZeroTouchStep(0), None)
+    planned = moves_of(asked, PaperPlane(config.paper.touch_z_mm), ZeroTouchStep(0))
     assert len(sent) > 10
-    assert not not_checked(config, sent, planned.parts)
+    assert not not_checked(config, sent, planned.segments)
     [point] = result.points
     truth_mm = table.surface_z_mm(*config.paper.touch_point_mm)
     assert [t.z_mm for t in point.touches] == pytest.approx([truth_mm] * 2, abs=0.12)

@@ -14,7 +14,7 @@ from brushloop.collect.engine.last_capture import LastCapture, mark_of
 from brushloop.collect.engine.snapshot import CellCount, Mark, Picture, SheetMap, Snapshot
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.quality.verdict import Check, Failure, Verdict
+from brushloop.collect.quality.checks import Check, Failure, Verdict
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.events import Press
 from brushloop.sessions.records import Condition

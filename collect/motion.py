@@ -1,15 +1,19 @@
-"""Every list of moves that the arm makes: a plan checks, times and draws the lists that a run carries out."""
+"""Every list of moves that the arm makes, which a plan checks, times and draws, and their execution in a run."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from brushloop.collect.protocols.steps import TrajectoryPoint
+from brushloop.collect.errors import StepVoid, arm_at_fault
+from brushloop.collect.photograph.photographer import ArmTrips, Photographer
+from brushloop.collect.protocols.steps import Drawn, TrajectoryPoint
 from brushloop.collect.rig.config import RigConfig, WashConfig
-from brushloop.collect.rig.paper import PaperPlane, Patch, to_base
-from brushloop.drivers.devices import Pose
+from brushloop.collect.rig.devices import Rig, limits_of
+from brushloop.collect.rig.paper import PaperPlane, Patch, to_base, to_paper
+from brushloop.drivers.devices import Frame, Pose, QueuedLine
 from brushloop.drivers.geometry import brush_pose, interpolate, lean
 from brushloop.sessions.records import Condition
 
@@ -32,9 +36,14 @@ class Move:
     least_s: float = 0.0
     """Minimum duration."""
 
+    @property
+    def poses(self) -> tuple[Pose]:
+        """The target."""
+        return (self.target,)
+
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class Path:
     """Poses to pass through without a halt."""
 
     poses: list[Pose]
@@ -42,7 +51,7 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class Region:
     """The outermost poses of the region in which a touch that decides by itself may move the upright brush."""
 
     poses: tuple[Pose, ...]
@@ -53,7 +62,7 @@ class Room:
     @classmethod
     def over(
         cls, config: RigConfig, rect_mm: tuple[float, float, float, float], lowest_z_mm: float, speed_mm_s: float
-    ) -> Room:
+    ) -> Region:
         """The region over a rectangle of the sheet (x, y, width, height), which may be a point, up to travel height."""
         x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
         places = dict.fromkeys((x, y) for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm))
@@ -61,19 +70,9 @@ class Room:
         return cls(tuple(touching(config, *place, z_mm) for z_mm in heights for place in places), speed_mm_s)
 
 
-Part = Move | Way | Room
-
-
-def commanded(parts: Iterable[Part]) -> list[tuple[Pose, float]]:
-    """Every pose with its speed in mm/s; of a `Room`, the outermost poses."""
-    found: list[tuple[Pose, float]] = []
-    for part in parts:
-        match part:
-            case Move():
-                found.append((part.target, part.speed_mm_s))
-            case Way() | Room():
-                found += [(pose, part.speed_mm_s) for pose in part.poses]
-    return found
+Segment = Move | Path | Region
+Dip = Callable[[], Awaitable[None]]
+"""Fills the brush; begins and ends at travel height."""
 
 
 # Travel and photographs
@@ -174,23 +173,9 @@ def press_moves(
     return before, pressing
 
 
-@dataclass(frozen=True, slots=True)
-class StrokeMoves:
-    """One drawn stroke: single moves to its first point, the way through the others, single moves up from the last."""
-
-    down: list[Move]
-    way: Way
-    up: list[Move]
-
-    @property
-    def parts(self) -> list[Part]:
-        """All moves in order."""
-        return [*self.down, self.way, *self.up]
-
-
 def stroke_moves(
     config: RigConfig, plane: PaperPlane, patch: Patch, points: Sequence[TrajectoryPoint], speed_mm_s: float
-) -> StrokeMoves:
+) -> list[Move | Path]:
     """Over the first point with the wrist turned as the stroke begins, tilt just above the paper, land, follow, lift.
 
     Points are in the patch's frame: origin at its lower left corner, axes along the sheet's.
@@ -210,19 +195,17 @@ def stroke_moves(
 
     first, *rest = points
     last = points[-1]
-    down = [
+    return [
         # The wrist turns during the approach, while the upright brush turns about its own axis.
         Move(high(first), motion.travel_speed_mm_s),
         Move(at(first, clear(first), 0.0), motion.travel_speed_mm_s),
         # The tip stays in place while the brush turns about it: ARCS then reads mm/s as thousandths of rad/s.
         Move(at(first, clear(first), first[3]), motion.travel_speed_mm_s),
         Move(at(first, -first[2], first[3]), motion.press_speed_mm_s),
-    ]
-    lifted = [
+        Path([at(point, -point[2], point[3]) for point in rest], speed_mm_s),
         Move(at(last, clear(last), last[3]), motion.press_speed_mm_s),
         Move(high(last), motion.travel_speed_mm_s),
     ]
-    return StrokeMoves(down, Way([at(point, -point[2], point[3]) for point in rest], speed_mm_s), lifted)
 
 
 # Touches
@@ -243,15 +226,10 @@ def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
     return Move(upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.press_speed_mm_s)
 
 
-def lift(config: RigConfig, here: Pose) -> list[Move]:
+def lift_moves(config: RigConfig, here: Pose) -> list[Move]:
     """Straight up to travel height from wherever the tip is; no move if it is there already."""
     high = Pose(here.x_mm, here.y_mm, config.motion.safe_z_mm, *here.quaternion)
     return [Move(high, config.motion.press_speed_mm_s)] if here.z_mm < config.motion.safe_z_mm else []
-
-
-def zero_touch_moves(config: RigConfig) -> list[Move]:
-    """To the taught height at the touch point."""
-    return visit_moves(config, PaperPlane(config.paper.touch_z_mm), *config.paper.touch_point_mm)
 
 
 def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
@@ -289,3 +267,156 @@ def upright(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
 
 def _upright_in_base(config: RigConfig, x_mm: float, y_mm: float, z_mm: float) -> Pose:
     return brush_pose(x_mm, y_mm, z_mm, heading_deg=config.paper.yaw_deg)
+
+
+DEPTH_TOLERANCE_MM = 0.1
+"""How far the depth at the end of the dwell may be from the requested one."""
+TOUCH_TOLERANCE_MM = 0.1
+"""How far the arm may rest from the taught height at zero touch."""
+THERE_MM = 0.1
+"""How far from the beginning of a dip the arm counts as being there."""
+
+
+class Procedures:
+    """Carries out the moves of each step on the devices of a rig. Every procedure begins and ends at safe height."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self._config = rig.config
+        self.plane = PaperPlane(rig.config.paper.touch_z_mm)
+        """Level, at the taught height, until touches have measured it."""
+        self._dips = 0
+        over = over_sheet_move(rig.config)
+        self.photographer = Photographer(
+            rig.robot,
+            rig.camera,
+            rig.config.camera,
+            rig.clock,
+            ArmTrips(
+                over_mm=over.target.position_mm,
+                park_mm=rig.config.motion.park_mm,
+                over=lambda: self.go(over),
+                park=self.park,
+                over_sheet=self._over_sheet,
+            ),
+        )
+
+    async def go(self, *moves: Move) -> None:
+        """Make moves one after the other, each when the arm rests after the one before."""
+        for move in moves:
+            acc_mm_s2 = self._config.motion.acc_mm_s2
+            await self.rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
+
+    async def queue(self, moves: Iterable[Move]) -> list[Pose]:
+        """Send all moves to the controller before the first begins; it then ends them whatever happens to this program.
+
+        Returns the poses that were seen meanwhile.
+        """
+        lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in moves]
+        return await self.rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
+
+    async def retreat(self) -> None:
+        """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
+        here = await self.rig.robot.take_up()
+        limits_of(self._config).check_start("robot", here)
+        await self.go(*retreat_moves(self._config, here))
+
+    async def visit(self, plane: PaperPlane, x_mm: float, y_mm: float) -> float:
+        """Go slowly down to where `plane` has the surface; returns the height at which the arm rests, in mm."""
+        *down, up = visit_moves(self._config, plane, x_mm, y_mm)
+        await self.go(*down)
+        rests_mm = (await self.rig.robot.where()).z_mm
+        await self.go(up)
+        return rests_mm
+
+    async def zero_touch(self) -> float:
+        """Visit the taught touch height at the touch point; returns the height at which the arm rests, in mm.
+
+        This confirms that the arm reaches the height that the operator taught. It does not measure the paper. Raises
+        `StepVoid` if the arm rests elsewhere.
+        """
+        paper = self._config.paper
+        rests_mm = await self.visit(PaperPlane(paper.touch_z_mm), *paper.touch_point_mm)
+        off_mm = rests_mm - paper.touch_z_mm
+        if abs(off_mm) > TOUCH_TOLERANCE_MM:
+            raise StepVoid(f"zero touch rests {off_mm:+.3f} mm from the taught height; limit {TOUCH_TOLERANCE_MM} mm")
+        return rests_mm
+
+    async def approach(self, x_mm: float, y_mm: float, z_mm: float) -> None:
+        """Go over a point of the sheet, then down to where a slow approach begins."""
+        await self.go(over(self._config, x_mm, y_mm), near(self._config, x_mm, y_mm, z_mm))
+
+    async def lower(self, x_mm: float, y_mm: float, z_mm: float, speed_mm_s: float) -> float:
+        """Go to a height over a point of the sheet; returns the height at which the arm rests, in mm."""
+        await self.go(Move(touching(self._config, x_mm, y_mm, z_mm), speed_mm_s))
+        return (await self.rig.robot.where()).z_mm
+
+    async def lift(self) -> None:
+        """Go straight up to travel height from wherever the tip is."""
+        await self.go(*lift_moves(self._config, await self.rig.robot.where()))
+
+    @contextlib.asynccontextmanager
+    async def lifted_after(self) -> AsyncGenerator[None]:
+        """Lift at the end and after an error, unless the arm is at fault. After a stop the arm stays where it is."""
+        try:
+            yield
+        except Exception as error:
+            if arm_at_fault(error):
+                raise
+            try:
+                await self.lift()
+            except Exception as trouble:
+                error.add_note(f"The brush could not be lifted: {trouble}")
+            raise
+        await self.lift()
+
+    async def set_out(self) -> None:
+        """Go to where the next dip or wash begins, at travel height."""
+        await self.go(inking_moves(self._config, self._dips)[0])
+
+    async def dip(self) -> None:
+        """Dip into the well and wipe; wash first if a wash is due. After `set_out` the arm is there already."""
+        first, *moves = inking_moves(self._config, self._dips)
+        if math.dist((await self.rig.robot.where()).position_mm, first.target.position_mm) > THERE_MM:
+            moves.insert(0, first)
+        await self.go(*moves)
+        self._dips += 1
+
+    async def press(self, patch: Patch, condition: Condition, dwell_s: float) -> float:
+        """Press once; returns the depth reached below the paper along its normal, in mm."""
+        before, pressing = press_moves(self._config, self.plane, patch, condition, dwell_s)
+        await self.go(*before)
+        seen = await self.queue(pressing)
+        reached_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
+        if abs(reached_mm - condition.depth_mm) > DEPTH_TOLERANCE_MM:
+            raise StepVoid(f"the depth was {reached_mm:.3f} mm, {condition.depth_mm:g} mm was commanded")
+        return reached_mm
+
+    async def stroke(self, patch: Patch, drawn: Drawn, number: int) -> float:
+        """Draw stroke `number`, from 0, of a figure whose poses were checked; begins and ends at safe height.
+
+        Returns the depth at which the brush landed, in mm.
+        """
+        robot, acc_mm_s2, depth_mm = self.rig.robot, self._config.motion.acc_mm_s2, 0.0
+        for segment in stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s):
+            if isinstance(segment, Move):
+                await self.go(segment)
+            else:
+                depth_mm = -self.plane.above_mm(self._config.paper, await robot.where())
+                poses, speed_mm_s = segment.poses, segment.speed_mm_s
+                await robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=drawn.blend_mm)
+        return depth_mm
+
+    async def capture(self) -> Frame:
+        """Park, and return the first frame exposed after the camera has shown the arm gone."""
+        return await self.photographer.photograph()
+
+    async def park(self) -> None:
+        """Go out of the camera's view."""
+        await self.go(*park_moves(self._config))
+
+    async def _over_sheet(self) -> bool:
+        here = await self.rig.robot.where()
+        x_mm, y_mm = to_paper(self._config.paper, here.x_mm, here.y_mm)
+        size_x_mm, size_y_mm = self._config.paper.size_mm
+        return 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
