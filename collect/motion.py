@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from brushloop.collect.errors import StepVoid, arm_at_fault
@@ -285,6 +285,8 @@ class Procedures:
         self._config = rig.config
         self.plane = PaperPlane(rig.config.paper.touch_z_mm)
         """Level, at the taught height, until touches have measured it."""
+        self.target_mm: tuple[float, float, float] | None = None
+        """Where the arm was last sent; for a press, its deepest point."""
         self._dips = 0
         over = over_sheet_move(rig.config)
         self.photographer = Photographer(
@@ -303,15 +305,17 @@ class Procedures:
 
     async def go(self, *moves: Move) -> None:
         """Make moves one after the other, each when the arm rests after the one before."""
+        acc_mm_s2 = self._config.motion.acc_mm_s2
         for move in moves:
-            acc_mm_s2 = self._config.motion.acc_mm_s2
+            self.target_mm = move.target.position_mm
             await self.rig.robot.move(move.target, speed_mm_s=move.speed_mm_s, acc_mm_s2=acc_mm_s2)
 
-    async def queue(self, moves: Iterable[Move]) -> list[Pose]:
+    async def queue(self, moves: Sequence[Move]) -> list[Pose]:
         """Send all moves to the controller before the first begins; it then ends them whatever happens to this program.
 
         Returns the poses that were seen meanwhile.
         """
+        self.target_mm = min((move.target.position_mm for move in moves), key=lambda at: at[2], default=None)
         lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in moves]
         return await self.rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
 
@@ -404,6 +408,7 @@ class Procedures:
             else:
                 depth_mm = -self.plane.above_mm(self._config.paper, await robot.where())
                 poses, speed_mm_s = segment.poses, segment.speed_mm_s
+                self.target_mm = poses[-1].position_mm
                 await robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=drawn.blend_mm)
         return depth_mm
 

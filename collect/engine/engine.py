@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from brushloop.collect.engine.control import FINAL, RunControl, State
-from brushloop.collect.engine.live import LiveView, Telemetry, noting_targets, previewing, watching
+from brushloop.collect.engine.live import LiveView, Telemetry, previewing, watching
 from brushloop.collect.engine.policy import board_first, resume_question
 from brushloop.collect.engine.progress import Progress
 from brushloop.collect.engine.run import Run
@@ -103,6 +103,7 @@ class Engine:
         self._task: asyncio.Task[None] | None = None
         self._stopper: asyncio.Task[None] | None = None
         self._rig: Rig | None = None
+        self._procedures: Procedures | None = None
         self._store: SessionStore | None = None
         self._stop_failure: DeviceError | None = None
         self._rest_unknown = False
@@ -139,8 +140,11 @@ class Engine:
         if force_n is not None:
             self._telemetry.note_force(force_n, self._clock.now_ns())
         return replace(
-            self._progress.snapshot(state, tip_mm, force_n, self._asker.prompt),
-            target_mm=self._telemetry.target_mm,
+            self._progress.snapshot(state),
+            tip_mm=tip_mm,
+            force_n=force_n,
+            prompt=self._asker.prompt,
+            target_mm=None if self._procedures is None else self._procedures.target_mm,
             parked=self._parked(),
             rest_unknown=self._rest_unknown,
             trace_n=self._telemetry.trace_n(),
@@ -243,7 +247,6 @@ class Engine:
     async def _session(self) -> None:
         self._progress.doing("connect")
         async with connected(self._rig_config, self._clock, self._progress.log) as rig:
-            rig = replace(rig, robot=noting_targets(rig.robot, self._telemetry))
             self._rig = rig
             await self._permitted(rig)
             store = self._store = self._open_store(rig)
@@ -300,12 +303,13 @@ class Engine:
             self._control.go_on()
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
+        self._procedures = Procedures(rig)
         context = RunContext(
             rig,
             store,
             self._progress,
             self._asker,
-            Procedures(rig),
+            self._procedures,
             sheet_of(self._rig_config, self._protocol_config),
             self._protocol_config,
             self._requests,

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from brushloop.calibrate.stroke import Gray
 
 FIELD = Field()
+FINE = 8
+"""Points per pixel and axis at which the model's mark is evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +65,15 @@ def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | Non
     A brush of which only radius and length are given leaves the mark of CCD-BSM as published.
     """
     left, top = FIELD.anchor_mm
-    centres_mm = (np.arange(SIZE_PX) + 0.5) * FIELD.mm_per_px
+    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
     try:
-        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres_mm - left, np.float64))
+        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres - left, np.float64))
     except ValueError:
         return None
-    up_mm = (top - centres_mm)[:, None]
+    up_mm = (top - centres)[:, None]
     edge_mm = np.asarray(np.where(up_mm > 0.0, upper, lower), np.float64)
-    return np.asarray(np.abs(up_mm) <= edge_mm)
+    fine = np.abs(up_mm) <= edge_mm
+    return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
 
 
 def cell_raster(image: Gray, plane: Plane, patch: Patch) -> tuple[Gray, tuple[float, float], tuple[int, int, int, int]]:

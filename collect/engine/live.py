@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable
 from typing import TYPE_CHECKING, Any, cast
 
 import cv2
@@ -21,7 +21,7 @@ from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.quality.measure import blur_px
 from brushloop.collect.rig.optics import gray
-from brushloop.drivers.devices import Camera, ForceSample, Frame, Pose, QueuedLine, Robot, Stamp
+from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.mcap_writer import Outgoing, channel_of, encoded
@@ -48,8 +48,6 @@ class Telemetry:
     """Newest values. Each write is short, and none waits for a reader."""
 
     def __init__(self) -> None:
-        self.target_mm: tuple[float, float, float] | None = None
-        """Where the arm was last sent."""
         self.tip_mm: tuple[float, float, float] | None = None
         """Where the brush tip was last seen, however long ago."""
         self.picture: Picture | None = None
@@ -75,34 +73,6 @@ class Telemetry:
         """Peak force of each tenth of a second, oldest first."""
         with self._lock:
             return tuple(self._peaks)
-
-
-def noting_targets(robot: Robot, telemetry: Telemetry) -> Robot:
-    """Return the same robot, with its targets noted in `telemetry`."""
-    return cast("Robot", _NotedRobot(robot, telemetry))
-
-
-class _NotedRobot:
-    """Notes targets; passes every method without a target on to the robot."""
-
-    def __init__(self, robot: Robot, telemetry: Telemetry) -> None:
-        self._robot = robot
-        self._telemetry = telemetry
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._robot, name)
-
-    async def move(self, target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
-        self._telemetry.target_mm = target.position_mm
-        await self._robot.move(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-
-    async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
-        self._telemetry.target_mm = poses[-1].position_mm if poses else None
-        await self._robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
-
-    async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
-        self._telemetry.target_mm = min((line.target.position_mm for line in lines), key=lambda at: at[2], default=None)
-        return await self._robot.sequence(lines, acc_mm_s2=acc_mm_s2)
 
 
 @contextlib.asynccontextmanager

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +20,7 @@ from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, InkConfig, RigConf
 from brushloop.collect.rig.devices import Rig
 from brushloop.drivers.devices import Identity
 from brushloop.drivers.host import Clock
-from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, check_folder, holds, read_bounded
+from brushloop.sessions.disk import MAX_SNAPSHOT_BYTES, check_folder, read_bounded
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
@@ -29,13 +28,10 @@ from brushloop.sessions.records import Header, Source
 from brushloop.sessions.store import SessionStore
 
 RIG_EFFECTIVE, PROTOCOL_EFFECTIVE = "rig.effective.json", "protocol.effective.json"
-COMPARED = (RIG_EFFECTIVE, PROTOCOL_EFFECTIVE)
-FILES = {RIG_EFFECTIVE: "rig.toml", PROTOCOL_EFFECTIVE: "protocol.toml"}
-"""Name by which the user knows each compared file. Its values are compared, environment and side files included."""
-OPTIONS = {"rig.toml": "--config", "protocol.toml": "--protocol"}
+COMPARED = {RIG_EFFECTIVE: "rig.toml", PROTOCOL_EFFECTIVE: "protocol.toml"}
+"""Files whose values are compared, environment and side files included, and the names by which users know them."""
 MOST_SHOWN = 5
 """Most differences that are listed; with more, the advice below them would not fit on a screen of 24 lines."""
-SIDE_FILE = re.compile(r"^\s*(lens_)?file\s*=|\{\s*file\s*=", re.MULTILINE)
 MACHINE_NAMES = {
     "robot": {"host", "port", "rtde_port"},
     "camera": {"source"},
@@ -45,8 +41,6 @@ MACHINE_NAMES = {
 """Fields that may differ between two runs of one session: where the devices are, not what they do."""
 CLEAR_MM = 5.0
 """Least distance of the tip from the paper at the deepest point of a dry run."""
-ABSENT = object()
-"""Placeholder for the value of a field that one of the two configurations does not have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,11 +150,17 @@ def find_resumable(opening: Opening) -> Path | None:
     else:
         folders = [] if opening.new else open_sessions(opening.root)
     for folder in reversed(folders):
-        found = differences(folder, {name: opening.as_begun(folder).snapshots[name] for name in COMPARED})
-        if not found:
+        changes = differences(folder, opening.as_begun(folder).snapshots)
+        if not changes:
             return folder
-        given = {"rig.toml": opening.rig_path, "protocol.toml": opening.protocol_path}
-        refusals.append(_changed(folder, found, given, {name: opening.snapshots[name] for name in given}))
+        if len(changes) > MOST_SHOWN:
+            changes[MOST_SHOWN - 1 :] = [f"and {len(changes) - MOST_SHOWN + 1} more"]
+        way_out = (
+            f"Go on as it was begun: --config {folder / 'rig.toml'} --protocol {folder / 'protocol.toml'}, beside the "
+            "files that they name, in the same environment; or start a new session with --new."
+        )
+        what = "\n".join(["was begun with another configuration:", *changes, way_out])
+        refusals.append(ConfigError(folder, "", what))
     if refusals:
         raise refusals[0]
     check_fresh_sheet(opening.root, opening.sheet)
@@ -189,110 +189,38 @@ def check_fresh_sheet(root: Path, sheet: int | None) -> None:
         raise ConfigError("--sheet", "", f"{sheet}: a new session begins with sheet 1")
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """One changed field, or a whole list if its length changed; `field` is empty if the file cannot be compared."""
+def differences(folder: Path, snapshots: Mapping[str, str]) -> list[str]:
+    """What differs between the session's configuration and `snapshots` (file name -> text), a line for each value.
 
-    file: str
-    field: tuple[str, ...]
-    """Path of the field in the file: names, and indices of list items from 0."""
-    old: Any
-    new: Any
-
-    def __str__(self) -> str:
-        """Text such as `paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`."""
-        if not self.field:
-            return "its earlier content is missing or damaged"
-        return f"{'.'.join(self.field)}: {_short(self.old)} -> {_short(self.new)}"
-
-
-def differences(folder: Path, snapshots: Mapping[str, str]) -> list[Difference]:
-    """Compare the session's JSON files with `snapshots` (file name -> text); empty if nothing changed."""
-    found: list[Difference] = []
-    for name, text in snapshots.items():
-        try:
-            old = json.loads(read_bounded(folder / name, MAX_SNAPSHOT_BYTES))
-        except (InputError, ValueError, RecursionError):
-            found.append(Difference(name, (), ABSENT, ABSENT))
-        else:
-            found += _compared(name, (), old, json.loads(text))
-    return found
-
-
-def _compared(file: str, at: tuple[str, ...], old: Any, new: Any) -> Iterator[Difference]:
-    if isinstance(old, dict) and isinstance(new, dict):
-        before, after = cast("dict[str, Any]", old), cast("dict[str, Any]", new)
-        for name in {**after, **before}:
-            yield from _compared(file, (*at, name), before.get(name, ABSENT), after.get(name, ABSENT))
-    elif len(before := _tables(old)) == len(after := _tables(new)) > 0:
-        for number, (one, other) in enumerate(zip(before, after, strict=True)):
-            yield from _compared(file, (*at, str(number)), one, other)
-    elif old != new:
-        yield Difference(file, at, old, new)
-
-
-def _tables(value: Any) -> list[Any]:
-    """Items of a list of tables; an empty list for any other value."""
-    items = cast("list[Any]", value) if isinstance(value, list) else []
-    return items if any(isinstance(item, dict) for item in items) else []
-
-
-def _short(value: Any) -> str:
-    if value is ABSENT:
-        return "missing"
-    if value is None:
-        return "left out"
-    if items := _tables(value):
-        return f"{len(items)} items" if len(items) > 1 else "1 item"
-    if isinstance(value, dict):
-        return "given"
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 40 else f"{text[:37]}..."
-
-
-def _changed(folder: Path, found: Sequence[Difference], given: dict[str, Path], texts: dict[str, str]) -> ConfigError:
-    """The refusal to resume a session with another configuration: each difference on a line, then what to do.
-
-    `given` and `texts` are paths and contents of this run's `rig.toml` and `protocol.toml`.
+    A line is such as `rig.toml: paper.cell_mm: [80.0, 80.0] -> [40.0, 24.0]`; items of a list are numbered from 0, and
+    a value from the environment has the name of its variable behind it.
     """
-    environment = overrides()
     lines: list[str] = []
-    variables: list[str] = []
-    for one in found:
-        variable = environment.get(one.field) if FILES[one.file] == "rig.toml" else None
-        variables += [variable] if variable else []
-        lines.append(f"{FILES[one.file]}: {one}{f' (by {variable})' if variable else ''}")
-    if len(lines) > MOST_SHOWN:
-        lines[MOST_SHOWN - 1 :] = [f"and {len(lines) - MOST_SHOWN + 1} more"]
-    differing = {FILES[one.file] for one in found}
-    options = [
-        _option(folder / name, given[name])
-        for name, text in texts.items()
-        if name in differing and (folder / name).is_file() and not holds(folder / name, text.encode())
-    ]
-    old = " ".join(options)
-    if variables:
-        old += f"{' ' if old else ''}without {' and '.join(variables)} in the environment"
-    if any(_of_this_version(one, found) for one in found):
-        old += f"{' ' if old else ''}with the brushloop that began it, whose files had other fields"
-    elif not old:
-        old = "with the environment, and the files that it names, as they were then"
-    way_out = f"Go on with the old one: {old}; or start a new session with --new."
-    return ConfigError(folder, "", "\n".join(["was begun with another configuration:", *lines, way_out]))
+    for file, name in COMPARED.items():
+        try:
+            old = dict(_values(json.loads(read_bounded(folder / file, MAX_SNAPSHOT_BYTES))))
+        except (InputError, ValueError, RecursionError):
+            lines.append(f"{name}: its earlier content is missing or damaged")
+            continue
+        new = dict(_values(json.loads(snapshots[file])))
+        variables = overrides() if file == RIG_EFFECTIVE else {}
+        for field in {**new, **old}:
+            before, after = old.get(field, "left out"), new.get(field, "left out")
+            if before != after:
+                by = f" (by {variables[field]})" if field in variables else ""
+                lines.append(f"{name}: {'.'.join(field)}: {before:.40} -> {after:.40}{by}")
+    return lines
 
 
-def _of_this_version(one: Difference, found: Sequence[Difference]) -> bool:
-    """Whether the software version alone explains `one`: one side has no such field, in a table of the same kind."""
-    kind = (*one.field[:-1], "kind")
-    known = ABSENT not in (one.old, one.new)
-    return bool(one.field) and not known and not any((o.file, o.field) == (one.file, kind) for o in found)
-
-
-def _option(old: Path, given: Path) -> str:
-    """The option that names the old file. A file that names side files must be copied next to them first."""
-    text = read_bounded(old, MAX_SNAPSHOT_BYTES).decode("utf-8", "replace")
-    beside = f" (copied beside {given}: it names other files)" if SIDE_FILE.search(text) else ""
-    return f"{OPTIONS[old.name]} {old}{beside}"
+def _values(value: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    """(path of a field, its value as JSON) for everything in tables and lists of tables that is not left out."""
+    if isinstance(value, list) and any(isinstance(item, dict) for item in cast("list[Any]", value)):
+        value = {str(number): item for number, item in enumerate(cast("list[Any]", value))}
+    if isinstance(value, dict):
+        for name, item in cast("dict[str, Any]", value).items():
+            yield from _values(item, (*at, name))
+    elif value is not None:
+        yield at, json.dumps(value, ensure_ascii=False)
 
 
 def put_in_sheet(store: SessionStore, sheet: int | None) -> None:

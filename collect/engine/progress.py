@@ -12,7 +12,6 @@ from pathlib import Path
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.last_capture import LastCapture
 from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
-from brushloop.collect.operator import Prompt
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.protocols.plan import Planned, with_review
 from brushloop.collect.protocols.steps import CaptureStep, DipStep, DrawStep, PressStep, Step
@@ -130,13 +129,7 @@ class Progress:
             self._over_ns = self._clock.now_ns()
         self.log(text)
 
-    def snapshot(
-        self,
-        state: State,
-        tip_mm: tuple[float, float, float] | None,
-        force_n: float | None = None,
-        prompt: Prompt | None = None,
-    ) -> Snapshot:
+    def snapshot(self, state: State) -> Snapshot:
         """One consistent snapshot; values that only the engine knows keep their defaults."""
         with self._lock:
             tally, store = self._tally, self._store
@@ -155,9 +148,6 @@ class Progress:
                 given_up=tally.left_out.total(),
                 elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
                 eta_s=tally.eta_s(),
-                tip_mm=tip_mm,
-                force_n=force_n,
-                prompt=prompt,
                 ink_level=tally.ink_level,
                 messages=tuple(self._messages),
                 error=self._error,

@@ -93,12 +93,12 @@ class Snapshot:
     elapsed_s: float
     eta_s: float | None
     """Remaining time in seconds; None until a stroke has been timed."""
-    tip_mm: tuple[float, float, float] | None
-    """Position of the brush tip; None while the arm sends no fresh pose."""
     messages: tuple[str, ...]
     """The newest lines of the log, oldest first."""
     error: str
     """Why the run failed or stopped; empty otherwise."""
+    tip_mm: tuple[float, float, float] | None = None
+    """Position of the brush tip; None while the arm sends no fresh pose."""
     given_up: int = 0
     """Strokes that were left out, because every take was bad or the operator asked for it."""
     force_n: float | None = None

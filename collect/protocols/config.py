@@ -50,10 +50,6 @@ def load_protocol(path: Path) -> ProtocolConfig:
     for name in ("presses", "points", "ignored_columns"):
         if name in values and "file" in values:
             raise ConfigError(path, name, "a file is named too: give only one of the two")
-    if values.get("kind") == "adaptive":
-        raise ConfigError(
-            path, "kind", "'adaptive' is no longer a protocol: use 'few-strokes' with depths_mm and tilts_deg"
-        )
     kind = _KINDS.get(str(values.get("kind")))
     if kind is WriteConfig:
         _fill_strokes(path, values)
@@ -105,7 +101,6 @@ def _tables(value: object) -> list[dict[str, Any]]:
 
 
 MAX_TABLE_BYTES = 4 * 1024 * 1024
-MAX_COLUMNS = 100
 _R = TypeVar("_R", bound=BaseModel)
 
 
@@ -117,61 +112,35 @@ def read_rows(
     The first line names the columns; an empty cell counts as left out. `field` is where the protocol names the file.
     Raises `ConfigError`.
     """
-    path = _beside(protocol, field, name)
+    if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
+        raise ConfigError(protocol, field, f"must be the plain name of a file next to it (given: {name!r:.80})")
+    path = protocol.parent / name
     lines = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig"), newline=""), strict=True)
     rows: list[_R] = []
     try:
-        header = _header(path, next(lines, list[str]()), row, ignore_others=ignore_others)
-        for cells in lines:
-            if not cells:
-                continue
+        columns = [EARLIER_NAMES.get(cell.strip(), cell.strip()) for cell in next(lines, list[str]())]
+        for column in columns:
+            if columns.count(column) > 1:
+                raise ConfigError(path, "line 1", f"the column {column!r:.80} occurs twice")
+        used = row.model_fields if ignore_others else columns
+        for cells in filter(None, lines):
+            line = f"line {lines.line_num}"
             if len(rows) == at_most:
-                raise ConfigError(path, f"line {lines.line_num}", f"more than {at_most} rows")
-            if len(cells) != len(header):
-                raise ConfigError(path, f"line {lines.line_num}", f"{len(cells)} cells under {len(header)} columns")
-            values = {
-                column: as_text(cell.strip())
-                for column, cell in zip(header, cells, strict=True)
-                if column in row.model_fields and cell.strip()
-            }
-            rows.append(_checked(path, lines.line_num, row, values))
+                raise ConfigError(path, line, f"more than {at_most} rows")
+            if len(cells) != len(columns):
+                raise ConfigError(path, line, f"{len(cells)} cells under {len(columns)} columns")
+            texts = {column: as_text(cell.strip()) for column, cell in zip(columns, cells, strict=True)}
+            values = {column: _value(column, text) for column, text in texts.items() if column in used and text}
+            try:
+                rows.append(row.model_validate(values, strict=True))
+            except ValidationError as error:
+                refused = refusal(path, error, row)
+                raise ConfigError(path, f"{line}: {refused.field}", refused.what) from None
     except csv.Error as error:
         raise ConfigError(path, f"line {lines.line_num}", f"is not CSV: {error}") from None
     if not rows:
         raise ConfigError(path, "", "has no rows")
-    return tuple(rows), tuple(column for column in header if column not in row.model_fields)
-
-
-def _beside(protocol: Path, field: str, name: object) -> Path:
-    if not isinstance(name, str) or not name or Path(name).name != name or not name.isprintable() or "\\" in name:
-        raise ConfigError(protocol, field, f"must be the plain name of a file next to it (given: {name!r:.80})")
-    return protocol.parent / name
-
-
-def _header(path: Path, cells: list[str], row: type[BaseModel], *, ignore_others: bool) -> list[str]:
-    columns = [EARLIER_NAMES.get(cell.strip(), cell.strip()) for cell in cells]
-    known = list(row.model_fields)
-    if len(columns) > MAX_COLUMNS:
-        raise ConfigError(path, "line 1", f"{len(columns)} columns, at most {MAX_COLUMNS}")
-    for column in columns:
-        if not column or len(column) > 60 or not column.isprintable():
-            raise ConfigError(path, "line 1", f"{column!r:.80} is not a valid column name")
-        if columns.count(column) > 1:
-            raise ConfigError(path, "line 1", f"the column {column} occurs twice")
-        if column not in known and not ignore_others:
-            raise ConfigError(path, "line 1", f"unknown column {column}; known are {', '.join(known)}")
-    for column, info in row.model_fields.items():
-        if info.is_required() and column not in columns:
-            raise ConfigError(path, "line 1", f"the column {column} is missing")
-    return columns
-
-
-def _checked(path: Path, line: int, row: type[_R], values: dict[str, str]) -> _R:
-    try:
-        return row.model_validate({name: _value(name, cell) for name, cell in values.items()}, strict=True)
-    except ValidationError as error:
-        refused = refusal(path, error, row)
-        raise ConfigError(path, f"line {line}: {refused.field}", refused.what) from None
+    return tuple(rows), tuple(column for column in columns if column not in row.model_fields)
 
 
 def _value(column: str, cell: str) -> str | float:

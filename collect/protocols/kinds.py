@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -19,12 +19,10 @@ from brushloop.collect.protocols.plan import (
     Repeats,
     Seed,
     StrokeId,
-    check_axes,
     check_count,
     check_distinct,
     numbered,
     shuffled,
-    stroke_id_problem,
 )
 from brushloop.collect.protocols.steps import (
     BoardStep,
@@ -43,29 +41,43 @@ from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.records import Condition
 
 
-class GridConfig(ProtocolBase):
+class _DesignConfig(ProtocolBase):
+    """Presses of a grid of depths and tilts."""
+
+    depths_field: ClassVar[str] = "depths_mm"
+
+    depths_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    """Depths H below the touch height."""
+    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
+    """Tilts alpha from the paper's normal."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth."""
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        check_distinct("depths_mm", self.depths_mm)
+        check_distinct("tilts_deg", self.tilts_deg)
+        return self
+
+    def _press(self, condition: Condition, repeat: int) -> Planned:
+        name = f"H{condition.depth_mm:g}-a{condition.tilt_deg:g}-r{repeat:02d}"
+        return Planned(name, condition, repeat, dwell_s=self.dwell_s)
+
+
+class GridConfig(_DesignConfig):
     """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`.
 
     Where the layout of the sheet is known, the order also spreads each (H, alpha) over the sheet (`protocols.plan`).
     """
 
-    depths_field: ClassVar[str] = "depths_mm"
-
     kind: Literal["grid"]
-    depths_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
-    """Depths H below the touch height."""
-    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
-    """Tilts alpha from the paper's normal."""
     repeats: Repeats = 10
     """Rounds: each holds every (H, alpha) once."""
     seed: Seed = 1
     """Seed of the order."""
-    dwell_s: DwellS = 0.2
-    """Time at full depth."""
 
     @model_validator(mode="after")
-    def _distinct(self) -> GridConfig:
-        check_axes(self.depths_mm, self.tilts_deg)
+    def _bounded(self) -> Self:
         check_count(len(self.depths_mm) * len(self.tilts_deg) * self.repeats)
         return self
 
@@ -76,47 +88,55 @@ class GridConfig(ProtocolBase):
         also spread over the sheet, which does the same for unevenness of the paper or of the camera's view.
         """
         rng = random.Random(self.seed)
-        cells = [(h, a) for h in self.depths_mm for a in self.tilts_deg]
+        conditions = [Condition(h, a) for h in self.depths_mm for a in self.tilts_deg]
         rounds: list[list[Planned]] = []
         for repeat in range(1, self.repeats + 1):
-            rng.shuffle(cells)
-            rounds.append(
-                [
-                    Planned(f"H{h:g}-a{a:g}-r{repeat:02d}", Condition(h, a), repeat, dwell_s=self.dwell_s)
-                    for h, a in cells
-                ]
-            )
+            rng.shuffle(conditions)
+            rounds.append([self._press(condition, repeat) for condition in conditions])
         return numbered(rounds, self.seed, layout)
 
 
-class FewStrokesConfig(ProtocolBase):
+class FewStrokesConfig(_DesignConfig):
     """A few presses of a grid that tell most about a brush: each (H, alpha) as far as possible from those before it."""
 
-    depths_field: ClassVar[str] = "depths_mm"
-
     kind: Literal["few-strokes"]
-    depths_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
-    """Depths H below the touch height."""
-    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
-    """Tilts alpha from the paper's normal."""
     strokes: Annotated[int, Field(ge=1, le=MAX_STROKES)] = 9
     """Number of presses. After every (H, alpha) once, the same order begins again."""
-    dwell_s: DwellS = 0.2
-    """Time at full depth."""
-
-    @model_validator(mode="after")
-    def _distinct(self) -> FewStrokesConfig:
-        check_axes(self.depths_mm, self.tilts_deg)
-        return self
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """The presses in the order of the design, which does not depend on the sheet."""
-        order = spread_out(self.depths_mm, self.tilts_deg)
-        return [
-            Planned(f"H{h:g}-a{a:g}-r{repeat + 1:02d}", Condition(h, a), repeat + 1, number, dwell_s=self.dwell_s)
-            for number in range(self.strokes)
-            for repeat, (h, a) in [(number // len(order), order[number % len(order)])]
-        ]
+        order = [Condition(h, a) for h, a in spread_out(self.depths_mm, self.tilts_deg)]
+        rounds = math.ceil(self.strokes / len(order))
+        presses = [self._press(condition, repeat) for repeat in range(1, rounds + 1) for condition in order]
+        return numbered([presses[: self.strokes]], None, None)
+
+
+class _TableConfig(ProtocolBase):
+    """Presses one by one, from a CSV next to `protocol.toml` or written out in it as `presses`."""
+
+    file: FileName | None = None
+    """CSV with a column for each field of a press."""
+    repeats: Repeats = 1
+    """Rounds: each holds every press once."""
+    seed: Seed | None = None
+    """Shuffles each round; if left out, the order is that of the list."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth of presses that have no `dwell_s` of their own."""
+
+    @model_validator(mode="after")
+    def _named_apart(self) -> Self:
+        check_count(len(self.round(1)) * self.repeats)
+        check_distinct("presses", [stroke.stroke_id for stroke in self.planned()])
+        return self
+
+    def round(self, repeat: int) -> list[Planned]:
+        """The presses of round `repeat`, counted from 1, in the order of the list."""
+        raise NotImplementedError
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every press `repeats` times, in rounds; shuffled and balanced over the sheet where there is a seed."""
+        rounds = [self.round(repeat) for repeat in range(1, self.repeats + 1)]
+        return numbered(shuffled(rounds, self.seed), self.seed, layout)
 
 
 class PressRow(Config):
@@ -130,58 +150,29 @@ class PressRow(Config):
     """If left out, it is made from the row's number, H and alpha."""
 
 
-class ListConfig(ProtocolBase):
-    """Presses one by one, from a CSV next to `protocol.toml` or written out in it."""
+class ListConfig(_TableConfig):
+    """Presses one by one. The CSV has a column `depth_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
 
     row: ClassVar[type[BaseModel] | None] = PressRow
 
     kind: Literal["list"]
-    file: FileName | None = None
-    """CSV with a column `depth_mm` and optionally `tilt_deg`, `dwell_s` and `stroke_id`."""
     presses: Annotated[tuple[PressRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
     """The presses. Read from `file` where one is named."""
-    repeats: Repeats = 1
-    """Rounds: each holds every press once."""
-    seed: Seed | None = None
-    """Shuffles each round; if left out, the order is that of the list."""
-    dwell_s: DwellS = 0.2
-    """Time at full depth of presses that have no `dwell_s` of their own."""
 
-    @model_validator(mode="after")
-    def _named_apart(self) -> ListConfig:
-        check_count(len(self.presses) * self.repeats)
-        check_distinct("presses", [name for repeat in range(1, self.repeats + 1) for name in self.names(repeat)])
-        return self
-
-    def names(self, repeat: int) -> list[str]:
-        """Stroke ids of round `repeat`, counted from 1.
+    def round(self, repeat: int) -> list[Planned]:
+        """The presses of round `repeat`, counted from 1.
 
         A press without an id is named after its number in the list, H and alpha, as `003-H15-a5-r01`. A given id gets
         `-r02` and so on from the second round on.
         """
-        ending = f"-r{repeat:02d}"
-        return [
-            row.stroke_id + (ending if repeat > 1 else "")
-            if row.stroke_id is not None
-            else f"{number:03d}-H{row.depth_mm:g}-a{row.tilt_deg:g}{ending}"
-            for number, row in enumerate(self.presses, 1)
-        ]
-
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every press `repeats` times, in rounds; shuffled and balanced over the sheet where there is a seed."""
-        rounds = [
-            [
-                Planned(
-                    name,
-                    Condition(row.depth_mm, row.tilt_deg),
-                    repeat,
-                    dwell_s=self.dwell_s if row.dwell_s is None else row.dwell_s,
-                )
-                for row, name in zip(self.presses, self.names(repeat), strict=True)
-            ]
-            for repeat in range(1, self.repeats + 1)
-        ]
-        return numbered(shuffled(rounds, self.seed), self.seed, layout)
+        ending, strokes = f"-r{repeat:02d}", list[Planned]()
+        for number, row in enumerate(self.presses, 1):
+            name = f"{number:03d}-H{row.depth_mm:g}-a{row.tilt_deg:g}{ending}"
+            if row.stroke_id is not None:
+                name = row.stroke_id + (ending if repeat > 1 else "")
+            dwell_s = self.dwell_s if row.dwell_s is None else row.dwell_s
+            strokes.append(Planned(name, Condition(row.depth_mm, row.tilt_deg), repeat, dwell_s=dwell_s))
+        return strokes
 
 
 class ReplayRow(Config):
@@ -193,57 +184,40 @@ class ReplayRow(Config):
     tilt_deg: TiltDeg
 
 
-class ReplayConfig(ProtocolBase):
-    """Press again what an inversion recovered from the images of an earlier session, to compare mark with mark."""
+class ReplayConfig(_TableConfig):
+    """Press again what an inversion recovered from the images of an earlier session, to compare mark with mark.
+
+    The CSV has the columns `stroke_id`, `depth_mm` and `tilt_deg`; any other column is ignored, and named in
+    `ignored_columns`.
+    """
 
     row: ClassVar[type[BaseModel] | None] = ReplayRow
     ignores_columns: ClassVar[bool] = True
 
     kind: Literal["replay"]
-    of: Annotated[str, Field(min_length=1, max_length=100)]
+    of: StrokeId
     """Id of the session that the strokes are from."""
-    file: FileName | None = None
-    """CSV with the columns `stroke_id`, `depth_mm` and `tilt_deg`; any other column is ignored and named in
-    `ignored_columns`."""
     presses: Annotated[tuple[ReplayRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
     """The presses, under the ids that the strokes had. Read from `file` where one is named."""
     ignored_columns: tuple[str, ...] = ()
     """Columns of `file` that are not used."""
-    repeats: Repeats = 1
-    """How often each is pressed again; each round holds every stroke once."""
-    seed: Seed | None = None
-    """Shuffles each round; if left out, the order is that of the list."""
-    dwell_s: DwellS = 0.2
-    """Time at full depth."""
 
-    @model_validator(mode="after")
-    def _named_apart(self) -> ReplayConfig:
-        if problem := stroke_id_problem(self.of):
-            raise ValueError(f"of = {self.of!r}: {problem}")
-        check_distinct("presses", [row.stroke_id for row in self.presses])
-        check_count(len(self.presses) * self.repeats)
-        return self
-
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every stroke `repeats` times. `H13-a5-r02` pressed again is `H13-a5-r02~1`, then `~2` and so on.
+    def round(self, repeat: int) -> list[Planned]:
+        """The presses of round `repeat`: `H13-a5-r02` pressed again is `H13-a5-r02~1`, then `~2` and so on.
 
         An id may hold a `~` but not begin with one: everything before the last `~` is the original's id, which is also
         `again_of` in the step's parameters.
         """
-        rounds = [
-            [
-                Planned(
-                    f"{row.stroke_id}~{repeat}",
-                    Condition(row.depth_mm, row.tilt_deg),
-                    repeat,
-                    dwell_s=self.dwell_s,
-                    again_of=row.stroke_id,
-                )
-                for row in self.presses
-            ]
-            for repeat in range(1, self.repeats + 1)
+        return [
+            Planned(
+                f"{row.stroke_id}~{repeat}",
+                Condition(row.depth_mm, row.tilt_deg),
+                repeat,
+                dwell_s=self.dwell_s,
+                again_of=row.stroke_id,
+            )
+            for row in self.presses
         ]
-        return numbered(shuffled(rounds, self.seed), self.seed, layout)
 
 
 MAX_POINTS = 10_000
@@ -278,7 +252,7 @@ class DrawnStroke(Config):
     """Points [x_mm, y_mm, depth_mm, tilt_deg, heading_deg]. Read from `file` where one is named."""
 
     @model_validator(mode="after")
-    def _drawn(self) -> DrawnStroke:
+    def _marks(self) -> Self:
         for number, (a, b) in enumerate(zip(self.points, self.points[1:], strict=False), 2):
             if math.dist(a[:3], b[:3]) < LEAST_APART_MM:
                 raise ValueError(f"point {number} is less than {LEAST_APART_MM:g} mm from the previous point")
@@ -295,7 +269,7 @@ class DrawnStroke(Config):
 class Figure(Config):
     """A character or a single drawn line: strokes that share one paper patch."""
 
-    name: Annotated[str, Field(min_length=1, max_length=60)]
+    name: Annotated[StrokeId, Field(max_length=60)]
     """The stroke id is this name and the number of the repeat."""
     strokes: Annotated[tuple[DrawnStroke, ...], Field(min_length=1, max_length=100)]
     """The strokes, in the order of writing."""
@@ -324,12 +298,8 @@ class WriteConfig(ProtocolBase):
     """Dip again within a figure after this many strokes; 0 writes it with one dip."""
 
     @model_validator(mode="after")
-    def _on_the_cell(self) -> WriteConfig:
-        names = [figure.name for figure in self.figures]
-        for name in names:
-            if problem := stroke_id_problem(name):
-                raise ValueError(f"figure {name!r}: {problem}")
-        check_distinct("figures", names)
+    def _on_the_cell(self) -> Self:
+        check_distinct("figures", [figure.name for figure in self.figures])
         check_count(len(self.figures) * self.repeats)
         points = 0
         for figure in self.figures:
@@ -352,24 +322,24 @@ class WriteConfig(ProtocolBase):
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """Every figure `repeats` times, in rounds. `layout` changes nothing: figures are not conditions of a design."""
-        rounds: list[list[Planned]] = []
-        index = 0
-        for repeat in range(1, self.repeats + 1):
-            strokes: list[Planned] = []
-            for figure in self.figures:
-                _, _, depth_mm, tilt_deg, _ = max((s.deepest for s in figure.strokes), key=lambda point: point[2])
-                drawn = Drawn(
-                    [list(stroke.points) for stroke in figure.strokes],
-                    self.cell_mm,
-                    self.speed_mm_s,
-                    self.blend_mm,
-                    self.dip_every_strokes,
-                )
-                name = f"{figure.name}-r{repeat:02d}"
-                strokes.append(Planned(name, Condition(depth_mm, tilt_deg), repeat, index, drawn=drawn))
-                index += 1
-            rounds.append(strokes)
+        rounds = [
+            [self._drawn(figure, repeat, number) for number, figure in enumerate(self.figures)]
+            for repeat in range(1, self.repeats + 1)
+        ]
         return [stroke for strokes in shuffled(rounds, self.seed) for stroke in strokes]
+
+    def _drawn(self, figure: Figure, repeat: int, number: int) -> Planned:
+        """Figure `number`, from 0, of round `repeat`, from 1."""
+        _, _, depth_mm, tilt_deg, _ = max((stroke.deepest for stroke in figure.strokes), key=lambda point: point[2])
+        drawn = Drawn(
+            [list(stroke.points) for stroke in figure.strokes],
+            self.cell_mm,
+            self.speed_mm_s,
+            self.blend_mm,
+            self.dip_every_strokes,
+        )
+        index = (repeat - 1) * len(self.figures) + number
+        return Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), repeat, index, drawn=drawn)
 
 
 class CalibrationConfig(ProtocolBase):
@@ -384,13 +354,12 @@ class CalibrationConfig(ProtocolBase):
     """How often the board is photographed in each round."""
 
     @model_validator(mode="after")
-    def _apart(self) -> CalibrationConfig:
+    def _apart(self) -> Self:
         if self.board_every is not None:
             raise ValueError("board_every counts strokes, and this protocol has none: use board_views")
         if self.wait_after_dip_s is not None:
             raise ValueError("wait_after_dip_s: this protocol has no dips")
-        if len(set(self.touches_mm)) != len(self.touches_mm):
-            raise ValueError("touches_mm contains the same point twice: use rounds")
+        check_distinct("touches_mm", self.touches_mm)
         check_count((len(self.touches_mm) + self.board_views) * self.rounds)
         return self
 

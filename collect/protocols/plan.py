@@ -242,13 +242,6 @@ def check_count(strokes: int) -> None:
         raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
 
 
-def check_axes(depths_mm: list[float], tilts_deg: list[float]) -> None:
-    """Raise ValueError if an axis of a grid has a value twice."""
-    for name, values in (("depths_mm", depths_mm), ("tilts_deg", tilts_deg)):
-        if len(set(values)) != len(values):
-            raise ValueError(f"{name} has the same value twice: {values}")
-
-
 def check_distinct(field: str, values: Iterable[object]) -> None:
     """Raise ValueError if a value occurs twice."""
     seen: set[object] = set()
@@ -258,19 +251,14 @@ def check_distinct(field: str, values: Iterable[object]) -> None:
         seen.add(value)
 
 
-def stroke_id_problem(ident: str) -> str:
-    """Reason why this is no valid stroke id, which names files and is shown on terminals; empty if it is valid."""
-    if not 1 <= len(ident) <= MAX_ID:
-        return f"a name has 1 to {MAX_ID} characters"
-    if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":
-        return 'a name has no spaces, control characters, slashes or any of < > : " | ? *, and begins with no . - ~'
-    return ""
-
-
 def _stroke_id(ident: str) -> str:
-    if problem := stroke_id_problem(ident):
-        raise ValueError(problem)
+    if not 1 <= len(ident) <= MAX_ID:
+        raise ValueError(f"a name has 1 to {MAX_ID} characters")
+    if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":
+        what = 'a name has no spaces, control characters, slashes or any of < > : " | ? *, and begins with no . - ~'
+        raise ValueError(what)
     return ident
 
 
 StrokeId = Annotated[str, AfterValidator(_stroke_id)]
+"""A name that names files and is shown on terminals."""

@@ -119,7 +119,7 @@ async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeyp
         run.left_ink_ns = 1
 
     monkeypatch.setattr(touching, "fill_brush", dipped)
-    await touching._Effector(cast(Any, SimpleNamespace(run=run))).dip()
+    await touching._fill_for_touch(cast(Any, SimpleNamespace(run=run)))
     assert run.left_ink_ns is None
 
 

@@ -13,7 +13,6 @@ import pytest
 
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import (
-    Difference,
     Opening,
     find_resumable,
     next_session_id,
@@ -36,6 +35,10 @@ from tests.collect.tui.fake import FakeEngine, picture
 
 RIG = rig_toml(SimConfig(), Addresses("127.0.0.1", 30004, 30010, 8080, 28700, "/dev/ttyUSB0"))
 GRID = 'kind = "grid"\ndepths_mm = [11.0, 20.0]\ntilts_deg = [0.0]\nrepeats = 2\n'
+WAY_OUT = (
+    "Go on as it was begun: --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml, beside the "
+    "files that they name, in the same environment; or start a new session with --new."
+)
 
 
 @pytest.fixture
@@ -103,7 +106,7 @@ def test_file_field_old_and_new_value_are_reported_and_where_the_old_file_lies(l
     assert refused() == [
         "sessions/grid-01: was begun with another configuration:",
         "rig.toml: paper.cell_mm: [40.0, 24.0] -> [80.0, 80.0]",
-        "Go on with the old one: --config sessions/grid-01/rig.toml; or start a new session with --new.",
+        WAY_OUT,
     ]
     # and what it says is true
     old = Path("sessions/grid-01")
@@ -120,16 +123,13 @@ def test_both_files_and_the_environment_are_distinguished(lab: Path, monkeypatch
         "rig.toml: paper.touch_z_mm: 120.03 -> 121.0 (by BRUSHLOOP_PAPER__TOUCH_Z_MM)",
         "protocol.toml: repeats: 2 -> 3",
     ]
-    assert way_out == (
-        "Go on with the old one: --config sessions/grid-01/rig.toml --protocol sessions/grid-01/protocol.toml "
-        "without BRUSHLOOP_PAPER__TOUCH_Z_MM in the environment; or start a new session with --new."
-    )
+    assert way_out == WAY_OUT
 
 
 def test_another_kind_of_protocol_fits_on_a_small_terminal(lab: Path) -> None:
     Path("protocol.toml").write_text('kind = "list"\npresses = [{depth_mm = 11.0}, {depth_mm = 12.0}]\n')
     lines = refused()
-    assert lines[1] == 'protocol.toml: kind: "grid" -> "list"'
+    assert 'protocol.toml: kind: "grid" -> "list"' in lines
     assert lines[-2].startswith("and ")
     assert sum(1 + len(f"brushloop: {line}") // 80 for line in lines) <= 12
 
@@ -140,36 +140,9 @@ def test_a_changed_row_of_a_side_file_is_named_by_its_number(lab: Path) -> None:
     (lab / "sessions/grid-01").rename(lab / "elsewhere")
     begin()
     Path("p.csv").write_text("depth_mm\n11\n13\n")
-    assert refused()[1:] == [
-        "protocol.toml: presses.1.depth_mm: 12.0 -> 13.0",
-        "Go on with the old one: with the environment, and the files that it names, as they were then; "
-        "or start a new session with --new.",
-    ]
+    assert refused()[1:] == ["protocol.toml: presses.1.depth_mm: 12.0 -> 13.0", WAY_OUT]
     Path("p.csv").write_text("depth_mm\n11\n")
-    assert refused()[1] == "protocol.toml: presses: 2 items -> 1 item"
-
-
-def test_an_old_file_that_names_others_must_lie_beside_them(lab: Path) -> None:
-    Path("p.csv").write_text("depth_mm\n11\n")
-    Path("protocol.toml").write_text('kind = "list"\nfile = "p.csv"\n')
-    (lab / "sessions/grid-01").rename(lab / "elsewhere")
-    begin()
-    edit("protocol.toml", "file", "repeats = 3\nfile")
-    assert "(copied beside protocol.toml: it names other files)" in refused()[-1]
-
-
-def test_a_field_that_the_older_brushloop_did_not_know_is_reported_as_that(lab: Path) -> None:
-    edit("sessions/grid-01/rig.effective.json", '"retakes": 2,', "")
-    assert refused()[1:] == [
-        "rig.toml: quality.retakes: missing -> 2",
-        "Go on with the old one: with the brushloop that began it, whose files had other fields; "
-        "or start a new session with --new.",
-    ]
-
-
-def test_values_of_any_length_and_kind_have_short_words() -> None:
-    assert str(Difference("a", ("x",), list(range(99)), None)) == f"x: [{', '.join(map(str, range(12)))}... -> left out"
-    assert str(Difference("a", ("force",), None, {"kind": "x"})) == "force: left out -> given"
+    assert refused()[1] == "protocol.toml: presses.1.depth_mm: 12.0 -> left out"
 
 
 def test_a_session_whose_old_values_cannot_be_read_is_not_gone_on_with(lab: Path) -> None:

@@ -106,11 +106,11 @@ def test_a_value_from_the_environment_is_refused_by_its_variable(
         ("", r"kind: is missing: one of 'grid', 'few-strokes', 'list', 'replay', 'write', 'calibration'$"),
         (PROTOCOL.replace('"grid"', '"gird"'), r"kind: 'gird' is not one of 'grid', 'few-strokes', "),
         (PROTOCOL.replace("depths_mm", "depth_mm"), r"depth_mm: unknown field; did you mean depths_mm"),
-        (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"depths_mm has the same value twice"),
+        (PROTOCOL.replace("[11.0, 20.0]", "[11.0, 11.0]"), r"depths_mm: 11.0 occurs twice"),
         (PROTOCOL.replace("[0.0, 10.0]", "[-5.0]"), r"tilts_deg.0: .*greater than or equal to 0"),
         (
             PROTOCOL + "hurry = 3\n",
-            r"hurry: unknown field; known are board_every, wait_after_dip_s, kind, depths_mm, .*dwell_s$",
+            r"hurry: unknown field; known are board_every, wait_after_dip_s, depths_mm, .*, seed$",
         ),
     ],
 )
