@@ -197,7 +197,7 @@ def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
     [folder] = lab.sessions.iterdir()
     assert '"touch_z_mm": 121.0' in (folder / "rig.effective.json").read_text()
     monkeypatch.delenv("BRUSHLOOP_PAPER__TOUCH_Z_MM")
-    with pytest.raises(ConfigError, match=r"rig.toml: paper.touch_z_mm: 121.0 -> 120.03\n.*with the environment, and"):
+    with pytest.raises(ConfigError, match=r"rig.toml: paper.touch_z_mm: 121.0 -> 120.03\n.*in the same environment;"):
         lab.engine()
 
 
