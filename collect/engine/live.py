@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any, cast
 import cv2
 import numpy as np
 
-from brushloop.calibrate.stroke import Gray
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.quality.measure import blur_px
+from brushloop.collect.quality.measure import blur_px, busiest_tile
 from brushloop.collect.rig.optics import gray
 from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
@@ -40,8 +39,6 @@ TRACE_SLOTS = 300
 FRAME_PERIOD_S = 0.2
 """Time between two pictures of the camera."""
 WIDTH_PX = 320
-TILES = 4
-"""Rows and columns of tiles in a frame. The blur is measured in the tile with most contrast, which shows the board."""
 
 
 class Telemetry:
@@ -110,21 +107,7 @@ def _picture_of(frame: Frame, number: int) -> Picture:
     height, width = image.shape
     size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return Picture(number, small, blur_px(_busiest_tile(image, small)))
-
-
-def _busiest_tile(image: Gray, small: Gray) -> Gray:
-    """The tile of the full frame with most contrast."""
-    tiles = [(row, column) for row in range(TILES) for column in range(TILES)]
-    row, column = max(tiles, key=lambda at: float(_tile(small, *at).std()))
-    return np.ascontiguousarray(_tile(image, row, column))
-
-
-def _tile(image: Gray, row: int, column: int) -> Gray:
-    height, width = image.shape
-    return image[
-        row * height // TILES : (row + 1) * height // TILES, column * width // TILES : (column + 1) * width // TILES
-    ]
+    return Picture(number, small, blur_px(busiest_tile(image)))
 
 
 HOST = "127.0.0.1"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -195,8 +196,10 @@ def _pieces(ink: Mask) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.int32]],
 Floats32 = NDArray[np.float32]
 FINE_PX, WIDE_PX = 1.0, 2.0
 """Two blurs that are added; the ratio of an edge's slopes after each gives the edge's own blur."""
+TILES = 4
+"""Rows and columns of tiles in a frame."""
 EDGE_SHARE = 0.02
-"""Share of the frame's pixels, the steepest ones, that are taken for edges."""
+"""Share of the pixels, the steepest ones, that are taken for edges."""
 LEAST_EDGE = 3.0
 """Gray levels per pixel below which a slope is not an edge."""
 FEWEST_EDGES = 50
@@ -217,6 +220,13 @@ def paper_level(image: Gray) -> float:
     otsu, _ = cv2.threshold(np.ascontiguousarray(small), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     bright = small[small > otsu]
     return float(np.median(bright)) if bright.size else float(np.median(small))
+
+
+def busiest_tile(image: Gray) -> Gray:
+    """The one of `TILES` x `TILES` parts of an (h, w) frame that has most contrast: the board, where it is in view."""
+    rows, columns = (np.arange(TILES + 1) * side // TILES for side in image.shape)
+    tiles = [image[top:low, left:right] for top, low in pairwise(rows) for left, right in pairwise(columns)]
+    return np.ascontiguousarray(max(tiles, key=lambda tile: float(tile[::TILES, ::TILES].std())))
 
 
 def blur_px(image: Gray) -> float | None:
