@@ -89,7 +89,7 @@ class Frames:
     def __init__(self, reference: Thumbnail | None) -> None:
         self._reference = reference
         self._before: Thumbnail | None = None
-        self._waiting: list[_Waiting] = []
+        self._waiting: _Waiting | None = None
         self._failure: Exception | None = None
         self.seen: list[FrameChange] = []
         """Every frame so far."""
@@ -97,17 +97,13 @@ class Frames:
     async def first(self, condition: Condition, *, within_s: float) -> View | None:
         """The first frame from now on that meets `condition`; None if none does within `within_s`.
 
-        Raises `DeviceError` if no frame comes.
+        One caller waits at a time. Raises `DeviceError` if no frame comes.
         """
         if self._failure is not None:
             raise self._failure
         loop = asyncio.get_running_loop()
-        waiting = _Waiting(condition, loop.time() + within_s, loop.create_future())
-        self._waiting.append(waiting)
-        try:
-            return await waiting.answer
-        finally:
-            self._waiting.remove(waiting)
+        self._waiting = _Waiting(condition, loop.time() + within_s, loop.create_future())
+        return await self._waiting.answer
 
     async def follow(self, camera: Camera) -> None:
         """Take frame after frame, until cancelled or the camera fails."""
@@ -119,17 +115,19 @@ class Frames:
                 self._show(await asyncio.to_thread(self._view, frame))
         except Exception as error:
             self._failure = error
-            for waiting in self._waiting:
-                if not waiting.answer.done():
-                    waiting.answer.set_exception(error)
+            if self._waiting is not None and not self._waiting.answer.done():
+                self._waiting.answer.set_exception(error)
 
     def _show(self, view: View) -> None:
         self._before = view.small
         self.seen.append(FrameChange(view.frame.stamp.host_ns / 1e9, view.changed))
-        now_s = asyncio.get_running_loop().time()
-        for waiting in self._waiting:
-            if not waiting.answer.done() and (waiting.condition(view) or now_s > waiting.until_s):
-                waiting.answer.set_result(view if waiting.condition(view) else None)
+        waiting = self._waiting
+        if waiting is None or waiting.answer.done():
+            return
+        if waiting.condition(view):
+            waiting.answer.set_result(view)
+        elif asyncio.get_running_loop().time() > waiting.until_s:
+            waiting.answer.set_result(None)
 
     def _view(self, frame: Frame) -> View:
         small = thumbnail(frame.image)
