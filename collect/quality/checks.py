@@ -200,8 +200,17 @@ def patch_is_blank(
     window = take(image, plane.homography, on_sheet(patch.rect_mm, sheet_mm), Params())
     hidden_mm2 = mm2(~window.in_view)
     if hidden_mm2 > 0.0:
-        return unseen(patch.index, hidden_mm2, limits)
-    return before_press(patch.index, mm2(window.inked(limits.ink_gate)), limits)
+        # A patch that lies partly outside the frame cannot be called blank.
+        reason = (
+            f"Patch {patch.index} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. "
+            "Move the camera or the sheet."
+        )
+        return Check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, False, reason)
+    ink_mm2 = mm2(window.inked(limits.ink_gate))
+    reason = (
+        f"Patch {patch.index} is not blank: {ink_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
+    )
+    return _below(Failure.NEIGHBOUR, ink_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,21 +318,6 @@ def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: Qualit
     area_mm2 = float(spots[rows, columns].sum()) / scale**2
     reason = f"{area_mm2:.0f} mm^2 of glare in the patch. Move the lamp, or wait until the ink no longer shines."
     return _below(Failure.GLARE, area_mm2, "mm^2", limits.glare_mm2, reason)
-
-
-def before_press(patch: int, area_mm2: float, limits: QualityConfig) -> Check:
-    """The patch holds no ink before its press."""
-    reason = f"Patch {patch} is not blank: {area_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
-    return _below(Failure.NEIGHBOUR, area_mm2, "mm^2", limits.foreign_mm2, reason)
-
-
-def unseen(patch: int, hidden_mm2: float, limits: QualityConfig) -> Check:
-    """A patch that lies partly outside the frame cannot be called blank."""
-    reason = (
-        f"Patch {patch} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. "
-        "Move the camera or the sheet."
-    )
-    return Check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, False, reason)
 
 
 def neighbour(ink: Ink, limits: QualityConfig) -> Check:
