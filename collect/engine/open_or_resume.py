@@ -262,15 +262,15 @@ def open_sessions(root: Path) -> list[Path]:
 
     A session that is damaged or holds links is left out, so that it stands in no other's way.
     """
-    found: list[Path] = []
+    folders: list[Path] = []
     for journal in sorted(root.glob(f"*/{JOURNAL_NAME}")):
         try:
             check_folder(journal.parent)
             if replay(journal).is_open:
-                found.append(journal.parent)
+                folders.append(journal.parent)
         except SessionError:
             continue
-    return found
+    return folders
 
 
 def open_store(opening: Opening, resume: Path | None, rig: Rig, clock: Clock) -> SessionStore:

@@ -122,9 +122,9 @@ def look(seen: Sequence[FrameChange], placed: Sequence[ArmPlace]) -> Look | None
 
     `seen` begins and ends without the arm; `placed` goes from 0 to 1 and back.
     """
-    arrival_s = np.array([one.arrival_s for one in seen])
-    changed = np.array([one.changed for one in seen])
-    t_s, way = np.array([one.t_s for one in placed]), np.array([one.way for one in placed])
+    arrival_s = np.array([frame.arrival_s for frame in seen])
+    changed = np.array([frame.changed for frame in seen])
+    t_s, way = np.array([place.t_s for place in placed]), np.array([place.way for place in placed])
     if len(seen) < 3 or len(placed) < 3 or max(np.diff(arrival_s).max(), np.diff(t_s).max()) > MOST_GAP_S:
         return None
     half = 0.5 * float(changed.max())
@@ -249,7 +249,8 @@ class Photographer:
 
     def _check_drift(self, frames: Frames, delay: CameraDelay, parked_s: float) -> None:
         """Correct the delay if frames show the arm for longer after it parked. Raises `CameraLate` beyond the limit."""
-        late_s = max((one.arrival_s for one in frames.seen if one.changed >= ARM_SHARE), default=parked_s) - parked_s
+        shown_s = (frame.arrival_s for frame in frames.seen if frame.changed >= ARM_SHARE)
+        late_s = max(shown_s, default=parked_s) - parked_s
         if late_s > self._config.max_delay_ms / 1e3:
             self.forget()
             raise self._too_late(f"{1e3 * late_s:.0f} ms at least")
@@ -274,9 +275,9 @@ class Photographer:
                 if seen is None:
                     break
                 shown = True
-                view, found = seen
-                if found is not None:
-                    looks.append(found)
+                view, delay_of_trip = seen
+                if delay_of_trip is not None:
+                    looks.append(delay_of_trip)
                 elif attempt == 0:
                     looks.clear()  # these pictures may all show what the arm did before
                     break

@@ -213,16 +213,16 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
         await controller.connection.login()
         [controller.robot, *_] = await controller.robot_names()
         offset = await _tool(controller)
-        ours = [*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)]
+        own_tool = [*(v / 1e3 for v in robot.tcp_offset_mm), *map(math.radians, robot.tcp_rotation_deg)]
         near = await controller.joint_positions()
         asked: set[Pose] = set()
         for pose, _, where in poses:
             if pose in asked:
                 continue
             asked.add(pose)
-            wire = to_wire(_for_tool(pose, ours, offset))
-            found = await _joints(controller, wire, near)
-            if found is None:
+            wire = to_wire(_for_tool(pose, own_tool, offset))
+            joints = await _joints(controller, wire, near)
+            if joints is None:
                 raise ConfigError(
                     rig_path,
                     "paper",
@@ -230,7 +230,7 @@ async def ask_reach(rig_path: Path, config: RigConfig, poses: Iterable[tuple[Pos
                     f"x = {pose.x_mm:.1f}, y = {pose.y_mm:.1f}, z = {pose.z_mm:.1f} mm, "
                     "for robot.tcp_offset_mm. Move the paper nearer to the arm, or change its yaw",
                 )
-            near = found
+            near = joints
         return len(asked)
     finally:
         await controller.connection.close()
@@ -251,10 +251,10 @@ async def _tool(controller: Controller) -> list[float]:
     return six("getTcpOffset", await controller.ask("RobotConfig.getTcpOffset"))
 
 
-def _for_tool(tip: Pose, ours: list[float], theirs: list[float]) -> Pose:
+def _for_tool(tip: Pose, own_tool: list[float], set_tool: list[float]) -> Pose:
     """Pose of the controller's tool while our tip is at `tip`: tip * ours^-1 * theirs. Tools as on the wire."""
-    our, their = from_wire(ours), from_wire(theirs)
-    flange = product(tip.quaternion, inverse(our.quaternion))
-    shift_mm = turned(flange, [t - o for t, o in zip(their.position_mm, our.position_mm, strict=True)])
+    own, other = from_wire(own_tool), from_wire(set_tool)
+    flange = product(tip.quaternion, inverse(own.quaternion))
+    shift_mm = turned(flange, [t - o for t, o in zip(other.position_mm, own.position_mm, strict=True)])
     px, py, pz = (p + s for p, s in zip(tip.position_mm, shift_mm, strict=True))
-    return Pose(px, py, pz, *product(flange, their.quaternion))
+    return Pose(px, py, pz, *product(flange, other.quaternion))

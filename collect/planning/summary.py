@@ -232,7 +232,7 @@ def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
         triangle_in(sheet_of(armed, protocol).patch(0), armed.self_check)
     except StepError as error:
         return f"with --arm the self-check comes first, and {error}: change [self_check] legs_mm, or enabled = false"
-    (before, _), (sheets, taken) = (_sheets(one, protocol) for one in (config, armed))
+    (before, _), (sheets, taken) = (_sheets(rig, protocol) for rig in (config, armed))
     if sheets == before:
         return None
     patches = f"{taken} patches" if taken > 1 else "one patch"
@@ -263,7 +263,7 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
             for figure in protocol.figures
         ]
     anchor_x, anchor_y = patch.anchor_mm[0] - patch.x_mm, patch.anchor_mm[1] - patch.y_mm
-    found: dict[Condition, tuple[float, str]] = {}
+    overhangs: dict[Condition, tuple[float, str]] = {}
     for stroke in protocol.planned():
         reach = reach_of(config.brush, stroke.condition)
         beyond_mm = max(
@@ -271,8 +271,8 @@ def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> lis
             anchor_x + reach.ahead_mm - patch.size_x_mm,
             reach.side_mm - min(anchor_y, patch.size_y_mm - anchor_y),
         )
-        found.setdefault(stroke.condition, (beyond_mm, stroke.stroke_id))
-    return list(found.values())
+        overhangs.setdefault(stroke.condition, (beyond_mm, stroke.stroke_id))
+    return list(overhangs.values())
 
 
 def _figure_overhang(config: RigConfig, patch: Patch, point: tuple[float, float, float, float, float]) -> float:

@@ -132,13 +132,13 @@ def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchSt
 
 def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, patch: Patch, dips: int) -> StepMoves:
     segments: list[Segment] = []
-    made = 0
+    dipped = 0
     for number, points in enumerate(drawn.strokes):
         if drawn.dips_before(number):
-            segments += inking_moves(config, dips + made)
-            made += 1
+            segments += inking_moves(config, dips + dipped)
+            dipped += 1
         segments += stroke_moves(config, plane, patch, points, drawn.speed_mm_s)
-    return StepMoves(segments, dips=made)
+    return StepMoves(segments, dips=dipped)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,8 +169,8 @@ def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
 
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
     """The steps as this rig runs them: balanced over its sheet, with the self-check if it is on."""
-    found = protocol.steps(layout_of(config, protocol))
-    return with_self_check(found) if config.self_check.enabled else found
+    steps = protocol.steps(layout_of(config, protocol))
+    return with_self_check(steps) if config.self_check.enabled else steps
 
 
 def as_planned(step: Step, sheet: int, patch: int) -> StepResult | None:

@@ -239,8 +239,8 @@ def blur_px(image: Gray) -> float | None:
     exact = image.astype(np.float32)
     fine, wide = (np.asarray(cv2.GaussianBlur(exact, (0, 0), s_px), np.float32) for s_px in (FINE_PX, WIDE_PX))
     across = np.array([[-0.5, 0.0, 0.5]], np.float32)
-    found = [s for kernel in (across, across.T) if (s := _blur_along(fine, wide, kernel)) is not None]
-    return max(found) if found else None
+    blurs_px = [s for kernel in (across, across.T) if (s := _blur_along(fine, wide, kernel)) is not None]
+    return max(blurs_px) if blurs_px else None
 
 
 def _blur_along(fine_smooth: Floats32, wide_smooth: Floats32, kernel: Floats32) -> float | None:

@@ -76,10 +76,10 @@ def new_ink(
     As a share of the paper's brightness: 1 is paper turned black. Noise averages to 0.
     """
     first, second = (rectify(image, image_to_paper, window_mm).astype(np.float32) for image in (before, after))
-    found = _darkening(first, second)
-    if found is None:
+    darkened = _darkening(first, second)
+    if darkened is None:
         return np.zeros(first.shape, np.float32)
-    darkening, paper = found
+    darkening, paper = darkened
     return np.asarray(darkening / paper, np.float32)
 
 
@@ -109,10 +109,10 @@ class Mark:
 def new_marks(before: Gray, after: Gray, image_to_paper: Floats, least_ink_mm2: float) -> list[Mark]:
     """New marks of at least `least_ink_mm2`, the largest first. The camera must not have moved in between."""
     first, second = before.astype(np.float32), after.astype(np.float32)
-    found = _darkening(first, second)
-    if found is None:
+    darkened = _darkening(first, second)
+    if darkened is None:
         return []
-    darkening, paper = found
+    darkening, paper = darkened
     darker = np.asarray(darkening / np.maximum(first, DARK_SHARE * paper), np.float32)
     height, width = darker.shape
     middle = np.array([0.5 * width, 0.5 * height])

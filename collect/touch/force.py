@@ -167,16 +167,16 @@ class _Log:
 
         More readings are kept where too few are left to give it: the descent lay too low, or they are noisy still.
         """
-        found = self._fit(-math.inf)
+        contact = self._fit(-math.inf)
         for _ in range(3):
-            lowest_z_mm = found.z_mm - config.linear_mm
-            if not any(lowest_z_mm <= reading.z_mm < found.z_mm for reading, _ in self.readings):
+            lowest_z_mm = contact.z_mm - config.linear_mm
+            if not any(lowest_z_mm <= reading.z_mm < contact.z_mm for reading, _ in self.readings):
                 break
             try:
-                found = self._fit(lowest_z_mm)
+                contact = self._fit(lowest_z_mm)
             except StepError:
                 break
-        return found
+        return contact
 
     def _fit(self, lowest_z_mm: float) -> Contact:
         used = [(r, run) for r, run in self.readings if r.z_mm >= lowest_z_mm]

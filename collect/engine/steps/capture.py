@@ -96,7 +96,8 @@ def marked_bad(run: RunContext) -> list[str]:
     state = run.store.state
     listed = {again.stroke_id for review in state.results(ReviewResult) for again in review.again}
     bad = {remark.still for remark in remarks.values() if remark.bad}
-    counted = [one.press.stroke_id for one in state.results(CaptureResult) if one.kept and one.still in bad]
+    captures = state.results(CaptureResult)
+    counted = [capture.press.stroke_id for capture in captures if capture.kept and capture.still in bad]
     return [name for name in counted if name not in listed]
 
 
@@ -105,8 +106,8 @@ async def review(run: RunContext) -> ReviewResult:
     reviews = run.store.state.results(ReviewResult)
     first = run.progress.first_free_index + sum(len(review.again) for review in reviews)
     again = tuple(Again(stroke_id=name, index=first + n) for n, name in enumerate(marked_bad(run)))
-    for one in again:
-        run.progress.log(f"{one.stroke_id} was marked bad in the review and is pressed again")
+    for stroke in again:
+        run.progress.log(f"{stroke.stroke_id} was marked bad in the review and is pressed again")
     return ReviewResult(again=again)
 
 

@@ -103,8 +103,8 @@ async def press(context: StepContext, step: PressStep) -> PressResult:
         await timing.begin(down[0])
         pressing = procedures.press(patch, step.press.condition, step.dwell_s)
         reached_mm = await context.guard.guarded(pressing)
-    made = _made(context, step.press, reached_mm, timing)
-    return PressResult(press=made, peak_force_n=_peak_n(context, context.guard.peak_n))
+    pressed = _as_made(context, step.press, reached_mm, timing)
+    return PressResult(press=pressed, peak_force_n=_peak_n(context, context.guard.peak_n))
 
 
 async def draw(context: StepContext, step: DrawStep) -> PressResult:
@@ -126,9 +126,9 @@ async def draw(context: StepContext, step: DrawStep) -> PressResult:
                 await timing.begin(first)
             depths_mm.append(await context.guard.guarded(run.procedures.stroke(patch, drawn, number)))
             peaks_n.append(context.guard.peak_n)
-    made = _made(context, step.press, max(depths_mm), timing)
+    pressed = _as_made(context, step.press, max(depths_mm), timing)
     return PressResult(
-        kind=StepKind.DRAW, press=made, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm)
+        kind=StepKind.DRAW, press=pressed, peak_force_n=_peak_n(context, max(peaks_n)), depths_mm=tuple(depths_mm)
     )
 
 
@@ -143,7 +143,7 @@ async def _ready(context: StepContext) -> Patch:
     return patch
 
 
-def _made(context: StepContext, press: Press, reached_mm: float, timing: DipToTouch) -> Press:
+def _as_made(context: StepContext, press: Press, reached_mm: float, timing: DipToTouch) -> Press:
     """The press with its place, and what was measured of it."""
     [patch] = context.patches
     wait_s = None if timing.longest_s is None else round(timing.longest_s, 3)

@@ -29,30 +29,32 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
     if step.method == "kept":
-        found = kept(run.procedures.plane, rig.config.paper.touch_point_mm)
+        measured = kept(run.procedures.plane, rig.config.paper.touch_point_mm)
     else:
         if step.method is not None:
             await within_limits(check_step, "", rig.config, run.procedures.plane, step)
-        found = await _measured(context, touch_of(rig.config, step))
-    await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, found.plane)
-    moved_mm = _moved_mm(found, run.procedures.plane)
-    if found.method == "kept":
+        measured = await _measured(context, touch_of(rig.config, step))
+    await within_limits(check_poses, "over the paper as it was touched, ", rig.config, run.protocol, measured.plane)
+    moved_mm = _moved_mm(measured, run.procedures.plane)
+    if measured.method == "kept":
         run.progress.log(f"zero touch was given up: {_height(run)} is kept", warning=True)
-    elif found.method != "taught":
-        run.progress.log(f"zero touch by {found.method}: {_compared(moved_mm, found.plane, run.procedures.plane)}")
+    elif measured.method != "taught":
+        run.progress.log(
+            f"zero touch by {measured.method}: {_compared(moved_mm, measured.plane, run.procedures.plane)}"
+        )
     if step.between_strokes:
         await _accepted(context, moved_mm)
-    run.procedures.plane = found.plane
-    origin_mm, quaternion = found.plane.frame(rig.config.paper)
+    run.procedures.plane = measured.plane
+    origin_mm, quaternion = measured.plane.frame(rig.config.paper)
     context.recorder.paper(origin_mm, quaternion)
     if (optics := rig.config.camera.optics) is not None:
         context.recorder.optics(optics)
-    return found.result(moved_mm)
+    return measured.result(moved_mm)
 
 
-def _moved_mm(found: PlaneResult, before: PaperPlane) -> float:
+def _moved_mm(measured: PlaneResult, before: PaperPlane) -> float:
     """How far the paper lies above where it was before, at the touched point where it moved most."""
-    away = [point.mean[2] - before.touch_z_mm(point.mean[0], point.mean[1]) for point in found.points]
+    away = [point.mean[2] - before.touch_z_mm(point.mean[0], point.mean[1]) for point in measured.points]
     return max(away, key=abs)
 
 
@@ -78,9 +80,9 @@ async def touch(context: StepContext, step: TouchStep) -> TouchResult:
         visited = run.procedures.visit(run.procedures.plane, step.x_mm, step.y_mm)
         z_mm = await context.guard.guarded(visited)
         return TouchResult(method="taught", x_mm=step.x_mm, y_mm=step.y_mm, z_mm=z_mm)
-    found = await _measured(context, config)
-    x_mm, y_mm, z_mm = found.points[0].mean
-    return TouchResult(method=found.method, x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, span_mm=found.points[0].span_mm)
+    measured = await _measured(context, config)
+    x_mm, y_mm, z_mm = measured.points[0].mean
+    return TouchResult(method=measured.method, x_mm=x_mm, y_mm=y_mm, z_mm=z_mm, span_mm=measured.points[0].span_mm)
 
 
 async def check_rig(context: StepContext) -> SelfCheckResult:
