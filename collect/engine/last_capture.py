@@ -76,27 +76,21 @@ def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | Non
     return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
 
 
-def cell_raster(image: Gray, plane: Plane, patch: Patch) -> tuple[Gray, tuple[float, float], tuple[int, int, int, int]]:
-    """The field around the patch's zero-touch point, rectified, with that point and the patch (x, y, width, height) in
-    its pixels."""
+def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """The field around the patch's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
     x, y, _, height = window = FIELD.window_mm(patch.anchor_mm)
     left, top = FIELD.anchor_mm
     raster = rectify(image, plane.homography, window)
-    top_of_cell = y + height - (patch.y_mm + patch.size_y_mm)
-    cell_px = (
+    top_of_patch = y + height - (patch.y_mm + patch.size_y_mm)
+    patch_px = (
         round((patch.x_mm - x) * PX_PER_MM),
-        round(top_of_cell * PX_PER_MM),
+        round(top_of_patch * PX_PER_MM),
         round(patch.size_x_mm * PX_PER_MM),
         round(patch.size_y_mm * PX_PER_MM),
     )
-    return raster, (left * PX_PER_MM, top * PX_PER_MM), cell_px
-
-
-def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """The field around the patch's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
-    raster, anchor_px, cell_px = cell_raster(image, plane, patch)
+    anchor_px = left * PX_PER_MM, top * PX_PER_MM
     try:
-        prepared = prepare(raster, anchor_px, "the capture", Params(), cell_px)
+        prepared = prepare(raster, anchor_px, "the capture", Params(), patch_px)
     except CaptureRefused:
         return raster, None
     return raster, captured_mm(prepared, Tone.BINARY) > 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
@@ -129,9 +130,9 @@ class _TableConfig(ProtocolBase):
         check_distinct("presses", [stroke.stroke_id for stroke in self.planned()])
         return self
 
+    @abstractmethod
     def round(self, repeat: int) -> list[Planned]:
         """The presses of round `repeat`, counted from 1, in the order of the list."""
-        raise NotImplementedError
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """Every press `repeats` times, in rounds; shuffled and balanced over the sheet where there is a seed."""
