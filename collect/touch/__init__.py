@@ -1,1 +1,4 @@
-"""Measured zero touch and the self-check: where the paper really lies, and whether the rig is set up right."""
+"""Finds the paper by touch, and checks the rig by three marks.
+
+Used by the engine's steps; moves the arm only through `motion`.
+"""
