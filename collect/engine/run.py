@@ -23,7 +23,7 @@ from brushloop.collect.engine.policy import (
     question,
 )
 from brushloop.collect.engine.recorder import ForceGuard, Recorder
-from brushloop.collect.engine.steps import capture, press, touch
+from brushloop.collect.engine.steps import brush, capture
 from brushloop.collect.engine.steps.capture import marked_bad
 from brushloop.collect.engine.steps.context import RunContext, StepContext, uninterrupted
 from brushloop.collect.errors import NeedsOperator, Parked, PosesLate, SheetFull, StepError, arm_at_fault, describe
@@ -314,19 +314,19 @@ class Run:
     async def _do(self, step: Step, context: StepContext) -> StepResult:
         match step:
             case ZeroTouchStep():
-                return await touch.zero_touch(context, step)
+                return await brush.zero_touch(context, step)
             case TouchStep():
-                return await touch.touch(context, step)
+                return await brush.touch(context, step)
             case SelfCheckStep():
-                return await touch.check_rig(context)
+                return await brush.check_rig(context)
             case BoardStep():
                 return await capture.board(context)
             case DipStep():
-                return await press.dip(context)
+                return await brush.dip(context)
             case PressStep():
-                return await press.press(context, step)
+                return await brush.press(context, step)
             case DrawStep():
-                return await press.draw(context, step)
+                return await brush.draw(context, step)
             case CaptureStep():
                 return await capture.capture(context, step)
             case ReviewStep():

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from brushloop.collect.engine.progress import Progress
-from brushloop.collect.engine.steps import press as dipping
-from brushloop.collect.engine.steps import touch as touching
+from brushloop.collect.engine.steps import brush as brush_steps
 from brushloop.collect.planning.summary import make_plan
 from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import load_protocol
@@ -105,7 +104,7 @@ def test_a_brush_that_waited_with_its_ink_dips_again(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, targets: list[str], screen: list[str]
 ) -> None:
     """A pause between dip and press is as good as any length: every wait counts as too long here."""
-    monkeypatch.setattr(dipping, "STALE_INK_S", 0.0)
+    monkeypatch.setattr(brush_steps, "STALE_INK_S", 0.0)
     lab.write_protocol("[11.0]", "[0.0]")
     run(lab)
     assert targets.count("ink") == 2
@@ -118,8 +117,8 @@ async def test_a_dip_of_zero_touch_or_the_self_check_is_none_for_a_press(monkeyp
     async def dipped(_context: Any) -> None:
         run.left_ink_ns = 1
 
-    monkeypatch.setattr(touching, "fill_brush", dipped)
-    await touching._fill_for_touch(cast(Any, SimpleNamespace(run=run)))
+    monkeypatch.setattr(brush_steps, "fill_brush", dipped)
+    await brush_steps._fill_for_touch(cast(Any, SimpleNamespace(run=run)))
     assert run.left_ink_ns is None
 
 
@@ -166,15 +165,15 @@ def test_a_plan_counts_the_wait(lab: Lab) -> None:
 def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin, number = dipping.DipToTouch.begin, iter(range(9))
+    begin, number = brush_steps.DipToTouch.begin, iter(range(9))
 
-    async def late(self: dipping.DipToTouch, first: Any) -> None:
+    async def late(self: brush_steps.DipToTouch, first: Any) -> None:
         await begin(self, first)
         assert self._left_ns is not None
         if next(number) == 2:
             self._left_ns -= 8_000_000_000  # as if eight seconds had passed
 
-    monkeypatch.setattr(dipping.DipToTouch, "begin", late)
+    monkeypatch.setattr(brush_steps.DipToTouch, "begin", late)
     lab.write_protocol("[11.0]", "[0.0]", repeats=4)
     engine = lab.engine()
     engine.start()
