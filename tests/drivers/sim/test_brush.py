@@ -1,21 +1,71 @@
-"""The simulated brush: its marks and forces, its drags and its flaws."""
+"""The simulated brush: its marks and forces, its drags and its flaws, and the TOML file that describes one."""
 
 from __future__ import annotations
 
 import itertools
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+import brushloop.__main__
+from bench.brushes import FROZEN
+from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Flaw, Waypoint
 from brushloop.drivers.sim.brush.footprint import COHESIVE_LOAD, flaw_of_load, natural_split
 from brushloop.drivers.sim.brush.paper import Footprint
+from brushloop.drivers.sim.brush.spec import PAPER, SimFileError, load_brush
+from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.rig import Addresses, rig_toml
 
-DEPTHS_MM = (5.0, 11.0, 13.0, 15.0, 17.0, 20.0)
-TILTS_DEG = (0.0, 5.0, 10.0)
+PRESSED = (
+    (3986.908, 3129.639, 3100.391),
+    (4034.102, 3255.779, 3098.008),
+    (4272.797, 3165.911, 3266.336),
+    (4235.855, 3262.018, 3449.286),
+    (3842.285, 2882.832, 2868.087),
+    (10297.543, 8338.703, 7977.463),
+)
+"""Ink of a press, a drag and a split press of each frozen brush and of the paper's, as pressed when they were made."""
+
+
+FLAWED = {
+    None: 7146.251,
+    Flaw.SPLIT: 7618.547,
+    Flaw.BENT: 7289.363,
+    Flaw.DRY: 4110.589,
+    Flaw.BLANK: 0.0,
+    Flaw.FAINT: 3394.469,
+}
+"""Ink of a press of the default brush with each flaw."""
+EMPTYING = {0.7: 5663.099, 0.4: 3673.846, 0.2: 1883.439, 0.0: 0.0}
+"""Ink of a press of the default brush by ink load."""
+
+
+def test_the_frozen_brushes_and_the_papers_press_and_draw_what_they_always_did() -> None:
+    # the bytes agreed too; another processor may round the last bit differently
+    ink: list[list[float]] = []
+    for spec in (*FROZEN, load_brush(Path(PAPER)).spec):
+        brush = Brush(spec)
+        press = brush.press(12.0, 5.0, ink_load=0.8, press_seed=3)
+        split = brush.press(9.0, 0.0, ink_load=1.0, press_seed=4, flaw=Flaw.SPLIT, severity=0.7)
+        path = [Waypoint(0, 0, 0), Waypoint(0, 0, 5), Waypoint(12, 4, 5)]
+        drag = brush.drag(path, 0, 0, ink_load=1.0, press_seed=1)
+        ink.append([float(mark.density.sum(dtype=float)) for mark in (press, drag, split)])
+    assert ink == [pytest.approx(row, rel=1e-5) for row in PRESSED]
+
+
+def test_a_flaw_and_an_emptying_brush_take_the_ink_that_they_always_took(brush: Brush) -> None:
+    ink = {flaw: float(flawed(brush, flaw, 0.7).density.sum(dtype=float)) for flaw in FLAWED}
+    assert ink == pytest.approx(FLAWED, rel=1e-5)
+    marks = {load: brush.press(15.0, 5.0, ink_load=load, press_seed=1) for load in EMPTYING}
+    assert {load: float(mark.density.sum(dtype=float)) for load, mark in marks.items()} == pytest.approx(
+        EMPTYING, rel=1e-5
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +83,12 @@ def extent_mm(mark: Footprint) -> tuple[float, float]:
     return (np.ptp(columns) + 1) / mark.px_per_mm, (np.ptp(rows) + 1) / mark.px_per_mm
 
 
-@pytest.mark.parametrize("tilt_deg", TILTS_DEG)
+@pytest.mark.parametrize("tilt_deg", [0.0, 10.0])
 def test_mark_and_force_grow_with_depth(brush, tilt_deg):
-    marks = [wet(brush, depth, tilt_deg) for depth in DEPTHS_MM]
+    depths_mm = (5.0, 11.0, 15.0, 20.0)
+    marks = [wet(brush, depth, tilt_deg) for depth in depths_mm]
     lengths, widths = zip(*(extent_mm(m) for m in marks), strict=True)
-    forces = [float(brush.push_n(depth, tilt_deg)[-1]) for depth in DEPTHS_MM]
+    forces = [float(brush.push_n(depth, tilt_deg)[-1]) for depth in depths_mm]
     for series in (lengths, widths, forces):
         assert all(a < b for a, b in itertools.pairwise(series)), series
     assert 10 < lengths[1] < lengths[-1] < 30
@@ -50,23 +101,6 @@ def test_no_touch_no_ink(brush, depth_mm):
     blank = wet(brush, depth_mm, 5)
     assert not blank.density.any()
     assert max(blank.density.shape) <= 100
-
-
-def test_a_dry_brush_leaves_less_ink_and_streaks(brush):
-    loads = (1.0, 0.7, 0.4, 0.2, 0.0)
-    marks = {load: brush.press(17, 5, ink_load=load, press_seed=3) for load in loads}
-    ink = [float(marks[load].density.sum()) for load in loads]
-    assert all(a > b for a, b in itertools.pairwise(ink)), ink
-    assert not marks[0.0].density.any()
-
-    def gaps(mark: Footprint) -> float:
-        """Share of paper left bare between the outermost ink of each column."""
-        inked = mark.density > 0.3
-        inside = np.maximum.accumulate(inked, axis=0) & np.maximum.accumulate(inked[::-1], axis=0)[::-1]
-        return 1.0 - inked.sum() / inside.sum()
-
-    assert gaps(marks[1.0]) < 0.01
-    assert gaps(marks[0.2]) > 0.1
 
 
 @pytest.mark.parametrize(
@@ -105,18 +139,6 @@ def down_along_up(corners: list[tuple[float, float]], depth_mm: float) -> list[W
     return [Waypoint(*corners[0], 0.0), *points, Waypoint(*corners[-1], 0.0)]
 
 
-def ramp(depth_mm: float, length_mm: float = 50.0) -> list[Waypoint]:
-    """Comes down and lifts on the way."""
-    x = (0.0, 0.2 * length_mm, 0.8 * length_mm, length_mm)
-    return [Waypoint(a, 0.0, d) for a, d in zip(x, (0.0, depth_mm, depth_mm, 0.0), strict=True)]
-
-
-def draw(
-    brush: Brush, path: list[Waypoint], heading_deg: float = 0.0, ink_load: float = 1.0, seed: int = 1
-) -> Footprint:
-    return brush.drag(path, 0.0, heading_deg, ink_load=ink_load, press_seed=seed)
-
-
 def ink_mm(mark: Footprint) -> tuple[np.ndarray, np.ndarray]:
     """x and y of the inked pixels relative to the first waypoint."""
     rows, columns = np.nonzero(mark.density > 0.3)
@@ -127,48 +149,27 @@ def test_the_ink_trails_behind_the_tip_by_a_leash_that_grows_with_depth(brush: B
     short = []
     for depth_mm in (3.0, 6.0, 9.0):
         path = down_along_up([(0.0, 0.0), (40.0, 0.0)], depth_mm)[:-1]  # still down: no lifting to close the gap
-        short.append(40.0 - float(ink_mm(draw(brush, path))[0].max()))
+        short.append(40.0 - float(ink_mm(brush.drag(path, 0.0, 0.0, ink_load=1.0, press_seed=1))[0].max()))
     assert all(b > a + 0.5 for a, b in itertools.pairwise(short)), short
     assert 0.5 < short[0] < short[-1] < 9.0
 
 
-def test_the_ink_cuts_a_corner_and_cuts_it_more_when_deep(brush: Brush):
-    cut = []
-    for depth_mm in (3.0, 8.0, 14.0):
-        x, y = ink_mm(draw(brush, down_along_up([(0.0, 0.0), (40.0, 0.0), (40.0, -40.0)], depth_mm)))
-        cut.append(float(np.hypot(x - 40.0, y).min()))
-    assert all(b > a + 0.3 for a, b in itertools.pairwise(cut)), cut
-    assert cut[0] > 0.2
-
-
-def test_no_depth_no_ink(brush: Brush):
-    for depth_mm in (0.0, -2.0):
-        assert not draw(brush, down_along_up([(0.0, 0.0), (40.0, 0.0)], depth_mm)).density.any()
-
-
 def test_a_drag_out_of_range_is_refused_with_the_range(brush: Brush):
-    with pytest.raises(ValueError, match=r"depth_mm = 45 is outside -inf \.\. 43\.2"):
-        draw(brush, ramp(45.0))
-    with pytest.raises(ValueError, match="at least one waypoint"):
-        draw(brush, [])
-
-
-SEVERITIES = (0.0, 0.25, 0.5, 0.75, 1.0)
-CELLS = [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)]
-SEEDS = range(4)
+    for path, message in (
+        (down_along_up([(0.0, 0.0)], 45.0), "depth_mm = 45 is outside"),
+        ([], "at least one waypoint"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            brush.drag(path, 0.0, 0.0, ink_load=1.0, press_seed=1)
 
 
 def flawed(brush: Brush, flaw: Flaw | None, severity: float = 1.0, *, cell=(15.0, 5.0), seed: int = 1) -> Footprint:
     return brush.press(*cell, ink_load=1.0, press_seed=seed, flaw=flaw, severity=severity)
 
 
-def inked(mark: Footprint) -> np.ndarray:
-    return mark.density > 0.3
-
-
 def gap_mm(mark: Footprint) -> float:
     """Widest run of bare paper between ink of one column, in the half of the mark toward the tip."""
-    ink = inked(mark)
+    ink = mark.density > 0.3
     columns = np.flatnonzero(ink.any(axis=0))
     widest = 0
     for column in columns[: columns.size // 2]:
@@ -179,59 +180,18 @@ def gap_mm(mark: Footprint) -> float:
 
 def aside_mm(mark: Footprint) -> float:
     """Distance of the tip third's centroid from the axis of the brush."""
-    rows, columns = np.nonzero(inked(mark))
+    rows, columns = np.nonzero(mark.density > 0.3)
     third = columns < columns.min() + np.ptp(columns) / 3
     return abs(mark.origin_px[1] - rows[third].mean() - 0.5) / mark.px_per_mm
 
 
-def cover(mark: Footprint, sound: Footprint) -> float:
-    """Share of the outline of a sound press of the same seed that carries ink; frames differ, origins do not."""
-    placed = np.zeros(sound.density.shape, bool)
-    dx, dy = (int(a - b) for a, b in zip(sound.origin_px, mark.origin_px, strict=True))
-    rows, columns = np.nonzero(inked(mark))
-    rows, columns = rows + dy, columns + dx
-    kept = (rows >= 0) & (columns >= 0) & (rows < placed.shape[0]) & (columns < placed.shape[1])
-    placed[rows[kept], columns[kept]] = True
-    outline = inked(sound)
-    return (placed & outline).sum() / outline.sum()
-
-
-def grows(series: list[float], least: float = 0.0) -> bool:
-    return all(b - a >= least for a, b in itertools.pairwise(series))
-
-
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_split_opens_toward_the_tip(brush: Brush, cell, seed: int):
-    assert gap_mm(flawed(brush, None, cell=cell, seed=seed)) < 0.3
-    mark = flawed(brush, Flaw.SPLIT, cell=cell, seed=seed)
-    assert gap_mm(mark) > 1.0
-    ink = inked(mark).astype(np.uint8)
-    columns = np.flatnonzero(ink.any(axis=0))
-    prongs, _ = cv2.connectedComponents(np.ascontiguousarray(ink[:, : columns[0] + columns.size // 4]))
-    whole, _ = cv2.connectedComponents(ink)
-    assert (prongs - 1, whole - 1) == (2, 1), "two tips, one heel"
-
-
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_bent_tip_lies_off_the_axis(brush: Brush, cell, seed: int):
-    assert aside_mm(flawed(brush, None, cell=cell, seed=seed)) < 0.5
-    assert aside_mm(flawed(brush, Flaw.BENT, cell=cell, seed=seed)) > 1.0
-
-
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_dry_brush_inks_less_than_its_outline(brush: Brush, cell, seed: int):
-    assert cover(flawed(brush, Flaw.DRY, cell=cell, seed=seed), flawed(brush, None, cell=cell, seed=seed)) < 0.6
-
-
-def test_a_faint_mark_keeps_its_outline_and_loses_its_tone(brush: Brush):
-    marks = [flawed(brush, Flaw.FAINT, s) for s in SEVERITIES]
-    assert grows([-float(m.density.max()) for m in marks], 0.1)
-    areas = [np.count_nonzero(m.density > 0.5 * m.density.max()) for m in marks]
-    assert areas == pytest.approx([areas[0]] * len(areas), rel=0.01)
-    assert marks[-1].density.max() < 0.3
+@pytest.mark.parametrize("cell", [(11.0, 0.0), (15.0, 5.0), (20.0, 10.0)])
+def test_a_split_opens_toward_the_tip_and_a_bent_tip_lies_off_the_axis(brush: Brush, cell: tuple[float, float]):
+    sound, split, bent = (flawed(brush, flaw, cell=cell) for flaw in (None, Flaw.SPLIT, Flaw.BENT))
+    assert gap_mm(sound) < 0.3
+    assert gap_mm(split) > 1.0
+    assert aside_mm(sound) < 0.5
+    assert aside_mm(bent) > 1.0
 
 
 @pytest.mark.parametrize("flaw", list(Flaw))
@@ -248,21 +208,9 @@ def test_a_severity_out_of_range_is_refused(brush: Brush):
         flawed(brush, Flaw.SPLIT, 1.5)
 
 
-def test_an_emptying_brush_leaves_faint_then_dry_then_blank_marks(brush: Brush):
-    loads = [1.0 - 0.12 * n for n in range(9)]
-    named = [flaw_of_load(load) for load in [*loads, 0.0]]
+def test_an_emptying_brush_leaves_faint_then_dry_then_blank_marks():
+    named = [flaw_of_load(load) for load in [*(1.0 - 0.12 * n for n in range(9)), 0.0]]
     assert [flaw for flaw, _ in itertools.groupby(named)] == [None, Flaw.FAINT, Flaw.DRY, Flaw.BLANK]
-
-    def seen(load: float) -> tuple[float, float]:
-        """(tone, share of the outline inked), as a share of the fresh brush's."""
-        mark, fresh = (brush.press(15, 5, ink_load=v, press_seed=1) for v in (load, 1.0))
-        tone = np.median(mark.density[inked(mark)]) / np.median(fresh.density[inked(fresh)])
-        return float(tone), cover(mark, fresh)
-
-    for load, flaw in zip(loads, named, strict=False):
-        tone, share = seen(load)
-        assert (tone < 0.75) == (flaw is not None), (load, tone)
-        assert (share < 0.7) == (flaw is Flaw.DRY), (load, share)
 
 
 def test_a_brush_splits_by_itself_the_more_often_the_emptier_it_is():
@@ -270,6 +218,74 @@ def test_a_brush_splits_by_itself_the_more_often_the_emptier_it_is():
         return float(np.mean([natural_split(load, depth_mm, np.random.default_rng(n)) > 0.0 for n in range(400)]))
 
     assert chance(1.0) == chance(COHESIVE_LOAD) == 0.0
-    assert grows([chance(load) for load in (0.64, 0.4, 0.16)], 0.05)
+    assert 0.0 < chance(0.64) < chance(0.4) < chance(0.16)
     assert chance(0.1, depth_mm=1.0) == 0.0
     assert chance(0.0) == 0.0, "nothing shows"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "brush.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_brush_is_read_and_what_is_left_out_is_the_default(tmp_path: Path) -> None:
+    found = load_brush(written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nfriction = 0.3\nseed = 4\n'))
+    assert found.name == "our goat-hair brush"
+    assert found.spec == BrushSpec(friction=0.3, seed=4)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("friction = 3.0", r"brush: friction = 3 is outside 0 \.\. 0\.8"),
+        ("frictoin = 0.3", r"brush\.frictoin: "),
+        ("friction = nan", r"brush\.friction: .*finite"),
+        ("bristles = 400.5", r"brush\.bristles: .*integer"),
+        ("radius_mm = 19.0\nlength_mm = 40.0", r"brush: length_mm = 40 is outside 57 \.\. 120"),
+        ("friction = ", "is not TOML"),
+    ],
+)
+def test_a_brush_out_of_range_is_refused_with_file_field_and_range(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, f'name = "any"\n[brush]\n{text}\n')
+    with pytest.raises(SimFileError, match=message) as refused:
+        load_brush(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("depth_mm", "width_mm"), [(11.0, 8.67), (20.0, 15.77)])
+def test_the_paper_s_brush_marks_nearly_as_wide_as_ccd_bsm_says_and_says_for_what_it_was_made(
+    depth_mm: float, width_mm: float
+) -> None:
+    found = load_brush(Path(PAPER))
+    assert "made to agree with the paper's Table 2: no evidence for the model" in found.name
+    mark = Brush(found.spec).press(depth_mm, 5.0, ink_load=1.0, press_seed=1)
+    width = (mark.density > 0.4).sum(axis=0) / mark.px_per_mm
+    assert 0.8 < width.max() / width_mm < 1.2
+
+
+def test_the_rig_toml_of_the_paper_s_brush_says_where_its_marks_begin() -> None:
+    found = load_brush(Path(PAPER))
+    assert found.head is not None
+    heads_mm: list[float] = []
+    for depth_mm, tilt_deg in itertools.product((11.0, 20.0), (0.0, 5.0, 10.0)):
+        mark = Brush(found.spec).press(depth_mm, tilt_deg, ink_load=1.0, press_seed=1)
+        columns = np.flatnonzero((mark.density > 0.5).any(axis=0))
+        heads_mm.append((columns[-1] + 1 - mark.origin_px[0]) / mark.px_per_mm)
+    assert max(abs(at - found.head.head_mm) for at in heads_mm) < found.head.misplaced_mm - 0.5
+    assert max(abs(at - QualityConfig().head_mm) for at in heads_mm) > QualityConfig().misplaced_mm
+
+    at = Addresses("127.0.0.1", 1, 2, 3, None, None)
+    quality = tomllib.loads(rig_toml(SimConfig(brush=found.spec, head=found.head), at))["quality"]
+    assert quality == {"head_mm": found.head.head_mm, "misplaced_mm": found.head.misplaced_mm}
+    assert "quality" not in tomllib.loads(rig_toml(SimConfig(), at))
+
+
+def test_the_rig_is_served_with_the_brush_and_records_its_name(tmp_path: Path) -> None:
+    path = written(tmp_path, 'name = "our goat-hair brush"\n[brush]\nradius_mm = 5.0\nlength_mm = 45.0\n')
+    rig = tmp_path / "rig.toml"
+    words = ["sim", "--brush", str(path), "--write-rig", str(rig), "--idle-exit", "0.1"]
+    assert CliRunner().invoke(brushloop.__main__.app, words).exit_code == 0
+    brush = tomllib.loads(rig.read_text())["brush"]
+    assert (brush["name"], brush["radius_mm"], brush["length_mm"]) == ("our goat-hair brush", 5.0, 45.0)

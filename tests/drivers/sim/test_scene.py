@@ -16,33 +16,7 @@ from brushloop.drivers.sim.mjpeg_server import _Line
 from brushloop.drivers.sim.scene import Optics, Scene, board, homography, read_strip
 from brushloop.drivers.sim.world import World
 
-BENT = View(k1=-0.08)
-
-
-def test_a_perfect_lens_is_the_homography_alone() -> None:
-    optics = Optics(View(), 1)
-    points = np.array([[0.0, 0.0], [122.0, 86.0], [244.0, 172.0]])
-    mapped = np.column_stack([points, np.ones(3)]) @ optics.homography.T
-    assert optics.image_of(points) == pytest.approx(mapped[:, :2] / mapped[:, 2:], abs=1e-9)
-
-
-def test_corners_of_the_rendered_board_lie_where_the_optics_say() -> None:
-    config = SimConfig(view=BENT)
-    scene = Scene(World(config))
-    detector = cv2.aruco.CharucoDetector(board(config.table))
-    corners, ids, _, _ = detector.detectBoard(scene.render())
-    on_board = np.asarray(board(config.table).getChessboardCorners())[ids.ravel(), :2]
-    table = config.table
-    paper = np.column_stack(
-        [
-            table.board_origin_mm[0] + on_board[:, 0],
-            table.board_origin_mm[1] + table.board_squares[1] * table.board_square_mm - on_board[:, 1],
-        ]
-    )
-    off = np.linalg.norm(corners.reshape(-1, 2) - scene.optics.image_of(paper.astype(np.float64)), axis=1)
-    assert len(ids) > 100
-    assert np.median(off) < 0.3
-    assert np.quantile(off, 0.95) < 0.8
+CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
 
 
 def test_a_shadow_takes_light_from_a_part_of_the_sheet_only() -> None:
@@ -53,17 +27,9 @@ def test_a_shadow_takes_light_from_a_part_of_the_sheet_only() -> None:
     assert 0.2 < float((ratio < 0.8).mean()) < 0.8
 
 
-CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
-
-
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return Scene(World(CONFIG))
-
-
-@pytest.fixture(scope="module")
-def image(scene: Scene) -> np.ndarray:
-    return scene.render()
 
 
 def pixel(x_mm: float, y_mm: float) -> tuple[int, int]:
@@ -77,29 +43,19 @@ def gray_at(image: np.ndarray, x_mm: float, y_mm: float) -> float:
     return float(image[row - 3 : row + 4, column - 3 : column + 4].mean())
 
 
-def beside_the_sheet(x_mm: float, y_mm: float, by_mm: float) -> bool:
-    size_x_mm, size_y_mm = CONFIG.table.sheet_mm
-    return not (-by_mm < x_mm < size_x_mm + by_mm and -by_mm < y_mm < size_y_mm + by_mm)
-
-
-def test_every_corner_of_the_board_that_the_sheet_leaves_bare_is_found_where_it_lies(image: np.ndarray):
-    table = CONFIG.table
-    found, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(image)
-    at = dict(zip(ids.ravel().tolist(), found.reshape(-1, 2), strict=True))
-    columns, rows = (n - 1 for n in table.board_squares)
-    off_px: list[np.ndarray] = []
-    for ident in range(columns * rows):
-        row, column = divmod(ident, columns)  # counted from the upper left, row by row
-        x_mm = table.board_origin_mm[0] + (column + 1) * table.board_square_mm
-        y_mm = table.board_origin_mm[1] + (rows - row) * table.board_square_mm
-        if beside_the_sheet(x_mm, y_mm, table.board_square_mm):
-            assert ident in at
-        if ident in at and beside_the_sheet(x_mm, y_mm, 1.0):
-            u, v, w = homography(CONFIG.view) @ np.array([x_mm, y_mm, 1.0])
-            off_px.append(at[ident] - np.array([u / w, v / w]))
+@pytest.mark.parametrize("view", [CONFIG.view, View(k1=-0.08)], ids=["a lens without distortion", "with"])
+def test_corners_of_the_board_lie_where_the_optics_say(view: View):
+    table, scene = CONFIG.table, Scene(World(SimConfig(view=view)))
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board(table)).detectBoard(scene.render())
+    on_board = np.asarray(board(table).getChessboardCorners())[ids.ravel(), :2]
+    left, bottom = table.board_origin_mm
+    height_mm = table.board_squares[1] * table.board_square_mm
+    paper_mm = np.column_stack([left + on_board[:, 0], bottom + height_mm - on_board[:, 1]]).astype(np.float64)
+    off_px = corners.reshape(-1, 2) - scene.optics.image_of(paper_mm)
+    assert len(ids) > 100
+    assert np.quantile(np.linalg.norm(off_px, axis=1), 0.95) < 0.8
     # Blur rounds the corners of black squares, by turns to either side; the mean shows a wrong half pixel.
-    assert np.abs(off_px).max() < 0.8
-    assert np.abs(np.mean(off_px, axis=0)).max() < 0.05
+    assert np.abs(np.mean(off_px, axis=0)).max() < 0.1
 
 
 def test_noise_is_new_in_every_frame(scene: Scene):
@@ -123,11 +79,10 @@ def test_the_arm_hides_what_is_under_it():
     assert gray_at(image, 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
 
 
-@pytest.mark.parametrize("host_ns", [0, 1, 2**63 - 1, 0x5555555555555555, 1_795_000_000_123_456_789])
-@pytest.mark.parametrize("quality", [60, 95])
-def test_the_time_in_the_top_rows_survives_jpeg(small_view: View, host_ns: int, quality: int):
+@pytest.mark.parametrize("host_ns", [0, 2**63 - 1, 1_795_000_000_123_456_789])
+def test_the_time_in_the_top_rows_survives_jpeg(small_view: View, host_ns: int):
     scene = Scene(World(SimConfig(view=small_view)))
-    _, encoded = cv2.imencode(".jpg", scene.render(host_ns), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, encoded = cv2.imencode(".jpg", scene.render(host_ns), [cv2.IMWRITE_JPEG_QUALITY, 60])
     decoded = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
     assert read_strip(decoded) == host_ns
 
