@@ -129,7 +129,7 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
             client.settimeout(GUIDING_S if request["do"] == "hand" else TIMEOUT_S)
             client.connect(str(path))
             client.sendall(json.dumps(request).encode() + b"\n")
-            line = _read_line(client)
+            line = client.makefile("rb").readline(MAX_ANSWER_BYTES)
     except OSError as error:
         raise FaultRefused(f"{path}: no rig answers here: {error.strerror or error}") from None
     try:
@@ -143,10 +143,3 @@ def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:
             raise FaultRefused(error)
         case _:
             raise FaultRefused(f"{path}: not the control socket of a rig")
-
-
-def _read_line(client: socket.socket) -> bytes:
-    line = b""
-    while not line.endswith(b"\n") and len(line) < MAX_ANSWER_BYTES and (more := client.recv(65536)):
-        line += more
-    return line

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import functools
+import contextlib
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from brushloop.drivers.force.simulator import ForceBoard, SocketcandServer
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, Wrench
-from brushloop.drivers.geometry import columns, inverse, of_angles, product
-from brushloop.drivers.ink.simulator import Instrument, PtyLine, PumpFirmware, StationFirmware
+from brushloop.drivers.geometry import inverse, of_angles, product, turned
+from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
+from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.faults import Device, FaultBoard, Truth
@@ -44,6 +45,26 @@ def rig_toml(config: SimConfig, at: Addresses) -> str:
     """TOML text; addresses as served."""
     table, view, brush = config.table, config.view, config.brush
     touch_z_mm = table.paper_z_mm + TAUGHT_TOUCH_ERROR_MM
+    device = {
+        "station": f'kind = "ink-station"\nport = "{at.ink_path}"\nlight = 0.8\n',
+        "pump": f'kind = "modbus-pump"\nport = "{at.ink_path}"\nml_per_revolution = {PUMP_ML}\n',
+    }
+    ink_device = f"\n[ink.device]\n{device[config.ink_device]}" if config.ink_device in device else ""
+    fast = f"simulated time runs at {config.rate:g} times real time"
+    # A whole dwell could pass between two polls, and the age of a sample says little about the arm.
+    least_dwell = f"least_dwell_s = {SEEN_S * config.rate:g}    # {fast}\n" if config.rate > 2.0 else ""
+    stale = "100.0" if config.rate <= 1.0 else f"1000.0    # allowed on this bus alone: {fast}"
+    force = f"""
+[force]
+kind = "sri-m8123"
+interface = "socketcand"
+channel = "{LOOPBACK_CHANNEL}"
+host = "{at.host}"
+port = {at.force_port}
+stale_ms = {stale}
+"""
+    head = config.head
+    quality = "" if head is None else f"\n[quality]\nhead_mm = {head.head_mm}\nmisplaced_mm = {head.misplaced_mm}\n"
     return f"""\
 {LOOPBACK_HEAD}, seed {config.seed}. Simulated: nothing measured on it is a result on paper.
 name = "loopback rig"
@@ -90,7 +111,7 @@ touch_point_mm = [2.0, 2.0]
 name = "simulated ink"
 well_mm = [{table.well_mm[0]}, {table.well_mm[1]}]
 dip_z_mm = {table.paper_z_mm + table.ink_level_mm - 8.0}
-{_ink_device(config, at)}{_force_table(config, at)}
+{ink_device}{"" if at.force_port is None else force}
 [board]
 squares = [{table.board_squares[0]}, {table.board_squares[1]}]
 square_mm = {table.board_square_mm}
@@ -104,54 +125,7 @@ park_mm = [{config.home_mm[0]}, {config.home_mm[1]}, {config.home_mm[2]}]
 travel_speed_mm_s = 200.0
 press_speed_mm_s = 20.0
 acc_mm_s2 = 800.0
-{_dwell(config)}{_quality(config)}"""
-
-
-def _ink_device(config: SimConfig, at: Addresses) -> str:
-    match config.ink_device:
-        case "station":
-            return f'\n[ink.device]\nkind = "ink-station"\nport = "{at.ink_path}"\nlight = 0.8\n'
-        case "pump":
-            return f'\n[ink.device]\nkind = "modbus-pump"\nport = "{at.ink_path}"\nml_per_revolution = {PUMP_ML}\n'
-        case "none":
-            return ""
-
-
-def _force_table(config: SimConfig, at: Addresses) -> str:
-    if at.force_port is None:
-        return ""
-    return f"""
-[force]
-kind = "sri-m8123"
-interface = "socketcand"
-channel = "{LOOPBACK_CHANNEL}"
-host = "{at.host}"
-port = {at.force_port}
-{_staleness(config)}"""
-
-
-def _dwell(config: SimConfig) -> str:
-    """`least_dwell_s` if simulated time runs fast: else a whole dwell could pass between two polls."""
-    if config.rate <= 2.0:
-        return ""
-    return f"least_dwell_s = {SEEN_S * config.rate:g}    # simulated time runs at {config.rate:g} times real time\n"
-
-
-def _staleness(config: SimConfig) -> str:
-    """`stale_ms` of a real sensor; more if simulated time is fast: a sample's age then says little about the arm."""
-    if config.rate <= 1.0:
-        return "stale_ms = 100.0\n"
-    return f"stale_ms = 1000.0    # allowed on this bus alone: simulated time runs at {config.rate:g} times real time\n"
-
-
-def _quality(config: SimConfig) -> str:
-    if config.head is None:
-        return ""
-    return f"""
-[quality]
-head_mm = {config.head.head_mm}
-misplaced_mm = {config.head.misplaced_mm}
-"""
+{least_dwell}{quality}"""
 
 
 HOST = "127.0.0.1"
@@ -167,7 +141,7 @@ class LoopbackRig:
         self._host = host
         self.world = World(config)
         self.force = _force(self.world) if config.force_sensor else None
-        self.ink = None if config.ink_device == "none" else PtyLine(_ink(self.world, config.ink_device))
+        self.ink = _ink(self.world)
         missing = {Device.INK: self.ink, Device.FORCE: self.force}
         self.faults = FaultBoard(Truth(self.world), [device for device, server in missing.items() if server is None])
         """One board for all servers."""
@@ -180,7 +154,7 @@ class LoopbackRig:
             self.ink.next_fault = lambda: self._fault_of(Device.INK)
         if self.force is not None:
             self.force.board.next_fault = lambda: self._fault_of(Device.FORCE)
-        self._watching: asyncio.Task[None] | None = None
+        self._open = contextlib.AsyncExitStack()
 
     def _fault_of(self, device: Device) -> str | None:
         """The kind of the fault that strikes a request to a device, or its round."""
@@ -188,32 +162,32 @@ class LoopbackRig:
         return None if fault is None else fault.kind
 
     async def __aenter__(self) -> LoopbackRig:
-        try:
-            await self.arcs.start(self._host, self.config.arcs_port)
-            await self.rtde.start(self._host, self.config.rtde_port)
-            await self.camera.start(self._host, self.config.camera_port)
+        async with contextlib.AsyncExitStack() as opening:
+            for server, port in self._servers():
+                opening.push_async_callback(server.stop)
+                await server.start(self._host, port)
             if self.force is not None:
                 await asyncio.to_thread(self.world.reaction.prepare)  # takes some tenths of a second
-                await self.force.start(self._host, self.config.force_port)
             if self.ink is not None:
-                self.ink.__enter__()
-            self._watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
-        except BaseException:
-            await self.__aexit__()
-            raise
+                opening.enter_context(self.ink)
+            watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
+            opening.callback(watching.cancel)
+            self._open = opening.pop_all()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        if self._watching is not None:
-            self._watching.cancel()
-            await asyncio.gather(self._watching, return_exceptions=True)
-        if self.ink is not None:
-            self.ink.close()
-        if self.force is not None:
-            await self.force.stop()
-        await self.camera.stop()
-        await self.rtde.stop()
-        await self.arcs.stop()
+        await self._open.aclose()
+
+    def _servers(self) -> list[tuple[LoopbackServer, int]]:
+        """The servers on a port, and the port of each; 0 lets the system choose."""
+        config = self.config
+        force = [] if self.force is None else [(self.force, config.force_port)]
+        return [
+            (self.arcs, config.arcs_port),
+            (self.rtde, config.rtde_port),
+            (self.camera, config.camera_port),
+            *force,
+        ]
 
     def toml(self) -> str:
         """A `rig.toml` for this rig, as an operator would have taught it."""
@@ -259,7 +233,7 @@ class LoopbackRig:
         loop = asyncio.get_running_loop()
         since = loop.time()
         while loop.time() - since < seconds:
-            if self.arcs.clients + self.rtde.clients + self.camera.clients + (self.force.clients if self.force else 0):
+            if any(server.clients for server, _ in self._servers()):
                 since = loop.time()
             await asyncio.sleep(0.2)
 
@@ -277,25 +251,21 @@ def _force(world: World) -> SocketcandServer:
 
 def _at_sensor(config: SimConfig, wrench: Wrench) -> Wrench:
     """The wrench as the sensor reports it, whose axes and sign depend on how it is mounted."""
-    if (config.tool_lean_deg, config.sensor_turn_deg, config.sensor_sign) == ((0.0, 0.0), 0.0, 1):
-        return wrench
-    axes = _axes_of_sensor(config.tool_lean_deg, config.sensor_turn_deg, config.sensor_sign)
-    fx, fy, fz, mx, my, mz = (
-        sum(a * v for a, v in zip(row, part, strict=True)) for part in (wrench[:3], wrench[3:]) for row in axes
-    )
+    about_x, about_y = (math.radians(v) for v in config.tool_lean_deg)
+    sensor = of_angles(0.0, 0.0, math.radians(config.sensor_turn_deg))
+    brush_in_sensor = product(inverse(sensor), of_angles(about_x, about_y, 0.0))
+    force_n, torque_nm = (turned(brush_in_sensor, part) for part in (wrench[:3], wrench[3:]))
+    fx, fy, fz, mx, my, mz = (config.sensor_sign * value for value in (*force_n, *torque_nm))
     return fx, fy, fz, mx, my, mz
 
 
-@functools.lru_cache(maxsize=8)
-def _axes_of_sensor(lean_deg: tuple[float, float], turn_deg: float, sign: int) -> list[list[float]]:
-    """(3, 3) from the brush's axes to the sensor's, with its sign; solved once, as a round comes 200 times a second."""
-    brush = of_angles(math.radians(lean_deg[0]), math.radians(lean_deg[1]), 0.0)
-    sensor = of_angles(0.0, 0.0, math.radians(turn_deg))
-    return [[sign * value for value in row] for row in zip(*columns(product(inverse(sensor), brush)), strict=True)]
-
-
-def _ink(world: World, device: Literal["station", "pump"]) -> Instrument:
+def _ink(world: World) -> PtyLine | None:
     reservoir_ml = world.config.reservoir_ml
-    if device == "station":
-        return StationFirmware(world.well, reservoir_ml)
-    return PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=reservoir_ml, on_pumped=world.well.add)
+    match world.config.ink_device:
+        case "station":
+            return PtyLine(StationFirmware(world.well, reservoir_ml))
+        case "pump":
+            pumped = world.well.add
+            return PtyLine(PumpFirmware(ml_per_revolution=PUMP_ML, reservoir_ml=reservoir_ml, on_pumped=pumped))
+        case "none":
+            return None

@@ -40,16 +40,6 @@ MAX_LINE_BYTES = 8192
 MAX_CLIENTS = 16
 MAX_PATH_BYTES = 100
 """Longest allowed path of a unix socket; the system's limit is slightly higher."""
-FIELDS: dict[str, tuple[str, ...]] = {
-    "add": ("fault",),
-    "list": (),
-    "clear": ("id",),
-    "state": (),
-    "release": (),
-    "fresh-sheet": (),
-    "hand": ("act", "to", "index", "corner"),
-}
-"""Other keys allowed with each `do`."""
 USAGE = (
     'not a request: {"do": "add", "fault": {...}}, or "list", "clear" (with a number "id" or without), '
     '"state", "release", "fresh-sheet", "hand"'
@@ -110,30 +100,27 @@ class ControlServer(LoopbackServer):
 
     async def _obey(self, said: object) -> dict[str, Any]:
         request = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
-        do = str(request.get("do"))
-        if do not in FIELDS or not set(request) <= {"do", *FIELDS[do]}:
-            raise ValueError(USAGE)
-        board = self._rig.faults
-        match do, request.get("fault"), request.get("id"):
-            case "add", dict(values), _:  # pyright: ignore[reportUnknownVariableType]
+        board, alone = self._rig.faults, len(request) == 1
+        match request:
+            case {"do": "add", "fault": dict(values)} if len(request) == 2:  # pyright: ignore[reportUnknownVariableType]
                 return {"id": board.hang(fault_of(values))}  # pyright: ignore[reportUnknownArgumentType]
-            case "list", _, _:
+            case {"do": "list"} if alone:
                 return {"hanging": [_as_json(h) for h in board.hanging], "over": [_as_json(h) for h in board.over]}
-            case "clear", _, None:
+            case {"do": "clear"} if alone:
                 return {"taken": board.clear()}
-            case "clear", _, int(ident) if not isinstance(ident, bool):
+            case {"do": "clear", "id": int(ident)} if len(request) == 2 and not isinstance(ident, bool):
                 return {"taken": int(board.take(ident))}
-            case "state", _, _:
+            case {"do": "state"} if alone:
                 return self._rig.state()
-            case "release", _, _:
+            case {"do": "release"} if alone:
                 return {"was": self._rig.arcs.cabinet.release()}
-            case "fresh-sheet", _, _:
+            case {"do": "fresh-sheet"} if alone:
                 self._rig.world.fresh_sheet()
                 return {}
-            case "hand", _, _ if self._person is not None:
+            case {"do": "hand"} if set(request) <= {"do", "act", "to", "index", "corner"}:
+                if self._person is None:
+                    raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
                 return await self._person(request)
-            case "hand", _, _:
-                raise ValueError("there is no person here: only the lab of `brushloop sim --unknown` has one")
             case _:
                 raise ValueError(USAGE)
 

@@ -91,21 +91,16 @@ class Reaction:
         self._brush = brush
         self._arm_m = sensor_to_tip_mm / 1e3
         self._weight_n = hanging_kg * GRAVITY_M_S2
-        self._table: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def prepare(self) -> None:
         """Solve the spines; takes some tenths of a second, so call it outside the event loop. Once is enough."""
-        if self._table is not None:
-            return
-        self._table = _pushes(self._brush.spec)
+        _pushes(self._brush.spec)
 
     def push_n(self, depth_mm: float, tilt_deg: float) -> float:
         """Normal force of the paper on the bundle; 0 in the air."""
         if depth_mm <= 0.0:
             return 0.0
-        self.prepare()
-        assert self._table is not None
-        steps_mm, rows = self._table
+        steps_mm, rows = _pushes(self._brush.spec)
         at_tilts = np.array([np.interp(depth_mm, steps_mm, rows[k]) for k in range(len(TILTS_DEG))], np.float64)
         return float(np.interp(tilt_deg, np.array(TILTS_DEG), at_tilts))
 
