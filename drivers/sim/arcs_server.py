@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
@@ -179,15 +178,6 @@ BACKLOG_BYTES = 32 * 1024
 """A client that does not read is sent nothing more until it has caught up."""
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One client's subscription on one channel."""
-
-    chanel: int
-    period_s: float
-    segments: tuple[str, ...]
-
-
 class RtdeServer(LoopbackServer):
     """One RTDE port for any number of clients."""
 
@@ -217,27 +207,27 @@ class RtdeServer(LoopbackServer):
             while data := await reader.read(65536):
                 self.pings += data.count(PING)
                 for payload in decoder.feed(data):
-                    topic = topic_of(payload)
-                    if (old := pushes.pop(topic.chanel, None)) is not None:
+                    chanel, hz, names = topic_of(payload)
+                    if (old := pushes.pop(chanel, None)) is not None:
                         old.cancel()
-                    if topic.period_s > 0.0 and all(name in self._outputs for name in topic.segments):
-                        pushes[topic.chanel] = asyncio.create_task(self._push(topic, writer), name="rtde push")
+                    if hz > 0.0 and names and all(name in self._outputs for name in names):
+                        push = self._push(chanel, 1.0 / min(hz, MAX_HZ), names, writer)
+                        pushes[chanel] = asyncio.create_task(push, name="rtde push")
         finally:
             for task in pushes.values():
                 task.cancel()
             await asyncio.gather(*pushes.values(), return_exceptions=True)
 
-    async def _push(self, topic: Topic, writer: asyncio.StreamWriter) -> None:
+    async def _push(self, chanel: int, period_s: float, names: list[str], writer: asyncio.StreamWriter) -> None:
         loop = asyncio.get_running_loop()
         due, before_s = loop.time(), self._cabinet.now_s()
         while not writer.is_closing():
             now_s = self._cabinet.now_s()
             if writer.transport.get_write_buffer_size() < BACKLOG_BYTES:
-                for rest in self._rests(before_s, now_s):
-                    self._push_once(topic, writer, rest)
-                self._push_once(topic, writer)
+                for rest in (*self._rests(before_s, now_s), None):
+                    self._push_once(chanel, [self._value(name, rest) for name in names], writer)
             before_s = now_s
-            due = max(due + topic.period_s, loop.time())
+            due = max(due + period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
     def _rests(self, after_s: float, until_s: float) -> list[Rest]:
@@ -259,20 +249,22 @@ class RtdeServer(LoopbackServer):
                     pass
         return self._outputs[name][1]()
 
-    def _push_once(self, topic: Topic, writer: asyncio.StreamWriter, rest: Rest | None = None) -> None:
+    def _push_once(self, chanel: int, values: list[Any], writer: asyncio.StreamWriter) -> None:
         fault = self.faults.meet(Device.TELEMETRY)
         if fault is not None and fault.kind == "mute":
             return
-        sample = encode_sample(topic.chanel, [self._value(name, rest) for name in topic.segments])
+        sample = encode_sample(chanel, values)
         late_s = 0.0 if fault is None else fault.late_s
         asyncio.get_running_loop().call_later(late_s, _write, writer, sample)
 
 
-def topic_of(payload: bytes) -> Topic:
-    """The subscription in a payload; a period of 0 if the client unsubscribes. Raises `ProtocolViolation`."""
+def topic_of(payload: bytes) -> tuple[int, float, list[str]]:
+    """Channel, frequency in Hz and outputs of a subscription; 0 Hz, or no output, to unsubscribe.
+
+    Raises `ProtocolViolation`.
+    """
     match decode_message(payload, "rtde"):
         case (100, [{"chanel": int(chanel), "frequency": float() | int() as hz, "segments": list(names)}]):  # pyright: ignore[reportUnknownVariableType]
-            wanted = tuple(str(name) for name in names)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-            return Topic(chanel, 1.0 / min(hz, MAX_HZ) if hz > 0 and wanted else 0.0, wanted)
+            return chanel, hz, [str(name) for name in names]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
         case other:
             raise ProtocolViolation("rtde", "topic", f"not a topic: {other!r}")
