@@ -1,7 +1,8 @@
-"""A cabinet on a clock that the test turns."""
+"""A cabinet on a clock that the test turns, and a rig that serves."""
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -9,14 +10,15 @@ import pytest
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance, to_wire
 from brushloop.drivers.sim.cabinet import Cabinet, methods
-from brushloop.drivers.sim.config import SimConfig
+from brushloop.drivers.sim.config import SimConfig, View
+from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.world import World
 
 TOOL = [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
 CABINETS_OWN = ("RuntimeMachine", "RegisterControl", "SystemInfo")
 
 
-class Hand:
+class StoppedClock:
     """A clock that stands still until it is turned."""
 
     rate = 1.0
@@ -31,7 +33,7 @@ class Bench:
 
     def __init__(self) -> None:
         self.world = World(SimConfig())
-        self.clock = self.world.clock = Hand()  # type: ignore[assignment]
+        self.clock = self.world.clock = StoppedClock()  # type: ignore[assignment]
         self.cabinet = Cabinet(self.world)
         self.table = methods(self.cabinet)
         self.ask("RobotConfig.setTcpOffset", offset=TOOL)
@@ -80,3 +82,10 @@ def off() -> Bench:
 def on(off: Bench) -> Bench:
     off.run()
     return off
+
+
+@pytest.fixture
+async def rig(small_view: View) -> AsyncIterator[LoopbackRig]:
+    """Everything that a rig has, 20 times faster than life."""
+    async with LoopbackRig(SimConfig(rate=20.0, view=small_view)) as it:
+        yield it

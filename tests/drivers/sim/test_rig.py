@@ -6,7 +6,6 @@ import asyncio
 import itertools
 import time
 import tomllib
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -30,12 +29,6 @@ from brushloop.drivers.sim.world import World
 @pytest.fixture
 def config(small_view: View) -> SimConfig:
     return SimConfig(rate=20.0, view=small_view)
-
-
-@pytest.fixture
-async def rig(config: SimConfig) -> AsyncIterator[LoopbackRig]:
-    async with LoopbackRig(config) as it:
-        yield it
 
 
 async def test_both_servers_listen_on_loopback_and_nowhere_else(rig: LoopbackRig):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 
 import numpy as np
 import pytest
 
+from brushloop.drivers.arcs import stopping
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.camera import CameraOptions, OpenCvCamera
 from brushloop.drivers.camera.opencv import FrameFault, FrameHealth
 from brushloop.drivers.devices import Stamp
@@ -30,6 +32,18 @@ from brushloop.drivers.sim.faults import ALWAYS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.rig import HOST, LoopbackRig
 from brushloop.drivers.sim.scene import read_strip
 from tests.waiting import wait_until
+
+RPC_TIMEOUT_S = 0.4
+
+
+@pytest.fixture(autouse=True)
+def impatient() -> Iterator[None]:
+    # A patch of its own: `monkeypatch` would be undone after the arm is closed, and tests rely on its being before.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stopping, "CONFIRM_S", 1.5)
+        patch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", RPC_TIMEOUT_S)
+        yield
+
 
 FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}  # two real seconds
