@@ -17,7 +17,7 @@ from brushloop.drivers.errors import ProtocolViolation
 from brushloop.drivers.geometry import to_wire
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.cabinet import Cabinet, methods
-from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard, Truth
+from brushloop.drivers.sim.faults import KINDS, LOST, STOPS, Device, Fault, FaultBoard
 from brushloop.drivers.sim.motion import Rest
 from brushloop.drivers.sim.world import World
 
@@ -89,7 +89,7 @@ class ArcsServer(LoopbackServer):
         """`faults` is the board of the whole rig; alone, the server has one of its own."""
         super().__init__()
         self.cabinet = Cabinet(world)
-        self.faults = faults or FaultBoard(Truth(world))
+        self.faults = faults or FaultBoard(world)
         self._methods = methods(self.cabinet)
 
     async def stop(self) -> None:
@@ -184,7 +184,7 @@ class RtdeServer(LoopbackServer):
     def __init__(self, cabinet: Cabinet, faults: FaultBoard | None = None) -> None:
         """`faults` is the board of the whole rig; alone, the server has one of its own."""
         super().__init__()
-        self.faults = faults or FaultBoard(Truth(cabinet.world))
+        self.faults = faults or FaultBoard(cabinet.world)
         self._cabinet = cabinet
         self.pings = 0
         """Keep-alives seen, for tests."""

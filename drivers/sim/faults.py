@@ -51,50 +51,31 @@ class Phase(StrEnum):
     """At rest anywhere else."""
 
 
-class Truth:
-    """The facts about one world that faults may wait for. Use it in the thread that owns the world."""
+def phase_of(world: World) -> Phase:
+    """What the arm does now. Use it in the thread that owns the world."""
+    config, here, to = world.config, world.tool(), world.target()
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def on_paper(pose: Pose) -> tuple[float, float, float]:
+        x_mm, y_mm = world.to_paper(pose.x_mm, pose.y_mm)
+        return x_mm, y_mm, config.table.above_mm(x_mm, y_mm, pose.z_mm)
 
-    def now_s(self) -> float:
-        """Simulated seconds since the rig started."""
-        return self._world.clock.now_s()
-
-    @property
-    def presses(self) -> int:
-        """Marks on the paper so far: the index of the press to come."""
-        return len(self._world.presses)
-
-    def target(self) -> Pose | None:
-        """End of the piece of the path that is being travelled; None at rest."""
-        return self._world.motion.target(self.now_s())
-
-    def phase(self) -> Phase:
-        """What the arm does now."""
-        config, here, to = self._world.config, self._world.tool(), self.target()
-        x_mm, y_mm, above_mm = self._on_paper(here)
-        (size_x_mm, size_y_mm), end_mm = config.table.sheet_mm, above_mm if to is None else self._on_paper(to)[2]
-        over_well = math.dist((x_mm, y_mm), config.table.well_mm) <= config.table.well_radius_mm
-        over_sheet = 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
-        if over_well and min(above_mm, end_mm) < config.table.well_depth_mm:
-            return Phase.DIPPING
-        if to is None:
-            if over_sheet and above_mm <= ON_PAPER_MM:
-                return Phase.PRESSED
-            return Phase.PARKED if math.dist(here.position_mm, config.home_mm) <= HOME_MM else Phase.RESTING
-        if over_sheet and above_mm < 0.0 and 0.0 <= above_mm - end_mm <= ALL_BUT_THERE_MM:
+    x_mm, y_mm, above_mm = on_paper(here)
+    (size_x_mm, size_y_mm), end_mm = config.table.sheet_mm, above_mm if to is None else on_paper(to)[2]
+    over_well = math.dist((x_mm, y_mm), config.table.well_mm) <= config.table.well_radius_mm
+    over_sheet = 0.0 <= x_mm <= size_x_mm and 0.0 <= y_mm <= size_y_mm
+    if over_well and min(above_mm, end_mm) < config.table.well_depth_mm:
+        return Phase.DIPPING
+    if to is None:
+        if over_sheet and above_mm <= ON_PAPER_MM:
             return Phase.PRESSED
-        if over_sheet and end_mm < above_mm and end_mm <= ON_PAPER_MM:
-            return Phase.DESCENDING
-        if over_sheet and end_mm > above_mm and above_mm <= LIFT_MM:
-            return Phase.LIFTING
-        return Phase.TRAVELLING
-
-    def _on_paper(self, pose: Pose) -> tuple[float, float, float]:
-        """x and y in the paper frame, and the distance from the paper along its normal."""
-        x_mm, y_mm = self._world.to_paper(pose.x_mm, pose.y_mm)
-        return x_mm, y_mm, self._world.config.table.above_mm(x_mm, y_mm, pose.z_mm)
+        return Phase.PARKED if math.dist(here.position_mm, config.home_mm) <= HOME_MM else Phase.RESTING
+    if over_sheet and above_mm < 0.0 and 0.0 <= above_mm - end_mm <= ALL_BUT_THERE_MM:
+        return Phase.PRESSED
+    if over_sheet and end_mm < above_mm and end_mm <= ON_PAPER_MM:
+        return Phase.DESCENDING
+    if over_sheet and end_mm > above_mm and above_mm <= LIFT_MM:
+        return Phase.LIFTING
+    return Phase.TRAVELLING
 
 
 ALWAYS = 1_000_000
@@ -220,16 +201,20 @@ class FaultBoard:
     """Faults in the order in which they were added; of several that match one request the first strikes it."""
 
     def __init__(
-        self, truth: Truth, missing: Sequence[Device] = (), real_s: Callable[[], float] = time.monotonic
+        self, world: World, missing: Sequence[Device] = (), real_s: Callable[[], float] = time.monotonic
     ) -> None:
         """`missing`: devices that the rig does not have."""
-        self.truth = truth
+        self._world = world
         self._missing = missing
         self._real_s = real_s
         self._idents = itertools.count(1)
         self._hanging: dict[int, Hung] = {}
         self.over: deque[Hung] = deque(maxlen=KEPT)
         """The newest finished faults."""
+
+    def phase(self) -> Phase:
+        """What the arm does now."""
+        return phase_of(self._world)
 
     def hang(self, fault: Fault) -> int:
         """Add a fault; return the number by which it can be removed. Raises ValueError where it can never strike."""
@@ -305,11 +290,10 @@ class FaultBoard:
             self._end(hung)
 
     def _holds(self, fault: Fault) -> bool:
-        truth = self.truth
         return (
-            truth.now_s() >= fault.after_s
-            and (fault.press is None or truth.presses == fault.press)
-            and (fault.phase is None or truth.phase() is fault.phase)
+            self._world.clock.now_s() >= fault.after_s
+            and (fault.press is None or len(self._world.presses) == fault.press)
+            and (fault.phase is None or self.phase() is fault.phase)
         )
 
     def _end(self, hung: Hung) -> None:

@@ -182,7 +182,7 @@ class Person:
         world, power = self._world, self._cabinet.power
         if power.safety not in MOVING_ALLOWED:
             return f"The pendant shows {power.safety.value}: that has to be ended first."
-        if world.motion.target(world.clock.now_s()) is not None or world.motion.held:
+        if world.target() is not None or world.motion.held:
             return "The arm moves by itself; I keep my hands off."
         while power.mode != RobotMode.RUNNING:
             power.power_on()
@@ -230,7 +230,7 @@ class Person:
         try:
             for joints in way:
                 motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, world.clock.now_s(), 0.0)
-            while motion.target(world.clock.now_s()) is not None:
+            while world.target() is not None:
                 await asyncio.sleep(LOOK_S)
         finally:
             world.hand_guided = False

@@ -15,7 +15,7 @@ from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmwa
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.faults import Device, FaultBoard, Truth
+from brushloop.drivers.sim.faults import Device, FaultBoard
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
@@ -143,7 +143,7 @@ class LoopbackRig:
         self.force = _force(self.world) if config.force_sensor else None
         self.ink = _ink(self.world)
         missing = {Device.INK: self.ink, Device.FORCE: self.force}
-        self.faults = FaultBoard(Truth(self.world), [device for device, server in missing.items() if server is None])
+        self.faults = FaultBoard(self.world, [device for device, server in missing.items() if server is None])
         """One board for all servers."""
         self.arcs = ArcsServer(self.world, self.faults)
         self.rtde = RtdeServer(self.arcs.cabinet, self.faults)
@@ -209,14 +209,14 @@ class LoopbackRig:
 
     def state(self) -> dict[str, Any]:
         """Current state of the world, as JSON."""
-        power, truth = self.arcs.cabinet.power, self.faults.truth
+        power, world = self.arcs.cabinet.power, self.world
         return {
-            "now_s": round(truth.now_s(), 3),
-            "phase": truth.phase().value,
-            "moving": truth.target() is not None,
-            "tip_mm": [round(v, 3) for v in self.world.tool().position_mm],
-            "presses": truth.presses,
-            "ink_load": round(self.world.ink_load, 3),
+            "now_s": round(world.clock.now_s(), 3),
+            "phase": self.faults.phase().value,
+            "moving": world.target() is not None,
+            "tip_mm": [round(v, 3) for v in world.tool().position_mm],
+            "presses": len(world.presses),
+            "ink_load": round(world.ink_load, 3),
             "robot_mode": power.mode.value,
             "safety_mode": power.safety.value,
             "faults": len(self.faults.hanging),

@@ -247,6 +247,10 @@ class World:
         """Current pose of the tip in the base frame."""
         return self.motion.pose(self.clock.now_s())
 
+    def target(self) -> Pose | None:
+        """End of the piece of the path that is being travelled; None at rest."""
+        return self.motion.target(self.clock.now_s())
+
     def wrench(self) -> Wrench:
         """Current wrench on the force sensor, in the tool's frame."""
         tip, table, push_n = self.tool(), self.config.table, self.push_n

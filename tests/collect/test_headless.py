@@ -58,7 +58,7 @@ def test_a_run_whose_terminal_is_closed_finishes_its_step_and_parks(lab: Lab) ->
     _, stderr = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 4
     assert stderr.splitlines()[-1] == "brushloop: parked on request; the same command resumes from here"
-    assert lab.rig.faults.truth.phase() is Phase.PARKED
+    assert lab.rig.faults.phase() is Phase.PARKED
     [folder] = lab.sessions.iterdir()
     assert not replay(folder / JOURNAL_NAME).cut
 
@@ -74,7 +74,7 @@ def test_a_signal_says_that_the_brush_may_be_down_where_it_may(lab: Lab) -> None
     _, stderr = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 4
     assert "brush may be down" in stderr.splitlines()[-1]
-    assert lab.rig.faults.truth.phase() is not Phase.PARKED
+    assert lab.rig.faults.phase() is not Phase.PARKED
 
 
 def test_a_second_process_is_refused_and_the_first_goes_on(lab: Lab) -> None:

@@ -71,4 +71,4 @@ def at_rest_above_the_paper(lab: Lab) -> bool:
 
 def parked(lab: Lab) -> bool:
     """At rest where the arm waits, out of the camera's view."""
-    return at_rest_above_the_paper(lab) and lab.rig.faults.truth.phase() is Phase.PARKED
+    return at_rest_above_the_paper(lab) and lab.rig.faults.phase() is Phase.PARKED

@@ -191,12 +191,12 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
     def now() -> bool:
         if not engine.snapshot().step.startswith(moment.step):
             return False
-        to = rig.faults.truth.target()
+        to = rig.world.target()
         if moment.method == LINE and to is None:
             return False  # already there
         if moment.deep and (to is None or to.z_mm > rig.config.table.paper_z_mm - 1.0):
             return False
-        return moment.phase is None or rig.faults.truth.phase() is moment.phase
+        return moment.phase is None or rig.faults.phase() is moment.phase
 
     def watched(params: dict[str, Any]) -> Any:
         if targets:
@@ -205,7 +205,7 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
             stage.gears.shift(slow)  # or a line would be over before anyone has looked at it
         result = original(params)
         if now():
-            targets.append(rig.faults.truth.target())
+            targets.append(rig.world.target())
             rig.faults.hang(fault)
         if moment.method == WAITING and not targets:
             return result
@@ -270,7 +270,7 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     assert stage.at_rest
     [target] = targets
     if expected in (DONE, BLIND):
-        assert stage.rig.faults.truth.phase() is Phase.PARKED
+        assert stage.rig.faults.phase() is Phase.PARKED
     elif carried_out(name, phase):
         assert stage.rig.world.tool().z_mm > stage.rig.config.table.paper_z_mm + 7.0, "lifted"
     elif target is not None and phase != "at depth":

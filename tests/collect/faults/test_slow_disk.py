@@ -116,5 +116,5 @@ def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_o
 
 def assert_stopped_clear_of_the_paper(stage: Stage) -> None:
     assert stage.at_rest
-    assert stage.rig.faults.truth.phase() in (Phase.PARKED, Phase.RESTING)
+    assert stage.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
     assert stage.rig.world.tool().z_mm >= stage.rig.config.table.paper_z_mm + 8.0

@@ -271,6 +271,6 @@ async def test_a_sensor_that_was_silent_is_heard_again_as_soon_as_the_fault_is_c
 
 
 async def test_a_rig_without_the_instrument_refuses_its_faults(rig: LoopbackRig):
-    bare = FaultBoard(rig.faults.truth, [Device.INK])
+    bare = FaultBoard(rig.world, [Device.INK])
     with pytest.raises(ValueError, match="device = 'ink': this rig has none"):
         bare.hang(Fault(device=Device.INK, kind="garbage"))

@@ -10,7 +10,6 @@ import stat
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from brushloop.drivers.loopback import FaultRefused, request_of
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.faults import KINDS, Device, Fault, FaultBoard, Phase, Truth, fault_of
+from brushloop.drivers.sim.faults import KINDS, Device, Fault, FaultBoard, Phase, fault_of, phase_of
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.serve import MAX_LINE_BYTES, ControlServer, live_control
 from brushloop.drivers.sim.world import World
@@ -31,18 +30,15 @@ from tests.drivers.sim.conftest import StoppedClock
 from tests.waiting import PATIENCE_S, wait_until
 
 
-@dataclass
-class Scripted:
-    """A world whose state is set by the test, and a clock."""
+class Scripted(FaultBoard):
+    """A board over a world whose state is set by the test, and a clock."""
 
-    presses: int = 0
-    sim_s: float = 0.0
-    doing: Phase = Phase.PARKED
-    real_s: float = 0.0
-    board: FaultBoard = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.board = FaultBoard(self, real_s=lambda: self.real_s)
+    def __init__(self) -> None:
+        self.sim_s = self.real_s = 0.0
+        self.doing = Phase.PARKED
+        self.presses: list[None] = []
+        self.clock = self
+        super().__init__(self, real_s=lambda: self.real_s)  # type: ignore[arg-type]
 
     def now_s(self) -> float:
         return self.sim_s
@@ -51,7 +47,7 @@ class Scripted:
         return self.doing
 
     def strikes(self, *ops: str) -> list[bool]:
-        return [self.board.meet(Device.ROBOT, op) is not None for op in ops]
+        return [self.meet(Device.ROBOT, op) is not None for op in ops]
 
 
 @pytest.fixture
@@ -64,20 +60,20 @@ def mute(**more: object) -> Fault:
 
 
 def test_without_conditions_a_fault_strikes_the_next_request_and_is_over(world: Scripted):
-    world.board.hang(mute())
+    world.hang(mute())
     assert world.strikes("a", "b") == [True, False]
-    assert [hung.struck for hung in world.board.over] == [1]
-    assert not world.board.hanging
+    assert [hung.struck for hung in world.over] == [1]
+    assert not world.hanging
 
 
 def test_a_method_is_named_in_short_or_in_full(world: Scripted):
-    world.board.hang(mute(on="moveLine", count=2))
+    world.hang(mute(on="moveLine", count=2))
     ops = ("rob1.MotionControl.getExecId", "rob1.MotionControl.moveLine", "rob1.MotionControl.moveLines", "moveLine")
     assert world.strikes(*ops) == [False, True, False, True]
 
 
 def test_the_nth_is_counted_among_requests_for_which_all_else_holds(world: Scripted):
-    world.board.hang(mute(on="x", nth=2, phase="descending", count=2))
+    world.hang(mute(on="x", nth=2, phase="descending", count=2))
     assert world.strikes("x", "x") == [False, False]
     world.doing = Phase.DESCENDING
     assert world.strikes("x", "y", "x") == [False, False, True]
@@ -86,25 +82,25 @@ def test_the_nth_is_counted_among_requests_for_which_all_else_holds(world: Scrip
 
 
 def test_time_and_presses_are_conditions_too(world: Scripted):
-    world.board.hang(mute(after_s=10.0, press=3))
-    world.presses = 3
+    world.hang(mute(after_s=10.0, press=3))
+    world.presses = [None] * 3
     assert world.strikes("x") == [False]
     world.sim_s = 10.0
-    world.presses = 4
+    world.presses = [None] * 4
     assert world.strikes("x") == [False]
-    world.presses = 3
+    world.presses = [None] * 3
     assert world.strikes("x") == [True]
 
 
 def test_for_so_many_seconds_counts_from_when_it_begins(world: Scripted):
-    world.board.hang(mute(for_s=2.0))
+    world.hang(mute(for_s=2.0))
     world.real_s = 100.0
     assert world.strikes("x", "x") == [True, True]
     world.real_s = 101.9
     assert world.strikes("x") == [True]
     world.real_s = 102.0
     assert world.strikes("x") == [False]
-    assert [hung.struck for hung in world.board.over] == [3]
+    assert [hung.struck for hung in world.over] == [3]
 
 
 @pytest.mark.parametrize(
@@ -115,33 +111,33 @@ def test_for_so_many_seconds_counts_from_when_it_begins(world: Scripted):
     ],
 )
 def test_a_stop_begins_by_itself_and_once(world: Scripted, fault: Fault):
-    world.board.hang(fault)
-    assert world.board.meet(fault.device) is None
-    assert world.board.due() == []
+    world.hang(fault)
+    assert world.meet(fault.device) is None
+    assert world.due() == []
     world.doing = Phase.LIFTING
-    assert world.board.due() == [fault]
-    assert world.board.due() == []
+    assert world.due() == [fault]
+    assert world.due() == []
 
 
 def test_a_fault_of_ink_begins_by_itself_and_strikes_the_requests_that_follow(world: Scripted):
-    world.board.hang(Fault(device=Device.INK, kind="garbage", phase=Phase.LIFTING, count=2))
-    assert world.board.due() == []
-    assert world.board.meet(Device.INK) is None
+    world.hang(Fault(device=Device.INK, kind="garbage", phase=Phase.LIFTING, count=2))
+    assert world.due() == []
+    assert world.meet(Device.INK) is None
     world.doing = Phase.LIFTING
-    world.board.due()
+    world.due()
     world.doing = Phase.PARKED
-    strikes = [world.board.meet(Device.INK) is not None for _ in range(3)]
+    strikes = [world.meet(Device.INK) is not None for _ in range(3)]
     assert strikes == [True, True, False]
 
 
 @pytest.mark.parametrize("device", [Device.INK, Device.FORCE])
 def test_clearing_ends_a_fault_that_has_begun(world: Scripted, device: Device):
     kind = min(KINDS[device])
-    world.board.hang(Fault(device=device, kind=kind, count=1000))
-    world.board.due()
-    assert world.board.meet(device) is not None
-    assert world.board.clear() == 1
-    assert world.board.meet(device) is None
+    world.hang(Fault(device=device, kind=kind, count=1000))
+    world.due()
+    assert world.meet(device) is not None
+    assert world.clear() == 1
+    assert world.meet(device) is None
 
 
 def test_a_fault_has_what_its_request_says() -> None:
@@ -218,7 +214,7 @@ def test_each_piece_of_a_press_and_of_a_dip_has_its_phase(
     world.motion.add(base(here), 200.0, 1000.0, clock.s)
     clock.s = 100.0
     world.motion.add(base(to), 200.0, 1000.0, clock.s)
-    assert Truth(world).phase() is phase
+    assert phase_of(world) is phase
 
 
 @pytest.mark.parametrize(
@@ -233,7 +229,7 @@ def test_on_a_sloping_sheet_heights_count_from_the_paper_under_the_tip(
     world.clock = clock = StoppedClock()  # type: ignore[assignment]
     world.motion.add(brush_pose(*table.to_base(*corner_mm, above_mm)), 100.0, 1000.0, clock.s)
     clock.s = 60.0
-    assert Truth(world).phase() is phase
+    assert phase_of(world) is phase
 
 
 Ask = Callable[[object], Awaitable[dict[str, Any]]]
