@@ -16,7 +16,7 @@ from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.kinematics import HOME, inverse, inverted, matrix_of
-from brushloop.drivers.sim.scene import camera_matrix, homography
+from brushloop.drivers.sim.scene import Floats, camera_matrix, homography, mapped
 from brushloop.drivers.sim.world import tool_of
 
 Place = tuple[float, float, float]
@@ -262,20 +262,22 @@ def _nearest_mm(start: Place, end: Place) -> float:
 
 def in_picture(config: SimConfig, place: Place) -> bool:
     """Whether the arm with its tip there hides a part of the picture, lens distortion aside."""
-    table, view = config.table, config.view
-    u, v, w = homography(view) @ np.array([*table.to_paper(*place[:2]), 1.0])
-    edge_px = CLEAR_OF_PICTURE_MM * view.px_per_mm
-    return bool(-edge_px <= u / w <= view.width_px + edge_px and -edge_px <= v / w <= view.height_px + edge_px)
+    at_mm = np.array([config.table.to_paper(*place[:2])])
+    return _within_picture(config.view, at_mm, -CLEAR_OF_PICTURE_MM * config.view.px_per_mm)
 
 
 def _board_in_picture(config: SimConfig) -> bool:
     """Whether all of the board is seen, with a margin for the lens's distortion."""
-    table, view = config.table, config.view
-    (left, bottom), (width, height) = table.board_origin_mm, board_size_mm(table)
-    ends = np.array([[left + i * width, bottom + j * height, 1.0] for i in (0, 1) for j in (0, 1)])
-    mapped = ends @ homography(view).T
-    inside = mapped[:, :2] / mapped[:, 2:]
-    return bool(np.all((inside > 12.0) & (inside < np.array([view.width_px, view.height_px]) - 12.0)))
+    (left, bottom), (width, height) = config.table.board_origin_mm, board_size_mm(config.table)
+    corners_mm = np.array([[left + i * width, bottom + j * height] for i in (0, 1) for j in (0, 1)])
+    return _within_picture(config.view, corners_mm, 12.0)
+
+
+def _within_picture(view: View, paper_mm: Floats, margin_px: float) -> bool:
+    """Whether all of the (n, 2) points of the paper plane lie so far within the picture."""
+    inside = mapped(homography(view), paper_mm)
+    most = np.array([view.width_px, view.height_px]) - margin_px
+    return bool(np.all((inside > margin_px) & (inside < most)))
 
 
 def poses(facts: Facts) -> Iterator[Pose]:

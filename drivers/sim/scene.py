@@ -44,8 +44,7 @@ class Optics:
 
     def undistorted_image_of(self, paper_mm: Floats) -> Floats:
         """The same as `image_of`, for a lens without distortion."""
-        mapped = np.column_stack([paper_mm, np.ones(len(paper_mm))]) @ self.homography.T
-        return np.asarray(mapped[:, :2] / mapped[:, 2:], np.float64)
+        return mapped(self.homography, paper_mm)
 
     def distort(self, undistorted: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An image as this lens would have taken it; the same if the lens is perfect."""
@@ -60,6 +59,11 @@ class Optics:
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
         places = cv2.undistortPoints(pixels, self.camera_matrix, self.distortion, P=self.camera_matrix)
         return places.reshape(view.height_px, view.width_px, 2).astype(np.float32)
+
+
+def mapped(homography: Floats, points: Floats) -> Floats:
+    """(n, 2) points where a homography takes (n, 2) points."""
+    return np.asarray(cv2.perspectiveTransform(points[None], homography)[0], np.float64)
 
 
 def camera_matrix(view: View) -> Floats:

@@ -269,13 +269,10 @@ def _signalled() -> asyncio.Event:
 async def _until_over(rig: LoopbackRig, over: asyncio.Event, idle_exit_s: float) -> None:
     """Serve until the event is set or no client was connected for `idle_exit_s`; SIGUSR1 changes the sheet."""
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, rig.world.fresh_sheet)
-    waits: list[asyncio.Task[object]] = [asyncio.create_task(over.wait())]
     if idle_exit_s > 0:
-        waits.append(asyncio.create_task(rig.idle(idle_exit_s)))
-    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    for wait in waits:
-        wait.cancel()
-    await asyncio.gather(*waits, return_exceptions=True)
+        idle = asyncio.create_task(rig.idle(idle_exit_s))
+        idle.add_done_callback(lambda _: over.set())
+    await over.wait()
 
 
 class LabRefused(Exception):
