@@ -104,8 +104,6 @@ class UnknownLab:
     def __init__(
         self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
     ) -> None:
-        self.trap = trap
-        """The trap that is still set."""
         self._clean = draw(seed, rate, picture_px)
         self.facts = self._clean if trap is None else spring(self._clean, trap)
         self.host = _free_address(seed)
@@ -134,7 +132,7 @@ class UnknownLab:
         await self.rig.__aenter__()
         try:
             await self._room.start(self.host, CAMERA_PORTS[1 - self.facts.sheet_camera])
-            if not self.facts.arcs_answers:
+            if self.facts.trap is Trap.OLD_SOFTWARE:
                 await self.rig.arcs.stop()
                 await self.rig.rtde.stop()
                 await self._older.start(self.host, AUBOPE_PORT)
@@ -221,22 +219,21 @@ class UnknownLab:
 
     async def mend(self) -> str:
         """Correct the mistake that the trap is; return what was done."""
-        trap, self.trap = self.trap, None
-        if trap is None:
+        was = self.facts
+        if was.trap is None:
             return "Nothing is wrong that I know of."
-        if trap is Trap.CABLE_PULLED:
+        self.facts = self.person.facts = mended(was, self._clean)
+        if was.trap is Trap.CABLE_PULLED:
             return self.plug()
-        was, self.facts = self.facts, mended(self.facts, self._clean, trap)
-        self.person.facts = self.facts
         if self.facts.config != was.config:
             self.rig.reconfigure(self.facts.config)
         if self.facts.cabinet_tcp != was.cabinet_tcp:
             self.cabinet.tcp_offset = list(self.facts.cabinet_tcp)
-        if self.facts.arcs_answers and not was.arcs_answers:
+        if was.trap is Trap.OLD_SOFTWARE:
             await self._older.stop()
             await self.rig.arcs.start(self.host, ARCS_PORT)
             await self.rig.rtde.start(self.host, RTDE_PORT)
-        return f"I have seen to it: {trap.value}."
+        return f"I have seen to it: {was.trap.value}."
 
 
 def _free_address(seed: int) -> str:

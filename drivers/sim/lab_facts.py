@@ -77,6 +77,31 @@ BASE_CLEAR_MM = 230.0
 """Least distance from the axis of the base that a straight way may have."""
 
 
+class Trap(StrEnum):
+    """Its name on the command line."""
+
+    SWAPPED_CORNER = "swapped-corner"
+    """The person takes two neighbouring corners for each other."""
+    MIRRORED_CAMERA = "mirrored-camera"
+    """The camera's driver mirrors its picture."""
+    WRONG_BOARD_SIZE = "wrong-board-size"
+    """The board was printed to fit the page: its squares are smaller than the line below it says."""
+    TCP_IN_METRES = "tcp-in-metres"
+    """Somebody typed the tool at the pendant in metres, where it takes millimetres; the person writes metres too."""
+    PARK_IN_PICTURE = "park-in-picture"
+    """The person parks the arm where the camera sees it."""
+    SLOW_CAMERA = "slow-camera"
+    """The camera's pictures arrive 1.2 s late."""
+    FORCE_SIGN = "force-sign"
+    """The sensor reports the push of the brush on the paper, not the paper's on the brush."""
+    SHEET_OUT_OF_REACH = "sheet-out-of-reach"
+    """The far corners of the sheet lie beyond the arm's reach."""
+    OLD_SOFTWARE = "old-software"
+    """The cabinet has the software before ARCS: only its port 8899 answers."""
+    CABLE_PULLED = "cable-pulled"
+    """Somebody trips over the controller's network cable in the middle of a step."""
+
+
 @dataclass(frozen=True, slots=True)
 class Facts:
     """One lab. All numbers are the true ones; only tests may compare them with what was found."""
@@ -103,13 +128,10 @@ class Facts:
     """Standard deviation, along each axis, of the place to which a hand brings the tip."""
     swapped: tuple[str, str] | None = None
     """Corners that the person takes for each other."""
-    parks_in_picture: bool = False
-    arcs_answers: bool = True
-    """False for a cabinet with the older software."""
     cable_after: int | None = None
     """Number of touched things after which somebody trips over the controller's cable."""
-    ruler_unit: str = "mm"
-    """Unit in which the person writes down a length."""
+    trap: Trap | None = None
+    """What is wrong in the lab until it is mended."""
 
 
 def draw(seed: int, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX) -> Facts:
@@ -307,31 +329,6 @@ def reaches(config: SimConfig, wanted: Iterator[Pose] | list[Pose]) -> bool:
     return True
 
 
-class Trap(StrEnum):
-    """Its name on the command line."""
-
-    SWAPPED_CORNER = "swapped-corner"
-    """The person takes two neighbouring corners for each other."""
-    MIRRORED_CAMERA = "mirrored-camera"
-    """The camera's driver mirrors its picture."""
-    WRONG_BOARD_SIZE = "wrong-board-size"
-    """The board was printed to fit the page: its squares are smaller than the line below it says."""
-    TCP_IN_METRES = "tcp-in-metres"
-    """Somebody typed the tool at the pendant in metres, where it takes millimetres; the person writes metres too."""
-    PARK_IN_PICTURE = "park-in-picture"
-    """The person parks the arm where the camera sees it."""
-    SLOW_CAMERA = "slow-camera"
-    """The camera's pictures arrive 1.2 s late."""
-    FORCE_SIGN = "force-sign"
-    """The sensor reports the push of the brush on the paper, not the paper's on the brush."""
-    SHEET_OUT_OF_REACH = "sheet-out-of-reach"
-    """The far corners of the sheet lie beyond the arm's reach."""
-    OLD_SOFTWARE = "old-software"
-    """The cabinet has the software before ARCS: only its port 8899 answers."""
-    CABLE_PULLED = "cable-pulled"
-    """Somebody trips over the controller's network cable in the middle of a step."""
-
-
 SHRUNK = 0.97
 """What `fit to page` does to an A3 page."""
 SLOW_S = 1.2
@@ -352,7 +349,7 @@ def patched(facts: Facts, patch: Mapping[str, Any]) -> Facts:
 
 def spring(facts: Facts, trap: Trap) -> Facts:
     """The same lab with the trap in it."""
-    return patched(facts, _mistake(facts, trap))
+    return patched(facts, {"trap": trap, **_mistake(facts, trap)})
 
 
 def _mistake(facts: Facts, trap: Trap) -> dict[str, Any]:
@@ -367,9 +364,7 @@ def _mistake(facts: Facts, trap: Trap) -> dict[str, Any]:
         case Trap.WRONG_BOARD_SIZE:
             return {field: SHRUNK * getattr(table, field) for field in ("board_square_mm", "board_marker_mm")}
         case Trap.TCP_IN_METRES:
-            return {"cabinet_tcp": (0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0), "ruler_unit": "m"}
-        case Trap.PARK_IN_PICTURE:
-            return {"parks_in_picture": True}
+            return {"cabinet_tcp": (0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0)}
         case Trap.SLOW_CAMERA:
             return {"delay_s": SLOW_S}
         case Trap.FORCE_SIGN:
@@ -378,30 +373,30 @@ def _mistake(facts: Facts, trap: Trap) -> dict[str, Any]:
             x, y, _ = over_sheet(table)
             stretch = TOO_FAR_MM / math.hypot(x, y)
             return {"origin_mm": (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)}
-        case Trap.OLD_SOFTWARE:
-            return {"arcs_answers": False}
         case Trap.CABLE_PULLED:
             return {"cable_after": int(rng.integers(2, 7))}
+        case Trap.PARK_IN_PICTURE | Trap.OLD_SOFTWARE:
+            return {}
 
 
-def mended(trapped: Facts, clean: Facts, trap: Trap) -> Facts:
+def mended(facts: Facts, clean: Facts) -> Facts:
     """The lab once the person has corrected the mistake. A board that was printed too small is measured."""
-    match trap:
+    table = facts.config.table
+    match facts.trap:
         case Trap.WRONG_BOARD_SIZE:
-            table = trapped.config.table
-            return replace(trapped, printed_square_mm=table.board_square_mm, printed_marker_mm=table.board_marker_mm)
+            printed = {"printed_square_mm": table.board_square_mm, "printed_marker_mm": table.board_marker_mm}
+            return patched(facts, {"trap": None, **printed})
         case Trap.FORCE_SIGN:
-            return patched(trapped, {"sensor_sign": 1})
+            return patched(facts, {"trap": None, "sensor_sign": 1})
         case _:
             return clean
 
 
-def truth(facts: Facts, trap: Trap | None) -> dict[str, Any]:
+def truth(facts: Facts) -> dict[str, Any]:
     """The facts as JSON, and what a first day should find from them; lengths in mm, angles in deg, base frame."""
     table, view, tool = facts.config.table, facts.config.view, tool_of(facts.config)
     return {
         **asdict(facts),
-        "trap": trap,
         "tool": {"tcp_offset_mm": (1e3 * tool[:3, 3]).tolist(), "brush_axis": tool[:3, 2].tolist()},
         "corners_mm": {of: {name: corner(table, of, name) for name in CORNERS} for of in ("board", "sheet")},
         "well_rim_mm": table.to_base(*table.well_mm, table.well_depth_mm),

@@ -20,6 +20,7 @@ from brushloop.drivers.sim.lab_facts import (
     PIN_TILT_DEG,
     Facts,
     Place,
+    Trap,
     azimuth_deg,
     board_size_mm,
     corner,
@@ -131,7 +132,7 @@ class Person:
         }
         if what not in lengths_mm:
             raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
-        in_metres = self.facts.ruler_unit == "m" and what == "tool"
+        in_metres = self.facts.trap is Trap.TCP_IN_METRES and what == "tool"
         return f"{lengths_mm[what] / 1e3 if in_metres else lengths_mm[what]:g}"
 
     def _place(self, to: str, name: str) -> Place:
@@ -148,7 +149,7 @@ class Person:
                 return table.to_base(x, y + table.well_radius_mm, table.well_depth_mm)
             case "wash-pot":
                 return table.to_base(*facts.wash_mm, DIP_ABOVE_BOTTOM_MM)
-            case "park" if facts.parks_in_picture:
+            case "park" if facts.trap is Trap.PARK_IN_PICTURE:
                 return over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
             case "park":
                 return facts.park_mm

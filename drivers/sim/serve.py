@@ -240,7 +240,7 @@ def serve_unknown(
 
     def write_truth() -> None:
         if truth is not None:
-            _write_whole(truth, json.dumps(truth_of(lab.facts, lab.trap), indent=1) + "\n")
+            _write_whole(truth, json.dumps(truth_of(lab.facts), indent=1) + "\n")
 
     async def obey(request: Mapping[str, object]) -> dict[str, Any]:
         answer = await lab.obey(request)

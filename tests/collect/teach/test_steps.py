@@ -102,7 +102,7 @@ async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_pat
     turn = TipStep().derived(day.notebook)["robot.tcp_rotation_deg"]
     assert "12 times" in turn.how
     axis = Rotation.from_euler("ZYX", np.array(turn.value)[::-1], degrees=True).apply([0.0, 0.0, 1.0])
-    true = np.array(truth(person.lab.facts, None)["tool"]["brush_axis"])
+    true = np.array(truth(person.lab.facts)["tool"]["brush_axis"])
     assert math.degrees(math.acos(float(axis @ true))) < 0.2
 
 

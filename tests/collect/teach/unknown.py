@@ -197,7 +197,7 @@ class Errors:
 
 def errors(rig_path: Path, lab: UnknownLab) -> Errors:
     """Compare a `rig.toml` with the truth of its lab."""
-    rig, true = load_rig(rig_path), truth(lab.facts, None)
+    rig, true = load_rig(rig_path), truth(lab.facts)
     tcp_error = np.array(rig.robot.tcp_offset_mm) - true["tool"]["tcp_offset_mm"]
     paper = rig.paper
     x, y = to_base(paper, *paper.touch_point_mm)

@@ -114,19 +114,6 @@ async def test_a_controller_that_falls_silent_is_reported_as_an_arm_that_may_sti
         await arm.close()
 
 
-TOLERATED = [robot("split", count=ALWAYS), robot("duplicate", count=ALWAYS), robot("late", count=8, late_s=0.15)]
-
-
-@pytest.mark.parametrize("fault", TOLERATED, ids=lambda fault: fault.kind)
-async def test_replies_in_pieces_twice_or_a_little_late_change_nothing(
-    arm: AuboArcs, cabinet: ArcsServer, fault: Fault
-):
-    cabinet.faults.hang(fault)
-    await arm.move(FAR, **QUICK)
-    assert to_go_mm(cabinet) <= 0.05
-    await arm.stop()
-
-
 @pytest.mark.parametrize(
     ("kind", "mode", "condition", "power"),
     [

