@@ -19,7 +19,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from brushloop.drivers.arcs.controller import Controller, OutOfReach, QueueFull, RobotMode
+from brushloop.drivers.arcs.controller import Controller, OutOfReach, QueueFull
 from brushloop.drivers.arcs.wire import DEVICE
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
@@ -40,52 +40,23 @@ RESTS_ELSEWHERE_S = 1.0
 STUCK_S = 3.0
 PROGRESS = 0.05
 """Smallest approach to the target that counts as progress, mm or deg."""
+ARRIVED_MM, ARRIVED_DEG = 0.05, 0.1
+"""How near its target a settled arm is."""
+POLL_S = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class Tolerance:
-    """Distance and angle within which the arm counts as arrived."""
-
-    position_mm: float
-    rotation_deg: float
-
-    def holds(self, here: Pose, target: Pose) -> bool:
-        """Whether `here` is at `target`."""
-        off_mm, off_deg = distance(here, target)
-        return off_mm <= self.position_mm and off_deg <= self.rotation_deg
-
-
-async def until_mode(controller: Controller, wanted: set[RobotMode], *, timeout_s: float, poll_s: float) -> None:
-    """Return once the robot mode is one of `wanted`. Raises `RobotNotSafe`, `DeviceTimeout`."""
-    try:
-        async with asyncio.timeout(timeout_s):
-            while await controller.mode() not in wanted:
-                await controller.require_safe("power on")
-                await asyncio.sleep(poll_s)
-    except DeviceError:
-        raise
-    except TimeoutError:
-        raise DeviceTimeout(
-            DEVICE,
-            "power on",
-            f"mode {await controller.mode()} did not become {' or '.join(sorted(wanted))}",
-            remedy="Look at the pendant: a confirmation may be waiting there.",
-        ) from None
+def arrived(here: Pose, target: Pose) -> bool:
+    """Whether `here` is at `target`, within `ARRIVED_MM` and `ARRIVED_DEG`."""
+    off_mm, off_deg = distance(here, target)
+    return off_mm <= ARRIVED_MM and off_deg <= ARRIVED_DEG
 
 
 Look = Callable[[], Awaitable[tuple[bool, Pose] | DeviceError]]
 """Asks whether the arm rests, and where its tip is. An error that it returns, it does not raise: it is to ask again."""
 
 
-async def until_settled(
-    look: Look,
-    target: Pose,
-    tolerance: Tolerance,
-    *,
-    planned_s: float,
-    poll_s: float,
-) -> None:
-    """Return once `look` reports that the arm rests, at a pose within tolerance.
+async def until_settled(look: Look, target: Pose, planned_s: float) -> None:
+    """Return once `look` reports that the arm rests where it was sent.
 
     Raises `MotionFailed` if the arm rests elsewhere, or if twice the planned time has passed and it comes no nearer: an
     arm whose speed was turned down on the pendant is slow, not stuck. An error that `look` returns, instead of raising
@@ -100,20 +71,20 @@ async def until_settled(
         if isinstance(state, DeviceError):
             if now > begun_at + allowed_s:
                 raise state
-            await asyncio.sleep(poll_s)
+            await asyncio.sleep(POLL_S)
             continue
         steady, here = state
         off_mm, off_deg = distance(here, target)
         if off_mm + off_deg < nearest - PROGRESS:
             nearest, nearer_at = off_mm + off_deg, now
-        if steady and off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
+        if steady and arrived(here, target):
             return
         idle_since = (idle_since or now) if steady else None
         if idle_since is not None and now - idle_since > RESTS_ELSEWHERE_S:
             raise _not_arrived(f"rests {off_mm:.2f} mm and {off_deg:.2f} deg from the target")
         if now > begun_at + allowed_s and now - nearer_at > STUCK_S:
             raise _not_arrived(f"not settled after {allowed_s:.1f} s, {off_mm:.2f} mm and {off_deg:.2f} deg to go")
-        await asyncio.sleep(poll_s)
+        await asyncio.sleep(POLL_S)
 
 
 def planned_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float) -> float:
@@ -186,32 +157,34 @@ LEAST_BLEND_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One line of a path."""
+    """One line as it is sent to the controller."""
 
     target: Pose
     speed_mm_s: float
+    least_s: float
     blend_mm: float
     seconds: float
     """An upper estimate of how long it takes."""
 
 
 def legs_of(
-    start: Pose, poses: Sequence[Pose], limits: Limits, *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float
+    start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float, blend_mm: float | None = None
 ) -> list[Leg]:
     """The lines, each slow enough for its turn of the tool.
 
-    A corner is rounded within half the shorter line, but never by less than the controller accepts; at the last pose
-    the arm halts.
+    A corner is rounded within `blend_mm` and half the shorter line, but never by less than the controller accepts. At
+    the last pose, and without `blend_mm` at every pose, the arm halts.
     """
-    lengths_mm = [distance(a, b)[0] for a, b in zip([start, *poses], poses, strict=False)]
+    corners = [start, *(line.target for line in lines)]
+    lengths_mm = [distance(a, b)[0] for a, b in itertools.pairwise(corners)]
     legs: list[Leg] = []
-    before = start
-    for i, pose in enumerate(poses):
-        speed = limits.turn_capped(before, pose, speed_mm_s)
-        last = i + 1 == len(poses)
-        blend = 0.0 if last else max(min(blend_mm, 0.5 * lengths_mm[i], 0.5 * lengths_mm[i + 1]), LEAST_BLEND_MM)
-        legs.append(Leg(pose, speed, blend, planned_s(before, pose, speed, acc_mm_s2)))
-        before = pose
+    for i, (before, line) in enumerate(zip(corners, lines, strict=False)):
+        speed_mm_s = limits.turn_capped(before, line.target, line.speed_mm_s)
+        rounded_mm = 0.0
+        if blend_mm is not None and i + 1 < len(lines):
+            rounded_mm = max(min(blend_mm, 0.5 * lengths_mm[i], 0.5 * lengths_mm[i + 1]), LEAST_BLEND_MM)
+        seconds = max(planned_s(before, line.target, speed_mm_s, acc_mm_s2), line.least_s)
+        legs.append(Leg(line.target, speed_mm_s, line.least_s, rounded_mm, seconds))
     return legs
 
 
@@ -221,8 +194,6 @@ async def feed(
     acc_mm_s2: float,
     *,
     stopped: Callable[[], bool],
-    tolerance: Tolerance,
-    poll_s: float,
     notice: Callable[[str], None],
 ) -> None:
     """Queue every leg, at most `MOST_QUEUED` at a time; return once the last one is queued.
@@ -251,7 +222,7 @@ async def feed(
             sent, room = sent + 1, room - 1
         if sent == len(legs):
             return
-        await asyncio.sleep(poll_s)
+        await asyncio.sleep(POLL_S)
         if stopped():  # also where no line may follow for want of room
             raise _cut_short(sent, len(legs), "the arm was stopped")
         await controller.require_safe("moveLine")
@@ -265,12 +236,13 @@ async def feed(
             dry_since = None
             continue
         # The lines came too late, or the arm has not begun, or another client stopped it: then nothing may follow.
-        off_mm, off_deg = distance(await controller.pose(), legs[sent - 1].target)
-        if off_mm <= tolerance.position_mm and off_deg <= tolerance.rotation_deg:
+        here, target = await controller.pose(), legs[sent - 1].target
+        if arrived(here, target):
             notice(f"the arm halted at point {sent} of {len(legs)}: lines did not reach the controller in time")
             continue
         room, dry_since = 0, dry_since or now
         if now - dry_since > RESTS_ELSEWHERE_S:
+            off_mm, _ = distance(here, target)
             raise _cut_short(sent, len(legs), f"the arm rests {off_mm:.2f} mm from where it was sent")
 
 
@@ -282,28 +254,13 @@ def _cut_short(sent: int, legs: int, why: str) -> MotionFailed:
     )
 
 
-def capped(
-    start: Pose, lines: Sequence[QueuedLine], limits: Limits, acc_mm_s2: float
-) -> tuple[list[QueuedLine], float]:
-    """The lines, each slow enough for its turn of the tool, and an upper estimate of how long they take, in s."""
-    slowed: list[QueuedLine] = []
-    seconds, before = 0.0, start
-    for line in lines:
-        speed_mm_s = limits.turn_capped(before, line.target, line.speed_mm_s)
-        slowed.append(QueuedLine(line.target, speed_mm_s, line.least_s))
-        seconds += max(planned_s(before, line.target, speed_mm_s, acc_mm_s2), line.least_s)
-        before = line.target
-    return slowed, seconds
-
-
 async def queue_all(
     controller: Controller,
     start: Pose,
-    lines: Sequence[QueuedLine],
+    lines: Sequence[Leg],
     acc_mm_s2: float,
     *,
     stopped: Callable[[], bool],
-    tolerance: Tolerance,
 ) -> None:
     """Queue every line on an arm that rests at `start`, then release it; return once it may have begun.
 
@@ -322,7 +279,7 @@ async def queue_all(
     for line in lines:
         require_not_stopped()
         await controller.move_line(line.target, line.speed_mm_s, acc_mm_s2, least_s=line.least_s)
-    rests = tolerance.holds(await controller.pose(), start)
+    rests = arrived(await controller.pose(), start)
     _, size = await controller.queue()  # last: what another client sends after this answer comes after our lift
     if size > len(lines):
         raise PathDisturbed(DEVICE, "sequence", f"the controller holds {size} lines, {len(lines)} were sent")
@@ -344,7 +301,7 @@ than any drag that a mark would show."""
 class OwnPath:
     """Watches the controller carry out our lines, from their release on, for anything that another client does."""
 
-    def __init__(self, controller: Controller, start: Pose, lines: Sequence[QueuedLine], seen: Sequence[Pose]) -> None:
+    def __init__(self, controller: Controller, start: Pose, lines: Sequence[Leg], seen: Sequence[Pose]) -> None:
         """`seen` grows meanwhile by the poses that telemetry receives."""
         self._controller = controller
         self._corners = [start, *(line.target for line in lines)]

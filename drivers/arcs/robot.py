@@ -8,14 +8,13 @@ from typing import Any, TypeVar
 
 from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, ArmState, Controller
 from brushloop.drivers.arcs.motion import (
+    Leg,
     Look,
     Messages,
     OwnPath,
-    Tolerance,
-    capped,
+    arrived,
     feed,
     legs_of,
-    planned_s,
     queue_all,
     until_settled,
 )
@@ -31,6 +30,7 @@ from brushloop.drivers.limits import Limits
 __all__ = ["ArcsOptions", "ArmState", "AuboArcs"]
 
 AUBOPE_PORT = 8899
+STOP_ACC_M_S2 = 2.0
 _R = TypeVar("_R")
 
 
@@ -64,7 +64,6 @@ class AuboArcs:
         self._watchdog = Watchdog(self._state.connection, options.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
         self._departure = Departure(self._motion)
-        self._tolerance = Tolerance(options.position_tolerance_mm, options.rotation_tolerance_deg)
         self._motion.on_notice = on_notice
         self._motion.on_pose = self._telemetry.lag.asked
 
@@ -111,7 +110,7 @@ class AuboArcs:
                 await self._motion.require_safe("power on")  # a safety stop holds the path, and is the cause
                 raise
         settings = await make_ready(self._motion, self._options, self._notice)
-        await power_on(self._motion, self._options)
+        await power_on(self._motion)
         self._held = True  # a process that was killed may have left it so
         await self._ready()
         await self._departure.enabled(settings)
@@ -133,12 +132,7 @@ class AuboArcs:
         The whole line is checked, from where the arm really is. Any failure, cancellation included, stops the arm
         before it is raised.
         """
-        self.check(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-        start = await self._depart("moveLine", [target])
-        speed_mm_s = self._limits.turn_capped(start, target, speed_mm_s)
-        expected_s = planned_s(start, target, speed_mm_s, acc_mm_s2)
-        moving = self._motion.move_line(target, speed_mm_s, acc_mm_s2)
-        await self._carry_out(self._settled(moving, target, expected_s), target)
+        await self._fed([QueuedLine(target, speed_mm_s)], acc_mm_s2, None)
 
     async def follow(self, poses: Sequence[Pose], *, speed_mm_s: float, acc_mm_s2: float, blend_mm: float) -> None:
         """Send lines through all poses without a halt between them, then wait as `move` does at the last.
@@ -148,22 +142,7 @@ class AuboArcs:
         """
         if not poses:
             raise ValueError("follow: no poses")
-        for pose in poses:
-            self.check(pose, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
-        start = await self._depart("moveLine", poses)
-        legs = legs_of(start, poses, self._limits, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=blend_mm)
-        stops = self._stops
-        feeding = feed(
-            self._motion,
-            legs,
-            acc_mm_s2,
-            stopped=lambda: self._stops != stops,
-            tolerance=self._tolerance,
-            poll_s=self._options.poll_s,
-            notice=self._notice,
-        )
-        expected_s = sum(leg.seconds for leg in legs)
-        await self._carry_out(self._settled(feeding, poses[-1], expected_s), poses[-1])
+        await self._fed([QueuedLine(pose, speed_mm_s) for pose in poses], acc_mm_s2, blend_mm)
 
     async def sequence(self, lines: Sequence[QueuedLine], *, acc_mm_s2: float) -> list[Pose]:
         """Queue all lines while the controller holds its path, release it, and wait as `move` does.
@@ -171,42 +150,34 @@ class AuboArcs:
         After the release, answers that cannot be read do not stop the arm. Raises `PathDisturbed` if another client
         interferes, and ValueError for no lines and for lines that end where the arm is.
         """
-        for line in lines:
-            self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
-        start = await self._depart("sequence", [line.target for line in lines])
-        tolerance = self._tolerance
-        if not lines or tolerance.holds(start, lines[-1].target):
+        start = await self._depart("sequence", lines, acc_mm_s2)
+        if not lines or arrived(start, lines[-1].target):
             raise ValueError("sequence: it must not end where it begins")
-        lines, expected_s = capped(start, lines, self._limits, acc_mm_s2)
-        return await self._carry_out(self._pressed(start, lines, acc_mm_s2, expected_s), lines[-1].target)
+        legs = legs_of(start, lines, self._limits, acc_mm_s2)
+        return await self._carry_out(self._pressed(start, legs, acc_mm_s2), legs[-1].target)
 
-    async def _pressed(
-        self, start: Pose, lines: Sequence[QueuedLine], acc_mm_s2: float, expected_s: float
-    ) -> list[Pose]:
-        stops, target, tolerance = self._stops, lines[-1].target, self._tolerance
+    async def _fed(self, lines: Sequence[QueuedLine], acc_mm_s2: float, blend_mm: float | None) -> None:
+        start = await self._depart("moveLine", lines, acc_mm_s2)
+        legs = legs_of(start, lines, self._limits, acc_mm_s2, blend_mm)
+        stops = self._stops
+        feeding = feed(self._motion, legs, acc_mm_s2, stopped=lambda: self._stops != stops, notice=self._notice)
+        await self._carry_out(self._settled(feeding, legs), legs[-1].target)
+
+    async def _pressed(self, start: Pose, legs: Sequence[Leg], acc_mm_s2: float) -> list[Pose]:
+        stops = self._stops
         self._held = True
         with self._telemetry.seeing() as seen:
-            path = OwnPath(self._motion, start, lines, seen)
-            queueing = queue_all(
-                self._motion, start, lines, acc_mm_s2, stopped=lambda: self._stops != stops, tolerance=tolerance
-            )
-            await self._settled(queueing, target, expected_s, path.look)
+            path = OwnPath(self._motion, start, legs, seen)
+            queueing = queue_all(self._motion, start, legs, acc_mm_s2, stopped=lambda: self._stops != stops)
+            await self._settled(queueing, legs, path.look)
             self._held = False
-            await self._telemetry.reaching(target, tolerance)
+            await self._telemetry.reaching(legs[-1].target)
             path.require_followed()
             return [*seen]
 
-    async def _settled(
-        self, command: Coroutine[Any, Any, None], target: Pose, expected_s: float, look: Look | None = None
-    ) -> None:
+    async def _settled(self, command: Coroutine[Any, Any, None], legs: Sequence[Leg], look: Look | None = None) -> None:
         await command
-        await until_settled(
-            look or self._motion.rest,
-            target,
-            self._tolerance,
-            planned_s=expected_s,
-            poll_s=self._options.poll_s,
-        )
+        await until_settled(look or self._motion.rest, legs[-1].target, sum(leg.seconds for leg in legs))
 
     async def _carry_out(self, motion: Coroutine[Any, Any, _R], target: Pose) -> _R:
         self._unsettled, self._departure.left = True, None
@@ -227,11 +198,13 @@ class AuboArcs:
                 raise cause from error
             raise
 
-    async def _depart(self, op: str, poses: Sequence[Pose]) -> Pose:
-        """Check that the arm may go through `poses` from where it is, and return that place; see `Departure`."""
+    async def _depart(self, op: str, lines: Sequence[QueuedLine], acc_mm_s2: float) -> Pose:
+        """Check that the arm may go along `lines` from where it is, and return that place; see `Departure`."""
+        for line in lines:
+            self.check(line.target, speed_mm_s=line.speed_mm_s, acc_mm_s2=acc_mm_s2)
         stops = self._stops
         await self._ready()
-        start = await self._departure.ready(op, self._limits, poses)
+        start = await self._departure.ready(op, self._limits, [line.target for line in lines])
         if self._stops != stops:
             raise MotionFailed(DEVICE, op, "the arm was stopped", condition="Nothing was sent to it.")
         return start
@@ -244,7 +217,7 @@ class AuboArcs:
         if not self._connected:
             raise NotConnected(DEVICE, "stop", "not connected")
         self._stops += 1
-        await self._stopper.stop(self._options.stop_acc_m_s2)
+        await self._stopper.stop(STOP_ACC_M_S2)
         self._unsettled = False
 
     async def where(self) -> Pose:

@@ -14,10 +14,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from brushloop.drivers.arcs.controller import Controller, RobotMode, WrongOperationalMode, accepted
-from brushloop.drivers.arcs.motion import until_mode
+from brushloop.drivers.arcs.motion import POLL_S
 from brushloop.drivers.arcs.wire import DEVICE, Framing, numbers
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.errors import ArmMoved, NotConnected, NotPowered, ProtocolViolation, RpcError, SettingsChanged
+from brushloop.drivers.errors import (
+    ArmMoved,
+    DeviceTimeout,
+    NotConnected,
+    NotPowered,
+    ProtocolViolation,
+    RpcError,
+    SettingsChanged,
+)
 from brushloop.drivers.geometry import distance, from_wire
 from brushloop.drivers.limits import Limits
 
@@ -32,13 +40,6 @@ class ArcsOptions:
     """Offset from flange to brush tip."""
     tcp_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Turn from the flange's axes to the brush's, as `to_wire` orders it: R = Rz(rz) Ry(ry) Rx(rx)."""
-    position_tolerance_mm: float = 0.05
-    rotation_tolerance_deg: float = 0.1
-    poll_s: float = 0.02
-    telemetry_hz: float = 100.0
-    stale_after_ms: float = 500.0
-    power_timeout_s: float = 60.0
-    stop_acc_m_s2: float = 2.0
     framing: Framing = "sof"
     """`sof` as the maker's client speaks, `bare` as the maker documents; a cabinet may accept only one of them."""
     rtde_port: int | None = None
@@ -56,6 +57,8 @@ class ArcsOptions:
 
 
 METHOD_NOT_FOUND = -32601
+POWER_S = 60.0
+"""Longest wait for a mode: brakes take seconds, and a person may have to confirm on the pendant."""
 TOLERANCE = 1e-3
 """Largest difference in mm, deg and kg: a controller may keep single precision."""
 
@@ -192,21 +195,33 @@ async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Ca
     return settings
 
 
-async def power_on(controller: Controller, options: ArcsOptions) -> None:
+async def power_on(controller: Controller) -> None:
     """Power the arm and release its brakes, if need be. Raises `RobotNotSafe`, `DeviceTimeout`."""
-
-    async def until(*wanted: RobotMode) -> None:
-        await until_mode(controller, {*wanted}, timeout_s=options.power_timeout_s, poll_s=options.poll_s)
-
     await controller.require_safe("power on")
     mode = await controller.mode()
     if mode == RobotMode.POWERING_OFF:  # a request for power would be ignored
-        await until(RobotMode.POWER_OFF)
+        await _until_mode(controller, RobotMode.POWER_OFF)
     if mode != RobotMode.RUNNING:
         await controller.ask("RobotManage.poweron")
-        await until(RobotMode.IDLE, RobotMode.RUNNING)
+        await _until_mode(controller, RobotMode.IDLE, RobotMode.RUNNING)
         await controller.ask("RobotManage.startup")
-        await until(RobotMode.RUNNING)
+        await _until_mode(controller, RobotMode.RUNNING)
+
+
+async def _until_mode(controller: Controller, *wanted: RobotMode) -> None:
+    """Return once the robot mode is one of `wanted`. Raises `RobotNotSafe`, `DeviceTimeout`."""
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + POWER_S
+    while (mode := await controller.mode()) not in wanted:
+        await controller.require_safe("power on")
+        if loop.time() > until_s:
+            raise DeviceTimeout(
+                DEVICE,
+                "power on",
+                f"mode {mode} did not become {' or '.join(sorted(wanted))}",
+                remedy="Look at the pendant: a confirmation may be waiting there.",
+            )
+        await asyncio.sleep(POLL_S)
 
 
 def _require_automatic(mode: Value, on_notice: Callable[[str], None]) -> None:
@@ -223,8 +238,8 @@ MOVED_MM, MOVED_DEG = 0.5, 0.5
 """Limits beyond which another client or a person moved the arm: larger than the tolerance of any settled move."""
 DOWN_MM = 0.01
 """A line that ends more than this lower counts as going down."""
-RESTS_S, POLL_S = 0.5, 0.02
-"""Longest wait for rest, and interval of the checks: an arm that has just settled may take a moment to report it."""
+RESTS_S = 0.5
+"""Longest wait for rest: an arm that has just settled may take a moment to report it."""
 
 
 class Departure:

@@ -28,7 +28,7 @@ import cbor2
 import numpy as np
 
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.motion import Tolerance
+from brushloop.drivers.arcs.motion import arrived
 from brushloop.drivers.arcs.settings import ArcsOptions
 from brushloop.drivers.arcs.wire import DEVICE, FrameDecoder, encode_short, numbers
 from brushloop.drivers.devices import Pose, PoseSample, Stamp
@@ -252,6 +252,8 @@ class LagMeter:
 
 POSE_SEGMENT = "R1_actual_TCP_pose"
 JOINTS_SEGMENT = "R1_actual_q"
+RATE_HZ = 100.0
+STALE_MS = 500.0
 MOST_SILENCES = 3
 """Consecutive silences, of half a second each: a busy machine may cause one or two."""
 GIVE_UP_S = 2.0
@@ -293,12 +295,12 @@ class Telemetry:
         await self._drop_stream()
 
     def latest(self) -> PoseSample:
-        """The newest pose. Raises `NotConnected` before the first, `Stale` after `stale_after_ms`."""
+        """The newest pose. Raises `NotConnected` before the first, `Stale` after `STALE_MS`."""
         if self._latest is None:
             raise NotConnected(DEVICE, "latest", "no pose yet")
         age_ms = (self._clock.now_ns() - self._latest.stamp.host_ns) / 1e6
-        if age_ms > self._options.stale_after_ms:
-            raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
+        if age_ms > STALE_MS:
+            raise Stale(DEVICE, age_ms, STALE_MS)
         return self._latest
 
     @contextlib.contextmanager
@@ -310,12 +312,12 @@ class Telemetry:
         finally:
             self._seen = None
 
-    async def reaching(self, target: Pose, tolerance: Tolerance) -> None:
+    async def reaching(self, target: Pose) -> None:
         """Wait until a pose at `target` has arrived, and with it all earlier ones. Gives up after `GIVE_UP_S`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(GIVE_UP_S):
-                while self._latest is None or not tolerance.holds(self._latest.pose, target):
-                    await asyncio.sleep(0.5 / self._options.telemetry_hz)
+                while self._latest is None or not arrived(self._latest.pose, target):
+                    await asyncio.sleep(0.5 / RATE_HZ)
 
     async def read(self) -> None:
         """Ask for the pose once."""
@@ -325,7 +327,7 @@ class Telemetry:
         stream = RtdeStream(self._options.host, port)
         self._stream = stream
         try:
-            await stream.open([POSE_SEGMENT, JOINTS_SEGMENT], self._options.telemetry_hz)
+            await stream.open([POSE_SEGMENT, JOINTS_SEGMENT], RATE_HZ)
             self._take(*await self._pushed(stream))
         except DeviceError as error:
             await self._fall_back(error)
@@ -337,7 +339,7 @@ class Telemetry:
             except DeviceError as error:
                 await self._fall_back(error)
         loop = asyncio.get_running_loop()
-        period_s = 1.0 / self._options.telemetry_hz
+        period_s = 1.0 / RATE_HZ
         due = loop.time()
         while True:
             # A gap shows as an old sample (`Stale`); the motion path reports the cause.

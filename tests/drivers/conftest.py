@@ -42,7 +42,7 @@ def arm_at(limits: Limits) -> Callable[[int], AuboArcs]:
     """An arm that is not connected yet, by the port of its controller."""
 
     def make(port: int) -> AuboArcs:
-        options = ArcsOptions(HOST, port, tcp_offset_mm=(0.0, 0.0, 180.0), power_timeout_s=5.0)
+        options = ArcsOptions(HOST, port, tcp_offset_mm=(0.0, 0.0, 180.0))
         return AuboArcs(options, limits, HostClock())
 
     return make

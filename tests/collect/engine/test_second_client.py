@@ -10,7 +10,7 @@ import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.motion import Tolerance, until_settled
+from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
@@ -54,7 +54,7 @@ def second_client(lab: Lab, target: Pose | None = None, **calls: dict[str, Any])
                 assert await client.ask(method.replace("_", "."), **params) == 0
             if target is not None:
                 await client.move_line(target, 200.0, 800.0)
-                await until_settled(client.rest, target, Tolerance(0.05, 0.1), planned_s=5.0, poll_s=0.01)
+                await until_settled(client.rest, target, planned_s=5.0)
         finally:
             await client.connection.close()
 

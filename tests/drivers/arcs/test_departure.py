@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs.controller import Controller
-from brushloop.drivers.arcs.motion import Tolerance, until_settled
+from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import TOOL_OFFSET, require_same
 from brushloop.drivers.arcs.wire import RpcConnection
@@ -36,7 +36,7 @@ async def other(cabinet: ArcsServer) -> AsyncIterator[Controller]:
 async def send(client: Controller, target: Pose) -> None:
     """Move the arm there, as a client without any limits would."""
     await client.move_line(target, 200.0, 800.0)
-    await until_settled(client.rest, target, Tolerance(0.05, 0.1), planned_s=2.0, poll_s=0.01)
+    await until_settled(client.rest, target, planned_s=2.0)
 
 
 def lines(cabinet: ArcsServer) -> int:

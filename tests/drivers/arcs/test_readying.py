@@ -38,7 +38,7 @@ async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> A
     wide = dataclasses.replace(limits, x_mm=(-2000.0, 2000.0))
 
     def make(**options: Any) -> AuboArcs:
-        whole = {"tcp_offset_mm": (0.0, 0.0, 180.0), "power_timeout_s": 5.0, **options}
+        whole = {"tcp_offset_mm": (0.0, 0.0, 180.0), **options}
         arms.append(AuboArcs(ArcsOptions(HOST, cabinet.port, **whole), wide, HostClock(), notices.append))
         return arms[-1]
 

@@ -151,7 +151,7 @@ async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> A
     arms: list[AuboArcs] = []
 
     def make(rtde_port: int | None) -> AuboArcs:
-        options = ArcsOptions(HOST, cabinet.port, (0.0, 0.0, 180.0), power_timeout_s=5.0, rtde_port=rtde_port)
+        options = ArcsOptions(HOST, cabinet.port, (0.0, 0.0, 180.0), rtde_port=rtde_port)
         arms.append(AuboArcs(options, limits, HostClock(), notices.append))
         return arms[-1]
 
