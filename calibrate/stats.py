@@ -13,6 +13,7 @@ has strays of its own.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -69,22 +70,13 @@ class Line:
         return self.slope - reach, self.slope + reach
 
 
-def fit_line(x: Sequence[float], y: Sequence[float], weights: Sequence[float] | None = None) -> Line | None:
-    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y.
-
-    Points may have positive `weights`, inversely proportional to their variances.
-    """
-    n = len(x)
-    if n < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+def fit_line(x: Sequence[float], y: Sequence[float]) -> Line | None:
+    """y = slope x + intercept; None with fewer than 3 points or no spread in x or y."""
+    if len(x) < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
-    share = np.ones(n) if weights is None else np.asarray(weights, np.float64)
-    x_mean, y_mean = float(np.average(x, weights=share)), float(np.average(y, weights=share))
-    xs, ys = np.asarray(x) - x_mean, np.asarray(y) - y_mean
-    sxx, sxy, syy = (float((share * a * b).sum()) for a, b in ((xs, xs), (xs, ys), (ys, ys)))
-    slope = sxy / sxx
-    residual = ys - slope * xs
-    slope_se = float(np.sqrt((share * residual**2).sum() / max(n - 2, 1) / sxx))
-    return Line(slope, y_mean - slope * x_mean, slope_se, sxy / float(np.sqrt(sxx * syy)), n)
+    (slope, intercept), covariance = np.polyfit(x, y, 1, cov=True)
+    slope_se = float(np.sqrt(covariance[0, 0]))
+    return Line(float(slope), float(intercept), slope_se, float(np.corrcoef(x, y)[0, 1]), len(x))
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,11 +156,17 @@ def _cell_draws(values: Floats, strata: Integers) -> tuple[Floats, Floats]:
     ordered = values[order]
     _, inverse = np.unique(strata[order], return_inverse=True)
     many = int(inverse.max()) + 1
-    times = np.random.default_rng(SEED).multinomial(many, np.full(many, 1.0 / many), _draw_count(values))[:, inverse]
+    times = _cells_drawn(many, _draw_count(values))[:, inverse]
     total = times.cumsum(axis=1)
     half = 0.5 * total[:, -1:]
     middle = 0.5 * (ordered[(total >= half).argmax(axis=1)] + ordered[(total > half).argmax(axis=1)])
     return (times @ ordered) / total[:, -1], middle
+
+
+@functools.lru_cache(maxsize=8)
+def _cells_drawn(many: int, count: int) -> Integers:
+    """(count, many) how often each of so many strata is in each sample; the same for every model of a report."""
+    return np.random.default_rng(SEED).multinomial(many, np.full(many, 1.0 / many), count)
 
 
 def _draw_count(values: Floats) -> int:
@@ -226,12 +224,12 @@ def average(values: Floats, cells: Integers) -> Summary | None:
     """
     known = np.isfinite(values)
     values, cells = values[known], cells[known]
-    summary = summarise(values, cells)
-    if summary is None:
+    if not len(values):
         return None
-    over_cells = interval_over_groups(values, cells)
-    interval = summary.avg_interval if over_cells is None else (_round(over_cells[0]), _round(over_cells[1]))
-    return Summary(summary.n, summary.avg, interval)
+    if (interval := interval_over_groups(values, cells)) is not None:
+        return Summary(len(values), _round(values.mean()), (_round(interval[0]), _round(interval[1])))
+    summary = summarise(values, cells)
+    return summary and Summary(summary.n, summary.avg, summary.avg_interval)
 
 
 def is_near(below: float, interval: Interval | None, points: float = NEAR_POINTS) -> bool | None:

@@ -19,13 +19,13 @@ from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.remote import URL, local_path
-from brushloop.calibrate.report import framed, png_uri, source_note, write_files
+from brushloop.calibrate.report import framed, png_uri, write_files
 from brushloop.calibrate.scores import scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
-from brushloop.calibrate.validate import findings, tables
+from brushloop.calibrate.validate.findings import terminal_lines
 from brushloop.calibrate.validate.models import FittedSession
 from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
-from brushloop.calibrate.validate.report import Report, report_of
+from brushloop.calibrate.validate.report import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.validate.run import Outcome, Refused, Request, validate_presses
 from brushloop.calibrate.work import cluster, threads
 from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
@@ -41,8 +41,6 @@ WORK = "work"
 LOOP, WRITTEN = "loop", "written"
 """Folders of a session, where its loop and its characters are looked for; `written` also beside all sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
-MAX_REFUSED = 20
-"""Refused strokes listed on the terminal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +64,7 @@ class ValidationOutput:
         for drags in self.drags:
             yield from drag_summary(drags)
         if self.report is not None:
-            yield from _summary(self.report)
+            yield from terminal_lines(self.report)
         yield from self.notes
         yield f"Report: {self.folder / 'report.html'}"
 
@@ -92,7 +90,7 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     of the sessions, so that the same command resumes.
     """
     for text in request.gates:
-        tables.parse_gate(text)
+        parse_gate(text)
     if request.tune_steps and not request.generators:
         raise CalibrationError("--tune", "needs a --generator to tune")
     curves = [read_curve(text) for text in request.curves]
@@ -123,7 +121,7 @@ def check(output: ValidationOutput, request: Request) -> None:
     if request.gates and output.report is None:
         raise CalibrationError("--gate", "applies to presses; these are drags")
     if output.report is not None:
-        tables.check_gates(output.report, request.gates)
+        check_gates(output.report, request.gates)
 
 
 def open_session(place: str, fit: Path | None = None) -> FittedSession:
@@ -191,26 +189,11 @@ def figure_13(path: Path, record: WrittenRecord) -> str:
     return png_uri(data)
 
 
-def _summary(report: Report) -> Iterator[object]:
-    """Yield tables and lines for the terminal."""
-    names = ", ".join(session.session_id for session in report.sessions[:4])
-    yield f"{names}: {source_note(report.source)}"
-    yield findings.measured(report)
-    yield from tables.terminal_tables(report)
-    yield " ".join(findings.verdict(report))
-    for point in findings.trust(report):
-        yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
-    for press in report.refused[:MAX_REFUSED]:
-        yield f"not used: {press.session_id} {press.stroke_id}: {press.why}"
-    if len(report.refused) > MAX_REFUSED:
-        yield f"and {len(report.refused) - MAX_REFUSED} more, in the report"
-
-
 def _write(outcome: Outcome, folder: Path, curves: Sequence[Curve], beside: Beside) -> Report:
     """Write the files of a report."""
     files = {"scores.csv": scores_csv(outcome.scores)}
     report = report_of(outcome, hashlib.sha256(files["scores.csv"].encode()).hexdigest(), beside.loops, beside.written)
-    files["summary.csv"] = tables.summary_csv(report)
+    files["summary.csv"] = summary_csv(report)
     files["failures.csv"] = csv_text(Refused._fields, report.refused)
     files["report.json"] = report.to_json()
     names = [*files, *write_parquet(outcome.scores, report.label, folder / "scores.parquet")]

@@ -1,15 +1,32 @@
-"""Findings of a report in sentences: what was measured, how well models predict it, and whether to trust it."""
+"""Findings of a report in sentences: what was measured, how well models predict it, and whether to trust it.
+
+Page and terminal say the same; the terminal has its own, shorter tables.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+from rich.table import Table
 
 from brushloop.calibrate.compare.place import ORDER, Key
-from brushloop.calibrate.report import Point, brush_and_size, source_point
+from brushloop.calibrate.report import Point, brush_and_size, source_note, source_point
+from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
-from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT, PRESSES
-from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session, missed_mm
+from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES
+from brushloop.calibrate.validate.report import (
+    NORMAL,
+    STRICT,
+    Report,
+    Session,
+    TableRow,
+    missed_mm,
+    robot_writing,
+    table_2,
+    table_3,
+)
+from brushloop.calibrate.writing.compare import Table3Row
 
 CLOSE = 0.5
 """Points below which two models count as equal."""
@@ -22,6 +39,10 @@ MOVED_MM = 0.3
 MISSED_MM = 0.1
 """Difference between the commanded and the reached depth above which a report says so."""
 MAX_NAMED = 6
+MAX_REFUSED = 20
+"""Refused strokes listed on the terminal."""
+SHORT = {HELD_OUT: ", held out", "fitted, in sample": ", in sample"}
+"""What a model knows of the strokes, shortened for the terminal."""
 
 
 def measured(report: Report) -> str:
@@ -168,3 +189,39 @@ def _span(interval: Interval | None) -> str:
 def _label(report: Report, name: str) -> str:
     model = report.model(name)
     return name if model is None else model.label
+
+
+def terminal_lines(report: Report) -> Iterator[object]:
+    """Tables and lines for the terminal; the extremes of the scores are on the page."""
+    names = ", ".join(session.session_id for session in report.sessions[:4])
+    yield f"{names}: {source_note(report.source)}"
+    yield measured(report)
+    rows = [[*table_2(report, key), *robot_writing(report, key)] for key in (NORMAL, STRICT)]
+    yield _terminal_table(f"averages, binary, ink = 1, percent ({report.label})", *rows)
+    for record in report.written:
+        for name in record.characters:
+            rows = [table_3(record, name, alignment) for alignment in (NORMAL[0], STRICT[0])]
+            yield _terminal_table(f"Table 3: {name}, averages, binary, percent ({report.label})", *rows)
+    yield " ".join(verdict(report))
+    for point in trust(report):
+        yield f"{'•' if point.good is None else '✓' if point.good else '✗'} {point.text}"
+    for press in report.refused[:MAX_REFUSED]:
+        yield f"not used: {press.session_id} {press.stroke_id}: {press.why}"
+    if len(report.refused) > MAX_REFUSED:
+        yield f"and {len(report.refused) - MAX_REFUSED} more, in the report"
+
+
+def _terminal_table(title: str, like: Sequence[TableRow], strict: Sequence[TableRow]) -> Table:
+    """Each row in both alignments; the paper's numbers are of the first."""
+    table = Table("model", "n", "size-\nnormalised\nCSIM / SSIM", "paper's\navg", "mm\nCSIM / SSIM", title=title)
+    for row, other in itertools.zip_longest(like, strict):
+        if row.scores is not None:
+            words = [_pair(row.scores), "", "" if other is None else _pair(other.scores)]
+            if row.paper is not None:
+                words[1] = f"{row.paper.csim[2]:.2f} / {row.paper.ssim[2]:.2f}"
+            table.add_row(row.label + SHORT.get(row.basis, ""), str(row.scores.csim.n), *words)
+    return table
+
+
+def _pair(scores: Stat | Table3Row | None) -> str:
+    return "" if scores is None else f"{scores.csim.avg:.2f} / {scores.ssim.avg:.2f}"

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of, levels_of, simulated
+from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of, levels_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.fit.heldout import RefittedBezier
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING
+from brushloop.calibrate.work import Store, key_of
 from brushloop.model.ccdbsm import Brush, DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.fitted import FittedPress
+from brushloop.model.outline import Outline
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.records import Condition
 
@@ -96,13 +99,17 @@ BRUSH_LEFT_OUT = ModelInfo(
 )
 
 
+Mark = tuple[Outline, float]
+"""The outline of a press, and the distance of its origin from the zero-touch point, mm."""
+
+
 @dataclass(frozen=True, slots=True)
 class Model:
     """A model to compare with the presses of one session: one row of the tables."""
 
     info: ModelInfo
-    predict: Callable[[Condition], Pixels]
-    """(len(KEYS), 128, 128) of a condition; raises `DomainError` for a press that the model does not predict."""
+    mark: Callable[[Condition], Mark]
+    """What it predicts for a condition; raises `DomainError` for a press that it does not predict."""
 
     @property
     def name(self) -> str:
@@ -110,12 +117,35 @@ class Model:
         return self.info.name
 
 
+def predicted(
+    models: Iterable[Model], at: Condition, view: Field, store: Store
+) -> tuple[dict[str, Pixels], dict[str, str]]:
+    """(len(KEYS), 128, 128) of a condition by model, and why there is none by model that does not predict it.
+
+    Marks that were drawn before are in the store.
+    """
+    marks: dict[str, Mark] = {}
+    refused: dict[str, str] = {}
+    for model in models:
+        try:
+            marks[model.name] = model.mark(at)
+        except DomainError as error:
+            refused[model.name] = f"{model.name} does not predict it: {error}"
+    parts = ((mark.points, mark.weights, origin_x_mm) for mark, origin_x_mm in marks.values())
+    key = key_of("drawn", view, *itertools.chain.from_iterable(parts))
+    drawn = store.get(key)
+    if drawn is None:
+        drawn = {str(k): levels_of(images_of(*mark, view)) for k, mark in enumerate(marks.values())}
+        store.put(key, drawn)
+    return dict(zip(marks, (drawn[str(k)] for k in range(len(marks))), strict=True)), refused
+
+
 def in_order(models: Sequence[Model]) -> list[Model]:
     """Sort in the order of the paper's tables, all others last."""
     return sorted(models, key=lambda model: ORDER.index(model.name) if model.name in ORDER else len(ORDER))
 
 
-def known_models(session: FittedSession, generators: Sequence[Path], view: Field, *, ablations: bool) -> list[Model]:
+def known_models(session: FittedSession, generators: Sequence[Path], *, ablations: bool) -> list[Model]:
     """The models that need no held-out fit: generators, the registered models of the brush, and its fit.
 
     Raises what `load_generator` does, and `CalibrationError` for two generators of one name.
@@ -125,36 +155,36 @@ def known_models(session: FittedSession, generators: Sequence[Path], view: Field
     from brushloop.model.strokes import stroke_model, stroke_models
 
     brush, fit = brush_of(session.header), session.fit
-    models = [_of_model(model, PUBLISHED, view) for model in stroke_models(brush).values()]
+    models = [_of_model(model, PUBLISHED) for model in stroke_models(brush).values()]
     if fit is not None:
         basis = "fitted, in sample" if fit.recording_sha256 == session.sha256 else f"fitted on {fit.session_id}"
-        models.append(_of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis, view))
+        models.append(_of_model(fitted_model(fit.press(), "CCD-BSM fitted"), basis))
     for name, lam in LAMBDAS.items() if ablations else ():
         label = f"CCD-BSM, λ = {name.rpartition('-')[2].replace('pi', 'π')}"
-        models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, view, name=name, label=label))
+        models.append(_of_model(stroke_model("ccd-bsm", brush, lam), PUBLISHED, name=name, label=label))
     for file in generators:
         model = load_generator(file, brush)
         if model.name in [known.name for known in models]:
             raise CalibrationError(str(file), f"is a second {model.name}")
         basis = f"trained on exact images of {model.target.stroke_model.label}"
         basis += ", then tuned on captures" if model.fitted else ""
-        models.append(_of_model(model, basis, view, sha256=file_sha256(file)))
+        models.append(_of_model(model, basis, sha256=file_sha256(file)))
     return in_order(models)
 
 
-def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBezier | None], view: Field) -> Model:
+def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBezier | None]) -> Model:
     """A model that was fitted without the cell that it predicts; None where the other cells are too few."""
 
-    def predict(at: Condition) -> Pixels:
+    def mark(at: Condition) -> Mark:
         fit = fits.get(at)
         if fit is None:
             raise DomainError("depth_mm", at.depth_mm, "other cells", "the other cells do not determine this press")
-        return levels_of(images_of(fit.outline(at.depth_mm, at.tilt_deg), 0.0, view))
+        return fit.outline(at.depth_mm, at.tilt_deg), 0.0
 
-    return Model(info, predict)
+    return Model(info, mark)
 
 
-def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field) -> Model:
+def tuned(files: Mapping[Condition, Path], brush: Brush) -> Model:
     """A generator tuned on all cells except the one it predicts."""
     from brushloop.model.generator.stroke import load_generator
 
@@ -167,11 +197,13 @@ def tuned(files: Mapping[Condition, Path], brush: Brush, view: Field) -> Model:
         "CCD-BSM that was fitted to them, if there is a fit; its outline.",
         basis=HELD_OUT,
     )
-    return Model(info, lambda at: levels_of(simulated(loaded[files[at]], at.depth_mm, at.tilt_deg, view)))
+    return Model(info, lambda at: _pressed(loaded[files[at]], at))
 
 
-def _of_model(model: StrokeModel, basis: str, view: Field, **changes: str) -> Model:
+def _of_model(model: StrokeModel, basis: str, **changes: str) -> Model:
     info = ModelInfo(name=model.name, label=model.label, definition=model.definition, basis=basis)
-    return Model(
-        info.model_copy(update=changes), lambda at: levels_of(simulated(model, at.depth_mm, at.tilt_deg, view))
-    )
+    return Model(info.model_copy(update=changes), lambda at: _pressed(model, at))
+
+
+def _pressed(model: StrokeModel, at: Condition) -> Mark:
+    return model.profile(at.depth_mm, at.tilt_deg), at.depth_mm * math.tan(math.radians(at.tilt_deg))

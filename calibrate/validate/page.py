@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.artefact import FOLDER
-from brushloop.calibrate.compare.place import KEYS, TABLE_3, Alignment, Image, Tone
+from brushloop.calibrate.compare.place import KEYS, TABLE_3, Alignment, Image, Pixels, Tone
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.brush import FOLDER as FITS
@@ -32,7 +32,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.scores import Row, Stat
 from brushloop.calibrate.stats import CEILING, Cell
-from brushloop.calibrate.validate import findings, tables
+from brushloop.calibrate.validate import findings
 from brushloop.calibrate.validate.models import (
     BEZIER_REFITTED,
     FITTED_HELD_OUT,
@@ -40,9 +40,8 @@ from brushloop.calibrate.validate.models import (
     FittedSession,
     ModelInfo,
 )
-from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session
+from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session, TableRow, table_1, table_2, table_3
 from brushloop.calibrate.validate.run import Outcome
-from brushloop.model.ccdbsm import DomainError
 
 CELL_COLUMNS = ("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
 GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
@@ -95,9 +94,9 @@ def page_of(
         measured=findings.measured(report),
         trust=list(findings.trust(report)),
         order=findings.order(report),
-        table_one=tables.table_1(report),
-        table_two=tables.table_2(report),
-        table_three=list(tables.table_3(report)),
+        table_one=table_1(report),
+        table_two=table_2(report),
+        table_three=list(_table_three(report)),
         figures_13=figures_13,
         paper_three=list(TABLE_3.values()),
         plot=_distributions(outcome, report),
@@ -113,7 +112,8 @@ def page_of(
         curves=_curves(curves) if curves else "",
         refused=report.refused[:MAX_REFUSED],
         more_refused=max(0, len(report.refused) - MAX_REFUSED),
-        provenance=[*map(provenance, report.sessions), *_of_others(report), _of_run(report)],
+        provenance=list(map(provenance, report.sessions)),
+        software=", ".join(f"{name} {number}" for name, number in report.software.items()),
     )
 
 
@@ -126,6 +126,17 @@ def pages_beside(sessions: Sequence[FittedSession], folder: Path) -> Iterator[tu
         for name, artefact, kind in (("calibration", session.calibration, FOLDER), ("brush fit", session.fit, FITS)):
             if artefact is not None and (home / kind / f"{artefact.digest}.html").is_file():
                 yield f"{name} of {session.header.session_id}", f"../{kind}/{artefact.digest}.html"
+
+
+def _table_three(report: Report) -> Iterator[tuple[str, list[TableRow]]]:
+    """Title and rows of Table 3 of every character in either alignment."""
+    for record in report.written:
+        where = f"written in {record.session} with {record.brush or 'an unnamed brush'}"
+        where += f" on paper cells of {record.cell_mm:g} mm"
+        for name in record.characters:
+            yield f"{name}, {where} — {NORMAL[0]}, binary", table_3(record, name, NORMAL[0])
+            title = f"{name}, {where} — {STRICT[0]}, binary: where size and place count"
+            yield title, table_3(record, name, STRICT[0])
 
 
 def _extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
@@ -141,12 +152,13 @@ def _extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
 
 def _pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     """A press with what the model predicts for it, their difference, and their scores: the paper's figures 7 and 8."""
-    row = outcome.scores.rows[k]
-    captured, predicted = _captured(row), _predicted(outcome, row, model)
+    row, csim, ssim = outcome.scores.rows[k], np.nan, np.nan
+    captured, drawn = _shown(row.images), outcome.predicted(row)
     images = {"captured": ink_uri(captured)}
-    if predicted is not None:
+    if model in drawn:
+        predicted = _shown(drawn[model])
         images |= {"predicted": ink_uri(predicted), "difference": overlay_uri(captured, predicted)}
-    csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k] if model else (np.nan, np.nan)
+        csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k]
     return {"row": row, "images": images, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
 
 
@@ -155,8 +167,9 @@ def _side_by_side(outcome: Outcome) -> dict[str, Any]:
     labels = {model.name: model.info.label for group in outcome.models.values() for model in group}
     lines: list[tuple[Row, list[str]]] = []
     for row in (outcome.scores.rows[k] for k in _first_of_cells(outcome, MAX_CELLS)):
-        drawn = [_captured(row), *(_predicted(outcome, row, name) for name in labels)]
-        lines.append((row, ["" if image is None else ink_uri(image) for image in drawn]))
+        drawn = outcome.predicted(row)
+        predictions = (ink_uri(_shown(drawn[name])) if name in drawn else "" for name in labels)
+        lines.append((row, [ink_uri(_shown(row.images)), *predictions]))
     return {"labels": list(labels.values()), "lines": lines}
 
 
@@ -167,17 +180,9 @@ def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
     return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
 
 
-def _captured(row: Row) -> Image:
-    return np.asarray(row.images[GRAY_MM][ROWS] / 255.0, np.float32)
-
-
-def _predicted(outcome: Outcome, row: Row, name: str) -> Image | None:
-    """Gray on the millimetre field, or None if the model does not predict this press."""
-    model = next((model for model in outcome.models[row.session] if model.name == name), None)
-    try:
-        return None if model is None else np.asarray(model.predict(row.condition)[GRAY_MM][ROWS] / 255.0, np.float32)
-    except DomainError:
-        return None
+def _shown(images: Pixels) -> Image:
+    """The rows to show of the gray image on the millimetre field, of (len(KEYS), 128, 128)."""
+    return np.asarray(images[GRAY_MM][ROWS] / 255.0, np.float32)
 
 
 def _distributions(outcome: Outcome, report: Report) -> str:
@@ -248,31 +253,3 @@ def provenance(session: Session) -> list[tuple[str, str]]:
     used = (("brush fit", session.fit), ("strokes", counts), ("zero touch", touches))
     facts = recording_facts(session.header, session.recording, session.recording_sha256, session.calibration)
     return [*facts, *((name, text) for name, text in used if text)]
-
-
-def _of_others(report: Report) -> Iterator[list[tuple[str, str]]]:
-    """The loops and the characters of the report, each with its own digest."""
-    for loop in report.loops:
-        model = f"{loop.model}{' (in sample)' if loop.in_sample else ''}"
-        yield [
-            ("pressed again", f"{loop.original} as {loop.again} ({loop.source}), recovered by {model}"),
-            ("recording", f"sha256 {loop.again_sha256}; {loop.pairs} pairs, {len(loop.refused)} strokes not compared"),
-            ("loop.json", f"digest {loop.digest}; {loop.software}; {loop.command}"),
-        ]
-    for record in report.written:
-        yield [
-            (
-                "characters",
-                f"{' '.join(record.characters)} in {record.session} ({record.source}), brush {record.brush}",
-            ),
-            ("recording", f"sha256 {record.recording_sha256}; {len(record.refused)} strokes not compared"),
-            ("written.json", f"digest {record.digest}; planned by {record.model}; {record.software}; {record.command}"),
-        ]
-
-
-def _of_run(report: Report) -> list[tuple[str, str]]:
-    return [
-        ("validated with", ", ".join(f"{name} {number}" for name, number in report.software.items())),
-        ("command", report.command),
-        ("every score", f"scores.csv, sha256 {report.scores_sha256}"),
-    ]

@@ -1,38 +1,56 @@
-"""The report as data: what was validated with what, and the statistics of every model.
+"""The report as data: what was validated with what, the statistics of every model, and the queries on them.
 
-Everything in terminal, JSON, tables, gates and comparisons comes from it.
+Terminal, page, summary.csv, gates and comparisons are made of it. A gate is a score that must be reached, as
+`csim_avg>=0.90` or `ccd-bsm-heldout:mm:binary:csim_avg>=0.93`.
 """
 
 from __future__ import annotations
 
+import itertools
 import platform
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import Alignment, Key, Tone, brush_of
-from brushloop.calibrate.loop import LoopRecord
+from brushloop.calibrate.compare.place import (
+    ROBOT_WRITING,
+    TABLE_1,
+    TABLE_2,
+    Alignment,
+    Key,
+    Polarity,
+    Printed,
+    Tone,
+    brush_of,
+)
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.loop import AGAIN, LoopRecord
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
-from brushloop.calibrate.scores import Cell, Row, Scores, Stat, find_stat, statistics
+from brushloop.calibrate.scores import MEASURES, Cell, Row, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
-from brushloop.calibrate.stats import CEILING, Floats, ceiling_values
+from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
 from brushloop.calibrate.validate.models import (
     ANOTHER,
     FITTED,
     FITTED_HELD_OUT,
+    GENERATOR_HELD_OUT,
     KINDS_OF_PRESS,
+    LAMBDAS,
     FittedSession,
     ModelInfo,
 )
 from brushloop.calibrate.validate.run import Outcome, Refused, Step
-from brushloop.calibrate.writing.compare import WrittenRecord
+from brushloop.calibrate.writing.compare import ANOTHER as ANOTHER_WRITING
+from brushloop.calibrate.writing.compare import PAPER_ROWS, PLANNED, REFERENCE, SIMULATED, Table3Row, WrittenRecord
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
+from brushloop.sessions.disk import csv_text
 from brushloop.sessions.events import CaptureResult, DipResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.records import Header, Source, Stroke
@@ -45,6 +63,28 @@ STRICT: Key = (Alignment.MM, Tone.BINARY)
 NORMAL: Key = (Alignment.SIZE_NORMALISED, Tone.BINARY)
 """The comparison where size and place count, and that of the paper."""
 MAX_CELLS = 60
+"""Most conditions that have statistics of their own."""
+MISSING = {
+    "ccd-bsmg": "not in this run: give a trained one with --generator",
+    ROBOT_WRITING: "not in this run: “brushloop loop SESSION --config RIG” presses recovered strokes again; then "
+    "validate again",
+}
+WRITTEN_ROWS = {
+    SIMULATED: ("simulated", "each writing against the model's image of its plan"),
+    REFERENCE: ("robot writing", "each writing against the reference"),
+    ANOTHER_WRITING: ("another writing", "each writing against the others: how repeatable arm and brush are"),
+    PLANNED: ("the plan", "simulated image against the reference: the best that the plan could give"),
+}
+"""Label and description of the row of Table 3 for each comparison."""
+SUMMARY_COLUMNS = (
+    *("model", "alignment", "tone", "measure", "depth_mm", "tilt_deg", "n", "max", "min"),
+    *("avg", "avg_low", "avg_high", "median", "median_low", "median_high", "below_ceiling", "source"),
+)
+GATE = re.compile(
+    r"((?P<model>[^:<>=]+):)??((?P<alignment>mm|size-normalised):)?((?P<tone>binary|gray):)?"
+    r"(?P<measure>csim|ssim)_(?P<statistic>avg|median|min|max)\s*>=\s*(?P<limit>0|1|[01]?\.\d+)"
+)
+GATE_RULE = "expected [MODEL:][ALIGNMENT:][TONE:]csim_avg>=0.90, with csim or ssim, avg, median, min or max, and 0 to 1"
 
 
 class Collected(Frozen):
@@ -248,3 +288,116 @@ def _size_ratio(header: Header, rows: Sequence[Row]) -> tuple[float, float] | No
         return None
     length, width = np.mean(ratios, axis=0).tolist()
     return round(length, 6), round(width, 6)
+
+
+class TableRow(NamedTuple):
+    """One row in the paper's layout."""
+
+    label: str
+    basis: str
+    scores: Stat | Table3Row | None
+    """None if only the paper has such a row."""
+    paper: Printed | None = None
+    soft: bool = False
+    """Whether it is what a model may be compared with, not a model: the ceiling, another writing, the plan."""
+
+
+def table_1(report: Report) -> list[TableRow]:
+    """Rows of the generated models and robot writing, with calibrated models and the ceiling."""
+    calibrated = [name for name in (FITTED_HELD_OUT, GENERATOR_HELD_OUT) if report.model(name) is not None]
+    rows = [_row(report, name, TABLE_1[name]) for name in TABLE_1 if name != ROBOT_WRITING]
+    rows += robot_writing(report) or [_row(report, ROBOT_WRITING, TABLE_1[ROBOT_WRITING])]
+    return rows + [_row(report, name) for name in (*calibrated, ANOTHER, CEILING)]
+
+
+def robot_writing(report: Report, key: Key = NORMAL) -> list[TableRow]:
+    """Rows of strokes pressed again, one of each loop."""
+    rows: list[TableRow] = []
+    for loop in report.loops:
+        basis = f"{loop.original} pressed again as {loop.again}, recovered by {loop.model}"
+        if loop.mm_per_px != report.mm_per_px and key[0] is Alignment.MM:
+            basis += f"; at {loop.mm_per_px:g} mm per pixel"
+        rows.append(TableRow(ROBOT_WRITING, basis, loop.stat(AGAIN, key), TABLE_1[ROBOT_WRITING]))
+    return rows
+
+
+def table_2(report: Report, key: Key = NORMAL) -> list[TableRow]:
+    """Rows of the paper's models in its order, then of all others."""
+    last = (ANOTHER, CEILING)
+    others = [model.name for model in report.models if model.name not in (*TABLE_2, *last, *LAMBDAS)]
+    return [_row(report, name, TABLE_2.get(name), key) for name in (*TABLE_2, *others, *last)]
+
+
+def _row(report: Report, name: str, paper: Printed | None = None, key: Key = NORMAL) -> TableRow:
+    known = report.model(name)
+    label = known.label if known is not None else paper.label if paper is not None else name
+    basis = known.basis if known is not None else MISSING.get(name, "not in this run")
+    return TableRow(label, basis, report.stat(name, key), paper, name == CEILING)
+
+
+def table_3(record: WrittenRecord, character: str, alignment: Alignment) -> list[TableRow]:
+    """Rows of a character, binary: size-normalised in both polarities, with the paper's rows, or in mm with ink = 1."""
+    like = alignment is Alignment.SIZE_NORMALISED
+    keys = [(Polarity.INK, pair) for pair in WRITTEN_ROWS]
+    keys += [(Polarity.PAPER, pair) for pair in PAPER_ROWS] if like else []
+    of_character = [row for row in record.table_3 if (row.character, row.tone) == (character, Tone.BINARY)]
+    rows = {(row.polarity, row.pair): row for row in of_character if row.alignment is alignment}
+    table: list[TableRow] = []
+    for row in (rows[key] for key in keys if key in rows):
+        label, basis = WRITTEN_ROWS[row.pair]
+        basis += {SIMULATED: f", {record.model}", REFERENCE: f", {row.reference}"}.get(row.pair, "")
+        paper = PAPER_ROWS.get(row.pair) if like else None
+        if paper is not None:
+            basis += f" (beside the paper's {paper.label})"
+        table.append(TableRow(f"{label}, {row.polarity}", basis, row, paper, row.pair not in PAPER_ROWS))
+    return table
+
+
+def summary_csv(report: Report) -> str:
+    """Return every statistic, per cell and overall; “robot writing” is what `brushloop loop` pressed again."""
+    stats = [(stat.model, report.label, stat) for stat in report.stats]
+    for loop in report.loops:
+        again = (stat for stat in loop.table_1 if stat.model == AGAIN)
+        stats += [(f"{ROBOT_WRITING} ({loop.again})", str(loop.source), stat) for stat in again]
+    rows: list[tuple[object, ...]] = []
+    for (model, source, stat), measure in itertools.product(stats, MEASURES):
+        of: Summary = getattr(stat, measure)
+        avg, median = (ends or (None, None) for ends in (of.avg_interval, of.median_interval))
+        place = model, stat.alignment, stat.tone, measure, *(stat.cell or (None, None))
+        rows.append((*place, of.n, of.max, of.min, of.avg, *avg, of.median, *median, of.below_ceiling, source))
+    return csv_text(SUMMARY_COLUMNS, rows)
+
+
+class GateMissed(Exception):
+    """A score misses its gate; the report is still written."""
+
+    exit_code: ClassVar[int] = 5
+
+
+def parse_gate(text: str) -> re.Match[str]:
+    """The parts of a gate by name. Raises `CalibrationError`."""
+    gate = GATE.fullmatch(text.strip())
+    if gate is None or float(gate["limit"]) > 1.0:
+        raise CalibrationError(f"--gate {text}", GATE_RULE)
+    return gate
+
+
+def check_gates(report: Report, gates: Sequence[str]) -> None:
+    """Check the gates; one that names no model is for the report's calibrated model, or else for the first.
+
+    Raises `GateMissed` naming all missed ones, `CalibrationError` for a score that is not there.
+    """
+    missed: list[str] = []
+    for gate in map(parse_gate, gates):
+        model, measure, statistic = gate["model"] or report.shown, gate["measure"], gate["statistic"]
+        key = Alignment(gate["alignment"] or NORMAL[0]), Tone(gate["tone"] or NORMAL[1])
+        stat = report.stat(model, key)
+        percent: float | None = None if stat is None else getattr(getattr(stat, measure), statistic)
+        if percent is None:
+            known = ", ".join(dict.fromkeys(stat.model for stat in report.stats))
+            raise CalibrationError(f"--gate {gate[0]}", f"{model!r} has no {statistic}; scored: {known}")
+        if 0.01 * percent < float(gate["limit"]):
+            which = f"{measure}_{statistic} of {', '.join((model, *key))}"
+            missed.append(f"{gate[0]}: {which} is {0.01 * percent:.4f} ({report.label})")
+    if missed:
+        raise GateMissed(f"gate missed: {'; '.join(missed)}")

@@ -42,11 +42,11 @@ from brushloop.calibrate.validate.models import (
     held_out,
     in_order,
     known_models,
+    predicted,
     tuned,
 )
 from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
 from brushloop.calibrate.work import Arrays, Scheduler, key_of
-from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
@@ -106,7 +106,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Every score of a run."""
+    """Every score of a run, and the models that were compared."""
 
     sessions: Sequence[FittedSession]
     request: Request
@@ -118,6 +118,11 @@ class Outcome:
     steps: Sequence[Step] = ()
     """Similarity by number of fitted presses; empty without ablations."""
 
+    def predicted(self, row: Row) -> dict[str, Pixels]:
+        """(len(KEYS), 128, 128) of a press by the models that predict it."""
+        [store] = (session.store for session in self.sessions if session.header.session_id == row.session)
+        return predicted(self.models[row.session], row.condition, self.request.view, store)[0]
+
 
 def validate_presses(
     sessions: Sequence[FittedSession], request: Request, scheduler: Scheduler, work: Path, progress: Progress = unseen
@@ -128,7 +133,7 @@ def validate_presses(
     """
     models: dict[str, Sequence[Model]] = {}
     for session in sessions:
-        known = known_models(session, request.generators, request.view, ablations=request.ablations)
+        known = known_models(session, request.generators, ablations=request.ablations)
         models[session.header.session_id] = known
     if len(models) < len(sessions):
         raise CalibrationError(sessions[-1].header.session_id, "two sessions have this name")
@@ -152,7 +157,7 @@ def validate_presses(
     names = list(dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group])))
     scores = Scores(rows, (*names, ANOTHER))
     for session in sessions:
-        _score(scores, session, models[session.header.session_id], refused, scheduler, progress)
+        _score(scores, session, models[session.header.session_id], request.view, refused, scheduler, progress)
     steps: list[Step] = []
     for number, session in enumerate(sessions if request.ablations else ()):
         steps += _similarity_by_strokes(session, number, scores, request.view, scheduler)
@@ -178,10 +183,10 @@ def _held_out(
         left_out = _left_out(rows, MAX_FOLDS)
         presses = _refitted(session, left_out, view, scheduler, progress)
         if presses:
-            yield held_out(BRUSH_LEFT_OUT, presses, view)
+            yield held_out(BRUSH_LEFT_OUT, presses)
         if left_out:
             beziers = {cell: _bezier(others, view) for fold, others in left_out for cell in fold}
-            yield held_out(BEZIER_LEFT_OUT, beziers, view)
+            yield held_out(BEZIER_LEFT_OUT, beziers)
     if request.tune_steps:
         left_out = _left_out(rows, FOLDS)
         presses = _refitted(session, left_out, view, scheduler, progress)
@@ -189,7 +194,7 @@ def _held_out(
             folds = [(fold, presses.get(fold[0])) for fold, _ in left_out]
             files = tuned_by_cell(session, folds, generator, request.tune_steps, work, progress)
             if files:
-                yield tuned(files, brush_of(session.header), view)
+                yield tuned(files, brush_of(session.header))
 
 
 LeftOut = list[tuple[list[Condition], list[Pressed]]]
@@ -245,6 +250,7 @@ def _score(
     scores: Scores,
     session: FittedSession,
     models: Sequence[Model],
+    view: Field,
     refused: list[Refused],
     scheduler: Scheduler,
     progress: Progress,
@@ -257,7 +263,11 @@ def _score(
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell in cells:
-            predictions = list(_predictions(models, [rows[k] for k in cell], refused))
+            images, reasons = predicted(models, rows[cell[0]].condition, view, session.store)
+            for why in reasons.values():
+                refused.extend(Refused(rows[k].session, rows[k].stroke.stroke_id, why) for k in cell)
+            none = np.zeros((0,), np.uint8)
+            predictions = [images[model.name][np.newaxis] if model.name in images else none for model in models]
             for number, k in enumerate(cell):
                 others = [rows[cell[other]].images for other in others_of(number, len(cell))]
                 against = (*predictions, np.array(others))
@@ -268,17 +278,6 @@ def _score(
     what, count = f"{session.header.session_id}: compared", sum(map(len, cells))
     for key, arrays in counted(scheduler.finished(score_job, jobs(), session.store), what, count, progress):
         scores.values[np.ix_(places[key], columns)] = arrays["values"]
-
-
-def _predictions(models: Sequence[Model], cell: Sequence[Row], refused: list[Refused]) -> Iterator[Pixels]:
-    """Yield the images that each model predicts for a cell; none, and a reason, where it predicts none."""
-    for model in models:
-        try:
-            yield model.predict(cell[0].condition)[np.newaxis]
-        except DomainError as error:
-            yield np.zeros((0,), np.uint8)
-            why = f"{model.name} does not predict it: {error}"
-            refused += (Refused(row.session, row.stroke.stroke_id, why) for row in cell)
 
 
 def _similarity_by_strokes(

@@ -115,14 +115,5 @@ def test_a_line_is_fitted_with_its_interval() -> None:
         assert line is not None
         hits += line.interval[0] <= 0.6 <= line.interval[1]
     assert 180 <= hits <= 199  # 95 %, give or take what 200 draws allow
-
-
-def test_a_point_of_little_weight_moves_a_line_little() -> None:
-    x, y = [0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 2.0, 9.0]
-    even, less = fit_line(x, y), fit_line(x, y, [1.0, 1.0, 1.0, 0.01])
-    assert even is not None
-    assert less is not None
-    assert even.slope > 2.0
-    assert less.slope == pytest.approx(1.0, abs=0.2)
     assert fit_line([1.0, 2.0], [1.0, 2.0]) is None
     assert fit_line([1.0, 1.0, 1.0], [1.0, 2.0, 3.0]) is None
