@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import TABLE_1
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.validate import tables
-from brushloop.calibrate.validate.report import Report, load_report
+from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, load_report, table_1, table_3
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.calibrate.records import loop_record, table_of, written_record
@@ -77,8 +76,10 @@ def test_a_loop_in_the_session_is_the_third_row_of_table_1(place: Path) -> None:
     put(place / "loop", loop_text(place))
     assert "are at most 1 point less similar to their originals" in invoke(place)
     report, page = report_of(place)
-    [row] = [row for row in tables.table_1(report) if row.label == "robot writing"]
-    assert row.ours == pytest.approx((94.5, 94.0, 94.25, 84.5, 84.0, 84.25))
+    [row] = [row for row in table_1(report) if row.label == "robot writing"]
+    assert row.scores is not None
+    assert row.scores.csim.range_and_avg == pytest.approx((94.5, 94.0, 94.25))
+    assert row.scores.ssim.range_and_avg == pytest.approx((84.5, 84.0, 84.25))
     assert row.paper == TABLE_1["robot writing"]
     with (place / "validation" / "summary.csv").open() as file:
         rows = [r for r in csv.DictReader(file) if r["model"] == f"robot writing ({place.name}-replay)"]
@@ -130,8 +131,8 @@ def test_table_3_has_the_papers_rows_beside_and_figure_13(place: Path, beside: s
     characters(place.parent.parent / beside)
     assert "Table 3: 字" in invoke(place)
     report, page = report_of(place)
-    like, strict = tables.table_3(report)
-    assert {row.label: None if row.paper is None else row.paper.csim[2] for row in like.rows} == {
+    like, strict = (table_3(report.written[0], "字", key[0]) for key in (NORMAL, STRICT))
+    assert {row.label: None if row.paper is None else row.paper.csim[2] for row in like} == {
         "simulated, ink = 1": 94.58,
         "robot writing, ink = 1": 93.59,
         "another writing, ink = 1": None,
@@ -139,7 +140,7 @@ def test_table_3_has_the_papers_rows_beside_and_figure_13(place: Path, beside: s
         "simulated, paper = 1": 94.58,
         "robot writing, paper = 1": 93.59,
     }
-    assert all(row.paper is None for row in strict.rows)
+    assert all(row.paper is None for row in strict)
     assert page.count("Figure 13") >= 2
 
 
