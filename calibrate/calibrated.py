@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -25,13 +26,11 @@ from brushloop.calibrate.report import (
     BLUE,
     Point,
     about,
-    dress,
     framed,
     photograph_uri,
-    plot,
-    plot_uri,
     recording_facts,
     source_point,
+    svg_uri,
     write_page,
 )
 from brushloop.calibrate.session import Calibration, board_of, rig_of
@@ -247,7 +246,12 @@ def _reach(calibration: Calibration) -> float:
 
 def _scale(calibration: Calibration, width: int, height: int, sheet: Floats | None, label: str) -> str:
     """Contours of mm per pixel across the photograph."""
-    figure, axis = plot(1, 1, (5.6, 4.4))
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    axis: Any = figure.subplots()
     across, down = (np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), SCALE_GRID, strict=True))
     scale = np.array([[local_scale(calibration.to_paper, np.array([x, y])) for x in across] for y in down])
     lines = axis.contour(across, down, scale, levels=8, colors=BLUE, linewidths=0.9)
@@ -257,5 +261,11 @@ def _scale(calibration: Calibration, width: int, height: int, sheet: Floats | No
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
     axis.set_aspect("equal")
-    dress(axis, f"mm per pixel across the photograph ({label})", "px", "px", grid="")
-    return plot_uri(figure)
+    axis.set_title(f"mm per pixel across the photograph ({label})", fontsize=10, parse_math=False)
+    axis.set_xlabel("px")
+    axis.set_ylabel("px")
+    buffer, canvas = io.BytesIO(), cast("Any", FigureCanvasSVG(figure))
+    with matplotlib.rc_context({"svg.hashsalt": "brushloop"}):  # pyright: ignore[reportUnknownMemberType]
+        # Not `savefig`, which lays out and draws every figure twice.
+        canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
+    return svg_uri(buffer.getvalue())

@@ -6,7 +6,6 @@ import base64
 import functools
 import hashlib
 import html
-import io
 import json
 import math
 import re
@@ -174,6 +173,11 @@ def png_uri(data: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(data).decode()
 
 
+def svg_uri(data: bytes) -> str:
+    """An SVG file as a data URI."""
+    return "data:image/svg+xml;base64," + base64.b64encode(data).decode()
+
+
 def image_uri(image: NDArray[np.uint8]) -> str:
     """An (h, w) gray or (h, w, 3) BGR image as a PNG data URI."""
     import cv2
@@ -213,26 +217,6 @@ def overlay(first: Image, second: Image) -> Image:
     return np.clip(1.0 - darker, 0.0, 1.0).astype(np.float32)
 
 
-def plot(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    """A figure for a page, and its axes; size in inches."""
-    # The object interface: pyplot would keep every figure alive and look for a display.
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns)
-
-
-def dress(axis: Any, title: str, x: str, y: str = "", *, grid: str = "both", legend: bool = False) -> None:
-    """Give a plot its title, the names of its axes, and grid lines of `both` axes, of one or of none."""
-    axis.set_title(title, fontsize=10, parse_math=False)
-    axis.set_xlabel(x)
-    axis.set_ylabel(y)
-    if grid:
-        axis.grid(axis=grid, alpha=0.3)
-    if legend:
-        axis.legend()
-
-
 @dataclass(frozen=True, slots=True)
 class Marks:
     """Points of a chart, (n,) x and y, as dots, joined by a line, or both; a point that is not finite is left out."""
@@ -269,30 +253,25 @@ class Panel:
 def chart_uri(panels: Sequence[Panel], size_px: tuple[int, int], title: str = "") -> str:
     """Panels side by side below a title, as an SVG data URI; the same panels give the same bytes."""
     width, height = size_px
-    head, heads = _lines(title, width), [_lines(panel.title, width // len(panels)) for panel in panels]
-    above = LINE_PX * (1 + len(head))
-    named = any(mark.name for panel in panels for mark in panel.marks)
-    top, bottom = above + LINE_PX * (max(map(len, heads)) + named) - 4, height - 3 * LINE_PX
-    scales = [_scale(panel.y, [mark.y for mark in panel.marks], bottom, top) for panel in panels]
-    beside = [
-        CHAR_PX * max(len(text) for _, text in ticks) + (2 * LINE_PX if panel.y.name else LINE_PX)
-        for panel, (_, ticks) in zip(panels, scales, strict=True)
-    ]
-    side = (width - sum(beside)) // len(panels) - LINE_PX
+    side, head = width // len(panels), _lines(title, width)
+    above, heads = LINE_PX * (1 + len(head)), [_lines(panel.title, side) for panel in panels]
+    legends = [[(mark.colour, printable(mark.name)) for mark in panel.marks if mark.name] for panel in panels]
+    top = above + LINE_PX * (max(map(len, heads)) + any(legends)) - 4
+    bottom = height - 3 * LINE_PX
     drawn: list[dict[str, Any]] = []
-    for k, (panel, (y_of, y_ticks)) in enumerate(zip(panels, scales, strict=True)):
-        left = sum(beside[: k + 1]) + k * (side + LINE_PX)
-        x_of, x_ticks = _scale(panel.x, [mark.x for mark in panel.marks], left, left + side)
+    for k, panel in enumerate(panels):
+        y_of, y_ticks = _scale(panel.y, [mark.y for mark in panel.marks], bottom, top)
+        beside = CHAR_PX * max(len(text) for _, text in y_ticks) + (2 if panel.y.name else 1) * LINE_PX
+        frame = {"edge": k * side, "left": k * side + beside, "right": (k + 1) * side - LINE_PX}
+        x_of, x_ticks = _scale(panel.x, [mark.x for mark in panel.marks], frame["left"], frame["right"])
         marks: list[tuple[Marks, list[tuple[float, float]]]] = []
         for mark in panel.marks:
             places = np.stack([x_of(np.asarray(mark.x)), y_of(np.asarray(mark.y))], axis=-1)
             marks.append((mark, places[np.isfinite(places).all(axis=1)].tolist()))
-        frame = {"left": left, "right": left + side, "beside": beside[k], "x_ticks": x_ticks, "y_ticks": y_ticks}
-        legend = [(mark.colour, printable(mark.name)) for mark in panel.marks if mark.name]
-        drawn.append({"title": heads[k], "x": panel.x, "y": panel.y, "marks": marks, "legend": legend, **frame})
+        axes = {"x": panel.x, "y": panel.y, "x_ticks": x_ticks, "y_ticks": y_ticks}
+        drawn.append({"title": heads[k], "marks": marks, "legend": legends[k], **axes, **frame})
     about = {"width": width, "height": height, "title": head, "above": above, "top": top, "bottom": bottom}
-    svg = render("chart.svg.j2", panels=drawn, **about)
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+    return svg_uri(render("chart.svg.j2", panels=drawn, **about).encode())
 
 
 def _scale(
@@ -333,18 +312,6 @@ def _lines(text: str, width_px: int) -> list[str]:
 def printable(text: str) -> str:
     """A name or label for the text of a plot, with `?` for every character that no font draws."""
     return "".join(c if c.isprintable() else "?" for c in text)
-
-
-def plot_uri(figure: Any) -> str:
-    """A figure of `plot` as an SVG data URI; the same figure gives the same bytes."""
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    buffer, canvas = io.BytesIO(), cast("Any", FigureCanvasSVG(figure))
-    with matplotlib.rc_context({"svg.hashsalt": "brushloop"}):  # pyright: ignore[reportUnknownMemberType]
-        # Not `savefig`, which lays out and draws every figure twice.
-        canvas.print_svg(buffer, metadata={"Date": None, "Creator": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def picture_grid(rows: int, columns: int, size: tuple[float, float], title: str = "") -> tuple[Any, Any]:

@@ -202,7 +202,7 @@ def _distributions(outcome: Outcome, report: Report) -> str:
             if stat.csim.avg_interval is not None:
                 marks.append(Marks(stat.csim.avg_interval, [place] * 2, ORANGE, line_px=3.0))
             marks.append(Marks([stat.csim.avg] * 2, [place - 0.3, place + 0.3], ORANGE, line_px=3.0))
-        labels = {float(place): "" if panels else model.label for place, model in enumerate(models)}
+        labels = {float(place): model.label for place, model in enumerate(models)}
         panels.append(Panel(f"{key[0]}, binary", Axis("CSIM, %"), Axis(ticks=labels), marks))
     return chart_uri(panels, (1060, 120 + 32 * len(models)), report.label)
 
