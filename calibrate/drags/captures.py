@@ -14,14 +14,16 @@ can be compared with the one that CCD-BSM gives.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.presses import rectified
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stats import Line, fit_line
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
@@ -31,11 +33,10 @@ from brushloop.calibrate.stroke.preprocess import (
     fill_holes,
     measure,
     outline,
-    prepare,
     touches_edge,
 )
-from brushloop.calibrate.stroke.rectify import on_raster, rescale
 from brushloop.model.drag import Drawings, Floats
+from brushloop.model.similarity import inked_window
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture
 from brushloop.sessions.records import Header, Stroke
@@ -50,8 +51,7 @@ LENGTH_NAME = "length_mm"
 DEPTH_NAMES = ("depth_mm", "depth_mid_mm", "depth_mid_mm_nominal")
 COMMANDS = (LENGTH_NAME, "bend_mm", "depth_mm", "depth_ends_mm", "tilt_deg")
 ENDS, SHARE_ENDS, SHARE_MID = "depth_ends_mm", "z_frac_ends", "z_frac_mid"
-PARAMS = Params()
-JOIN_MM = 6.0
+WIDE = Params(join_mm=6.0)
 """Parts this close to the stroke belong to it."""
 TORN_SHARE = 0.03
 """Share of the ink outside the largest part from which a stroke is torn."""
@@ -158,7 +158,7 @@ class Drags:
             self.recording_sha256,
             [drag.stroke_id for drag in used],
             commands,
-            Drawings(paths, np.arange(len(used) + 1), ink, *self.grid),
+            Drawings.of([[path] for path in paths], ink, *self.grid),
             np.flatnonzero([not drag.flags for drag in used]),
             self.ends,
             tuple(left_out),
@@ -242,16 +242,12 @@ def _grid(commands: Sequence[tuple[float, ...] | None], mm_per_px: float) -> tup
 def _read(capture: Capture, command: tuple[float, ...] | None, grid: tuple[Floats, Floats]) -> Drag:
     """Find a drag, all parts of it, and measure its connected part. It is cut if any part is.
 
-    Raises `CaptureRefused` as `prepare` does.
+    Raises as `rectified` does.
     """
     stroke = capture.stroke
-    assert stroke.px_per_mm is not None  # as an import has
-    raster = rescale(capture.image(), stroke.px_per_mm, capture.where)
-    anchor = on_raster(stroke.anchor_px, stroke.px_per_mm) if stroke.anchor_px is not None else None
-    prepared = prepare(raster, anchor, capture.where, PARAMS)
-    mask = prepared.mask
-    wide = replace(PARAMS, join_mm=max(PARAMS.join_mm, JOIN_MM))
-    whole = fill_holes(components(prepared.ink, anchor, wide)[0], PARAMS)
+    raster, prepared = rectified(capture, None, Field())
+    mask, anchor = prepared.mask, prepared.anchor_px
+    whole = fill_holes(components(prepared.ink, anchor, WIDE)[0], WIDE)
     glare = tuple(flag for flag in prepared.flags if flag.startswith("glare"))
     named = {"depth_mm": stroke.depth_mm, "tilt_deg": stroke.tilt_deg}
     return Drag(
@@ -281,17 +277,16 @@ def _on_grid(mask: Mask, anchor_px: tuple[float, float], x_mm: Floats, y_mm: Flo
 
 def defects(mask: Mask) -> tuple[str, ...]:
     """Describe what is wrong with a stroke's ink, one phrase for each defect; empty for a sound stroke."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    ink = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    ink = mask[inked_window(mask, mask, 0)]
     count, _, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)
     areas = np.asarray(stats[1:, cv2.CC_STAT_AREA], np.float64)
-    found: list[str] = []
+    phrases: list[str] = []
     if areas.max() < (1.0 - TORN_SHARE) * areas.sum():
-        found.append(f"torn: {count - 1} parts, the largest holds {100 * areas.max() / areas.sum():.0f} % of the ink")
+        phrases.append(f"torn: {count - 1} parts, the largest holds {100 * areas.max() / areas.sum():.0f} % of the ink")
     covered = float(np.count_nonzero(ink)) / float(np.count_nonzero(outline(ink)))
     if covered < HOLLOW_SHARE:
-        found.append(f"hollow: ink covers {100 * covered:.0f} % of the outline")
-    return tuple(found)
+        phrases.append(f"hollow: ink covers {100 * covered:.0f} % of the outline")
+    return tuple(phrases)
 
 
 def along_axis(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

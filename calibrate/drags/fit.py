@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Self
 
 import cv2
@@ -98,13 +98,13 @@ class DragFit:
         steps = np.linalg.solve(square, -(weights @ self.gradients + self.scaled)[..., None])[..., 0]
         drawn = np.quantile(steps, [0.025, 0.975], axis=0)
         variance = np.diag(np.asarray(np.linalg.inv(self.squares.sum(axis=0) + unit), np.float64))
-        found: dict[str, FittedValue] = {}
+        values: dict[str, FittedValue] = {}
         for at, (name, sd) in enumerate(self.freedom.items()):
             value = float(getattr(self.model, name))
             low, high = (value + sd * float(end) for end in drawn[:, at])
             known = variance[at] < 1.0 - UNDETERMINED and low < high
-            found[name] = FittedValue(value=value, low=low if known else None, high=high if known else None)
-        return found
+            values[name] = FittedValue(value=value, low=low if known else None, high=high if known else None)
+        return values
 
 
 def fit_drags(drawings: Drawings, start: DragModel | None = None, freedom: Mapping[str, float] = FREEDOM) -> DragFit:
@@ -123,13 +123,12 @@ def fit_drags(drawings: Drawings, start: DragModel | None = None, freedom: Mappi
 
     scaled = fit_to_ink(trails_at, np.zeros(len(at)), drawings, SPREAD_MM)
     trails, slopes = trails_at(scaled), derivatives(trails_at, scaled)
-    each: list[tuple[Floats, Floats]] = []
-    for k in range(len(drawings.ink)):
-        one = Trails(trails.discs, trails.starts, trails.groups[k : k + 2])
-        equations = one.equations(slopes, drawings.only(np.array([k])), SPREAD_MM)
-        each.append((equations.square, equations.gradient))
-    squares, gradients = (np.array(part) for part in zip(*each, strict=True))
-    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, squares, gradients)
+    alone = (
+        replace(trails, groups=trails.groups[k : k + 2]).equations(slopes, drawings.only(np.array([k])), SPREAD_MM)
+        for k in range(len(drawings.ink))
+    )
+    squares, gradients = zip(*((at.square, at.gradient) for at in alone), strict=True)
+    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, np.array(squares), np.array(gradients))
 
 
 class Kept(Frozen):
@@ -186,22 +185,24 @@ class Kept(Frozen):
 
         Returns (n, len(y_mm), len(x_mm)) on a grid of the same scale.
         """
+        from scipy.interpolate import RBFInterpolator  # slow to import
+
         known, picture = np.array(self.commands), self._picture()
         seen = (picture > 127).reshape(len(known), -1, picture.shape[1])
         own_x = np.asarray(self.left_mm + np.arange(seen.shape[2]) * self.mm_per_px, np.float64)
         own_y = np.asarray(self.top_mm - np.arange(seen.shape[1]) * self.mm_per_px, np.float64)
         drawn = lagging([commanded_path(*row[:4]) for row in self.commands], model.vector()).distances(own_x, own_y)
         missed = clipped(captured_distance(seen, self.mm_per_px)) - clipped(drawn)
-        gram = _kernel(known, known, known) + RIDGE * np.eye(len(known))
-        weights = np.linalg.solve(gram, missed.reshape(len(known), -1)).astype(np.float32)
-        change = (_kernel(commands, known, known) @ weights).reshape(len(commands), *seen.shape[1:])
-        left = round((float(x_mm[0]) - self.left_mm) / self.mm_per_px)
-        top = round((self.top_mm - float(y_mm[0])) / self.mm_per_px)
-        out = np.zeros((len(change), len(y_mm), len(x_mm)))
-        rows = np.arange(max(0, -top), min(len(y_mm), seen.shape[1] - top))
-        columns = np.arange(max(0, -left), min(len(x_mm), seen.shape[2] - left))
-        out[:, rows[:, None], columns] = change[:, rows[:, None] + top, columns + left]
-        return out
+        spread = known.std(axis=0)
+        # A command that never changes in training has no influence.
+        scales = np.where(spread > 1e-9, np.array(SPREADS) * spread, 1e9)
+        images, width = missed.reshape(len(known), -1), 0.5**0.5
+        ridge = RBFInterpolator(known / scales, images, smoothing=RIDGE, kernel="gaussian", epsilon=width, degree=-1)
+        change = np.pad(ridge(commands / scales).reshape(-1, *seen.shape[1:]), ((0, 0), (1, 1), (1, 1)))
+        # The margin of 0 stands for everything outside the known grid.
+        rows = np.rint((self.top_mm - y_mm) / self.mm_per_px + 1).clip(0, seen.shape[1] + 1).astype(np.int64)
+        columns = np.rint((x_mm - self.left_mm) / self.mm_per_px + 1).clip(0, seen.shape[2] + 1).astype(np.int64)
+        return np.asarray(change[:, rows[:, None], columns], np.float64)
 
 
 def predicted(model: DragModel, kept: Kept | None, drawn: Drawn, images: Indices) -> dict[str, Masks]:
@@ -229,13 +230,6 @@ def captured_distance(masks: NDArray[np.bool_], mm_per_px: float) -> Floats:
         return [cv2.distanceTransform(each, cv2.DIST_L2, 5) - 0.5 for each in inked.astype(np.uint8)]
 
     return np.where(masks, np.array(to_other(masks)), -np.array(to_other(~masks))).astype(np.float64) * mm_per_px
-
-
-def _kernel(a: Floats, b: Floats, training: Floats) -> Floats:
-    """The Gaussian kernel of (n, 5) and (m, 5) commands; one that never changes in training has no influence."""
-    spread = training.std(axis=0)
-    scales = np.where(spread > 1e-9, np.array(SPREADS) * spread, 1e9)
-    return np.exp(-0.5 * (((a[:, None] - b[None]) / scales) ** 2).sum(axis=-1))
 
 
 class DragArtefact(SessionFit):

@@ -36,7 +36,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.stats import CEILING, ceiling_values, pair_means
 from brushloop.model.drag import Floats
-from brushloop.model.similarity import binary_scores
+from brushloop.model.similarity import binary_scores, inked_window
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
@@ -238,9 +238,7 @@ def _worst(predictions: Predictions) -> Iterator[tuple[str, float, float, str]]:
     """Name, CSIM, IoU and overlay of the worst predicted strokes."""
     for k in predictions.worst():
         seen, ink = predictions.seen[k], predictions.drawn.drawings.ink[k]
-        both = seen | (ink > 0.5)
-        rows, columns = np.flatnonzero(both.any(axis=1)), np.flatnonzero(both.any(axis=0))
-        window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        window = inked_window(seen, ink > 0.5, 0)
         csim, iou = predictions.scores[PREDICTED][k].tolist()
         uri = overlay_uri(ink[window].astype(np.float64), seen[window].astype(np.float64))
         yield predictions.drawn.stroke_ids[k], csim, iou, uri

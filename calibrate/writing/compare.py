@@ -55,10 +55,9 @@ from brushloop.calibrate.writing.record import (
     FigureRecord,
     PlanRecord,
     Round,
-    as_points,
+    check_drawn_from,
     code_points,
     load_plan,
-    recorded_figures,
 )
 from brushloop.model.characters.plan import Phase, phase_map
 from brushloop.model.similarity import SSIM_SETTINGS
@@ -222,7 +221,7 @@ def compare_written(
     Raises `CalibrationError` if the two do not belong together or nothing can be compared.
     """
     session, refused = open_session(path), list[tuple[str, str]]()
-    _check_drawn_from(plan, session)
+    check_drawn_from(plan, session)
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
         raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
     writings: dict[str, dict[str, Ink]] = {}
@@ -262,17 +261,6 @@ def read_writings(
             refused.append((stroke_id, error.what))
         else:
             yield stroke_id, stroke_id.rsplit("-r", 1)[0], prepared
-
-
-def _check_drawn_from(plan: PlanRecord, session: OpenSession) -> None:
-    """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
-    where, cell_mm = str(session.recording.path), session.strokes[0].cell_mm
-    for name, strokes in recorded_figures(session.header).items():
-        figure = plan.figure(name)
-        if figure is None or figure.commanded != as_points(strokes):
-            raise CalibrationError(where, f"{name!r} was not drawn from this plan")
-    if cell_mm is not None and cell_mm[2:] != (plan.cell_mm, plan.cell_mm):
-        raise CalibrationError(where, f"has cells of {cell_mm[2]:g} x {cell_mm[3]:g} mm, the plan {plan.cell_mm:g} mm")
 
 
 def compare_ink(fixed: Ink, moving: Ink, key: Key) -> tuple[float, float]:

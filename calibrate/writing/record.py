@@ -18,6 +18,7 @@ from brushloop.calibrate.compare.place import SIZE_PX, Image
 from brushloop.calibrate.errors import CalibrationError, invalid
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import write_files
+from brushloop.calibrate.session import OpenSession
 from brushloop.model.characters.plan import Reach, StrokePath
 from brushloop.model.drag import NAMES
 from brushloop.sessions.errors import SessionDamaged
@@ -157,6 +158,17 @@ def recorded_figures(header: Header) -> dict[str, list[Floats]]:
         }
     except (ValueError, KeyError, TypeError, RecursionError):
         raise CalibrationError(header.session_id, "was not collected by a `write` protocol") from None
+
+
+def check_drawn_from(plan: PlanRecord, session: OpenSession) -> None:
+    """Check that the session's protocol drew the plan. Raises `CalibrationError` otherwise."""
+    where, cell_mm = str(session.recording.path), session.strokes[0].cell_mm
+    for name, strokes in recorded_figures(session.header).items():
+        figure = plan.figure(name)
+        if figure is None or figure.commanded != as_points(strokes):
+            raise CalibrationError(where, f"{name!r} was not drawn from this plan")
+    if cell_mm is not None and cell_mm[2:] != (plan.cell_mm, plan.cell_mm):
+        raise CalibrationError(where, f"has cells of {cell_mm[2]:g} x {cell_mm[3]:g} mm, the plan {plan.cell_mm:g} mm")
 
 
 def code_points(name: str) -> str:
