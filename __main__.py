@@ -13,7 +13,6 @@ import typer
 from typer.core import TyperGroup
 
 import brushloop.calibrate.cli
-import brushloop.calibrate.cli_train
 import brushloop.calibrate.validate.cli
 import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
@@ -129,7 +128,7 @@ write.command("learn")(brushloop.calibrate.writing.cli.learn)
 write.command("practice")(brushloop.calibrate.writing.cli.practice)
 write.command("fit")(brushloop.calibrate.writing.cli.fit)
 app.add_typer(write, name="write")
-app.add_typer(brushloop.calibrate.cli_train.app, name="train")
+app.add_typer(brushloop.calibrate.cli.train, name="train")
 
 
 @app.command()

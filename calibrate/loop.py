@@ -46,7 +46,7 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.scores import MEASURES, Row, Scores, Stat, find_stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
-from brushloop.calibrate.stats import Interval, interval_over_groups
+from brushloop.calibrate.stats import Floats, Interval, interval_over_groups
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import check_writable
@@ -146,6 +146,10 @@ class LoopRecord(Sealed):
     software: str
     command: str
 
+    def rows(self, key: Key) -> list[Stat]:
+        """The rows of the table in one alignment and tone."""
+        return [row for row in self.table_1 if (row.alignment, row.tone) == key]
+
     def stat(self, compared: str, key: Key) -> Stat | None:
         """One row of the table, or None if nothing was compared in this way."""
         return find_stat(self.table_1, compared, key)
@@ -174,28 +178,12 @@ def read_loop(folder: Path) -> LoopRecord:
     return load_sealed(folder / FILE, LoopRecord, MAX_BYTES)
 
 
-@dataclass(frozen=True, slots=True)
-class LoopComparison:
-    """The result of pressing a session's strokes again."""
-
-    record: LoopRecord
-    original: OpenSession
-    again: OpenSession
-    pairs: list[Pair]
-    scores: Scores
-    """Of the original of each pair, against `AGAIN`, `ANOTHER` and `SIMULATED`."""
-
-
 def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
-    """Compare presses with those that repeat them, and write the report. Raises `CalibrationError` and OSError."""
+    """Compare presses with those that repeat them, pair by pair, and write the report.
+
+    Raises `CalibrationError` where the two sessions do not belong together, and OSError.
+    """
     check_writable(request.out)
-    loop = compare_sessions(request, progress)
-    page = write_loop(loop, request.out)
-    return Written(page, (*summary(loop.record), f"Report:  {page}"))
-
-
-def compare_sessions(request: CompareRequest, progress: Progress = unseen) -> LoopComparison:
-    """Compare pair by pair. Raises `CalibrationError` where the two do not belong together."""
     view = Field(mm_per_px=request.mm_per_px)
     first, second = (open_session(path, kind="press") for path in (request.original, request.again))
     where, source = str(second.recording.path), second.header.source
@@ -233,7 +221,8 @@ def compare_sessions(request: CompareRequest, progress: Progress = unseen) -> Lo
         software=made_by(),
         command=request.command,
     ).sealed()
-    return LoopComparison(record, first, second, pairs, scores)
+    page = write_loop(record, (first, second), pairs, scores, request.out)
+    return Written(page, (*summary(record), f"Report:  {page}"))
 
 
 def pair_up(
@@ -315,14 +304,21 @@ def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
     return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256
 
 
-def write_loop(loop: LoopComparison, folder: Path) -> Path:
-    """Write the report's files into `folder`; returns the page's path. Raises OSError."""
-    record, header = loop.record, loop.original.header
+def write_loop(
+    record: LoopRecord, sessions: tuple[OpenSession, OpenSession], pairs: Sequence[Pair], scores: Scores, folder: Path
+) -> Path:
+    """Write the report's files into `folder`; returns the page's path. Raises OSError.
+
+    The sessions are the original and the one that pressed it again.
+    """
+    header = sessions[0].header
     facts = [
         recording_facts(session.header, session.recording.path.name, session.sha256, session.calibration)
-        for session in (loop.original, loop.again)
+        for session in sessions
     ]
     made = [("recovered by", record.model), ("compared with", record.software), ("command", record.command)]
+    percent = 100.0 * scores.of_key(AGAIN, HEADLINE)
+    worst_first: list[int] = percent[:, 0].argsort(kind="stable").tolist()
     page = render(
         "loop.html.j2",
         **about(header.model_copy(update={"source": record.source})),
@@ -330,14 +326,14 @@ def write_loop(loop: LoopComparison, folder: Path) -> Path:
         record=record,
         trust=list(_trust(record)),
         beside=(TABLE, FILE),
-        tables=[(key, [row for row in record.table_1 if (row.alignment, row.tone) == key]) for key in KEYS],
+        tables=[(key, record.rows(key)) for key in KEYS],
         paper=TABLE_1[ROBOT_WRITING],
-        rows=_rows(loop),
-        not_shown=max(0, len(loop.pairs) - MAX_PAIRS_SHOWN),
+        rows=[_shown(pairs[k], percent[k]) for k in worst_first[:MAX_PAIRS_SHOWN]],
+        not_shown=max(0, len(pairs) - MAX_PAIRS_SHOWN),
         ssim_settings=SSIM_SETTINGS,
         provenance=[*facts, made],
     )
-    write_files(folder, {TABLE: scores_csv(loop.scores), FILE: record.to_json(), PAGE: page})
+    write_files(folder, {TABLE: scores_csv(scores), FILE: record.to_json(), PAGE: page})
     return folder / PAGE
 
 
@@ -345,28 +341,23 @@ def summary(record: LoopRecord) -> Iterator[str]:
     """Lines for the terminal."""
     yield f"{record.pairs} presses repeated, {len(record.refused)} not compared ({record.source})"
     for key in KEYS:
-        rows = [row for row in record.table_1 if (row.alignment, row.tone) == key]
-        parts = "; ".join(f"{row.model} {row.csim.avg:.2f} / {row.ssim.avg:.2f}" for row in rows)
+        parts = "; ".join(f"{row.model} {row.csim.avg:.2f} / {row.ssim.avg:.2f}" for row in record.rows(key))
         yield f"{key[0]}, {key[1]}, CSIM / SSIM: {parts}"
     yield record.answer.text
 
 
-def _rows(loop: LoopComparison) -> Iterator[dict[str, Any]]:
-    """The pairs, those that are least alike first."""
-    scores = loop.scores.of_key(AGAIN, HEADLINE)
-    order: list[int] = scores[:, 0].argsort(kind="stable").tolist()
-    for k in order[:MAX_PAIRS_SHOWN]:
-        pair = loop.pairs[k]
-        original, drawn, again = (
-            images[GRAY][SHEET_ROWS] for images in (pair.original.images, pair.simulated, pair.again.images)
-        )
-        images = {
-            "original": ink_uri(original),
-            "recovered, simulated": ink_uri(drawn),
-            "pressed again": ink_uri(again),
-            "original and pressed again": overlay_uri(original, again),
-        }
-        yield {"original": pair.original, "again": pair.again, "percent": 100.0 * scores[k], "images": images}
+def _shown(pair: Pair, percent: Floats) -> dict[str, Any]:
+    """A pair in the page: its CSIM and SSIM, (2,), and its pictures."""
+    original, drawn, again = (
+        images[GRAY][SHEET_ROWS] for images in (pair.original.images, pair.simulated, pair.again.images)
+    )
+    images = {
+        "original": ink_uri(original),
+        "recovered, simulated": ink_uri(drawn),
+        "pressed again": ink_uri(again),
+        "original and pressed again": overlay_uri(original, again),
+    }
+    return {"original": pair.original, "again": pair.again, "percent": percent, "images": images}
 
 
 def _trust(record: LoopRecord) -> Iterator[Point]:

@@ -18,7 +18,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
-from brushloop.calibrate.loop import NOT_AGAIN, LoopComparison, Pair, score_pairs, table_1, verdicts, write_loop
+from brushloop.calibrate.loop import NOT_AGAIN, Pair, score_pairs, table_1, verdicts, write_loop
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
@@ -96,8 +96,7 @@ def _loop(folder: Path) -> str:
     scores = score_pairs(pairs, [first, second], original.header)
     rows = {"table_1": tuple(table_1(scores)), "verdicts": tuple(verdicts(scores))}
     record = loop_record("grid", "ab", refused=(("a-r02", NOT_AGAIN), ("x<u>", "is blank")), **rows)
-    loop = LoopComparison(record, original, again, pairs, scores)
-    return write_loop(loop, folder / "loop").read_text(encoding="utf-8")
+    return write_loop(record, (original, again), pairs, scores, folder / "loop").read_text(encoding="utf-8")
 
 
 def _written(folder: Path) -> str:
