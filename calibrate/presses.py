@@ -209,10 +209,11 @@ def rectified(capture: Capture, calibration: Calibration | None, view: Field) ->
 
 
 def prepare_press(capture: Capture, calibration: Calibration | None, view: Field) -> Prepared:
-    """Rectify a stroke to the millimetre field. Raises as `rectified` does."""
+    """Rectify a stroke to the millimetre field, whether or not it was marked bad: that may change, the result is kept.
+
+    Raises as `rectified` does.
+    """
     stroke = capture.stroke
-    if capture.bad:
-        raise CaptureRefused(stroke.stroke_id, capture.bad)
     _, prepared = rectified(capture, calibration, view)
     if calibration is not None and stroke.anchor_mm is not None:
         return prepared

@@ -66,6 +66,9 @@ def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedP
             if stroke.depth_mm is None or stroke.tilt_deg is None:
                 aligned.left_out.append((stroke.stroke_id, "has no depth or tilt"))
                 continue
+            if capture.bad:
+                aligned.left_out.append((stroke.stroke_id, capture.bad))
+                continue
             try:
                 target.check(np.array([[stroke.depth_mm, stroke.tilt_deg]]))
                 prepared = prepare_press(capture, session.calibration, Field())

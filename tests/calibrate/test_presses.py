@@ -163,8 +163,8 @@ def test_a_folder_that_cannot_be_written_does_not_stop_the_work(session: Path, m
 
 
 def test_a_press_that_is_marked_bad_is_refused_and_comes_back_without_work(session: Path, calls: Counter[str]) -> None:
-    [name, *_] = [press.stroke.stroke_id for press in read(session)]
-    mark_bad_or_good(session, 0, name, 1)
+    name = next(Recording(session).captures()).stroke.stroke_id
+    mark_bad_or_good(session, 0, name, 1)  # before anything of the session was read
     refused: list[tuple[str, str]] = []
     assert len(read(session, refused=refused)) == 2
     assert refused == [(name, "was marked bad")]
