@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -209,18 +208,12 @@ async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm
             await arm.sequence(lines, acc_mm_s2=ACC)
 
 
-@pytest.fixture
-def impatient_calls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", 0.3)
-
-
 async def below(cabinet: ArcsServer, depth_mm: float) -> None:
     async with asyncio.timeout(PATIENCE_S):
         while z_mm(cabinet) > depth_mm:
             await asyncio.sleep(0.002)
 
 
-@pytest.mark.usefixtures("impatient_calls")
 @pytest.mark.parametrize("kind", ["malformed", "garbage", "mute", "wrong-id", "drop"])
 @pytest.mark.parametrize("method", ["getExecId", "getTcpPose", "getSafetyModeType"])
 async def test_an_answer_that_cannot_be_read_in_a_descent_is_asked_again(
@@ -235,7 +228,6 @@ async def test_an_answer_that_cannot_be_read_in_a_descent_is_asked_again(
     await arm.move(DEEP, speed_mm_s=100.0, acc_mm_s2=ACC)
 
 
-@pytest.mark.usefixtures("impatient_calls")
 @pytest.mark.parametrize("kind", ["malformed", "mute", "drop"])
 async def test_a_release_whose_answer_cannot_be_read_is_carried_out(
     arm: AuboArcs, cabinet: ArcsServer, kind: str
@@ -245,7 +237,6 @@ async def test_a_release_whose_answer_cannot_be_read_is_carried_out(
     assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
 
 
-@pytest.mark.usefixtures("impatient_calls")
 async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_press(
     arm: AuboArcs, cabinet: ArcsServer
 ) -> None:
@@ -259,7 +250,6 @@ async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_pr
     cabinet.faults.clear()
 
 
-@pytest.mark.usefixtures("impatient_calls")
 async def test_a_stop_is_carried_out_at_once_although_no_answer_can_be_read(arm: AuboArcs, cabinet: ArcsServer) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
@@ -272,7 +262,6 @@ async def test_a_stop_is_carried_out_at_once_although_no_answer_can_be_read(arm:
         await press
 
 
-@pytest.mark.usefixtures("impatient_calls")
 async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboArcs, cabinet: ArcsServer) -> None:
     press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
