@@ -6,7 +6,7 @@ The page shows the fitted outline over the ink of each cell, the sizes of the ma
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -35,10 +35,13 @@ from brushloop.calibrate.fit.captures import (
 from brushloop.calibrate.fit.fit import fit_presses as fit_parameters
 from brushloop.calibrate.fit.heldout import FITTED, UNCALIBRATED, HeldOut, leave_cell_out
 from brushloop.calibrate.report import (
-    BLUE,
-    ORANGE,
+    COLOURS,
+    Axis,
+    Marks,
+    Panel,
     Point,
     about,
+    chart_uri,
     framed,
     ink_uri,
     recording_facts,
@@ -60,10 +63,6 @@ FOLDER = "brushfit"
 MAX_CELLS = 48
 MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
-PLOT_X, PLOT_Y = (44.0, 470.0), (252.0, 24.0)
-"""Where the axes of a plot begin and end, px from the left and from the top."""
-COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Of Okabe and Ito, one for each tilt in turn."""
 
 
 class BrushFit(SessionFit):
@@ -220,7 +219,7 @@ def write_fit_page(
         left_out=len(cells) - len(range(0, len(cells), step)),
         verdict=list(_verdict(captures, held_out)),
         trust=[source_point(header.source), *_trust(captures, held_out)],
-        plots=list(_plots(captures, press)),
+        chart=_chart(captures, press),
         measured=sizes,
         middle="{:g} mm, {:g}°".format(*middle(captures.strokes)),
         held_out=held_out,
@@ -295,7 +294,7 @@ def _path(press: FittedPress, cell: Cell) -> str:
     return f"M{x:g} {y:g}{curves}Z"
 
 
-def _plots(captures: Captures, press: FittedPress) -> Iterator[dict[str, Any]]:
+def _chart(captures: Captures, press: FittedPress) -> str:
     """Length and width against depth: the ink of each press as a point, the fit as a line for each tilt."""
     strokes, grid = captures.strokes, captures.grid
     depths = sorted({stroke.depth_mm for stroke in strokes})
@@ -304,37 +303,16 @@ def _plots(captures: Captures, press: FittedPress) -> Iterator[dict[str, Any]]:
     seen = {tilt: np.array([_measured(s, grid) for s in strokes if s.tilt_deg == tilt]) for tilt in shown}
     smooth = np.linspace(depths[0], depths[-1], SMOOTH_POINTS).tolist()
     drawn = {tilt: np.array([_fitted(press, depth, tilt, grid.x_mm) for depth in smooth]) for tilt in shown}
+    panels: list[Panel] = []
     for column, what in ((1, "length"), (2, "width")):
-        every = np.concatenate([*seen.values(), *drawn.values()])[:, [0, column]]
-        (x, across), (y, upward) = (
-            _axis(values[np.isfinite(values)], *ends) for values, ends in zip(every.T, (PLOT_X, PLOT_Y), strict=True)
-        )
-        series = [
-            {
-                "name": f"α {tilt:g}°",
-                "colour": colour,
-                "points": np.column_stack([x(seen[tilt][:, 0]), y(seen[tilt][:, column])]).round(1).tolist(),
-                "line": np.column_stack([x(line[:, 0]), y(line[:, column])]).round(1).tolist(),
-            }
-            for tilt, colour in zip(shown, COLOURS, strict=False)
-            if len(line := drawn[tilt][np.isfinite(drawn[tilt][:, column])])
-        ]
-        yield {"what": what, "across": across, "upward": upward, "series": series}
-
-
-def _axis(values: Floats, start_px: float, end_px: float) -> tuple[Callable[[Floats], Floats], list[tuple[float, str]]]:
-    """From values to pixels of a plot, and the places and numbers of about five ticks."""
-    low, high = float(values.min()), float(values.max())
-    span = (high - low) or 1.0
-    low, high = low - 0.05 * span, high + 0.05 * span
-    steps = [share * 10.0 ** math.floor(math.log10(span)) for share in (0.1, 0.2, 0.5, 1.0)]
-    step = min(steps, key=lambda step: abs(span / step - 5.0))
-    ticks = np.arange(math.ceil(low / step), math.floor(high / step) + 1, dtype=np.float64) * step
-
-    def place(values: Floats) -> Floats:
-        return start_px + (end_px - start_px) * (values - low) / (high - low)
-
-    return place, [(round(at, 1), f"{tick:g}") for at, tick in zip(place(ticks).tolist(), ticks.tolist(), strict=True)]
+        marks: list[Marks] = []
+        for tilt, colour in zip(shown, COLOURS, strict=False):
+            points, line = seen[tilt], drawn[tilt]
+            marks.append(Marks(points[:, 0], points[:, column], colour, f"α {tilt:g}°", dot_px=6.0))
+            marks.append(Marks(line[:, 0], line[:, column], colour, line_px=1.5))
+        panels.append(Panel(what, Axis("commanded depth H, mm"), Axis(f"{what} of the mark, mm"), marks))
+    header = captures.session.header
+    return chart_uri(panels, (960, 320), source_label(header.source, [header.brush]))
 
 
 def _measured(stroke: Pressed, grid: Grid) -> tuple[float, float, float]:
