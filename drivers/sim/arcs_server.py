@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from brushloop.drivers.arcs.telemetry import MAX_MESSAGE_BYTES, PING, SET_RECIPE, decode_message, encode_sample
 from brushloop.drivers.arcs.wire import BareDecoder, FrameDecoder, encode, named
@@ -265,6 +265,6 @@ def topic_of(payload: bytes) -> tuple[int, float, list[str]]:
     """
     match decode_message(payload, "rtde"):
         case (100, [{"chanel": int(chanel), "frequency": float() | int() as hz, "segments": list(names)}]):  # pyright: ignore[reportUnknownVariableType]
-            return chanel, hz, [str(name) for name in names]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+            return chanel, hz, [str(name) for name in cast("list[Any]", names)]
         case other:
             raise ProtocolViolation("rtde", "topic", f"not a topic: {other!r}")

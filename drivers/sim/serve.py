@@ -102,8 +102,8 @@ class ControlServer(LoopbackServer):
         request = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
         board, alone = self._rig.faults, len(request) == 1
         match request:
-            case {"do": "add", "fault": dict(values)} if len(request) == 2:  # pyright: ignore[reportUnknownVariableType]
-                return {"id": board.hang(fault_of(values))}  # pyright: ignore[reportUnknownArgumentType]
+            case {"do": "add", "fault": dict()} if len(request) == 2:
+                return {"id": board.hang(fault_of(request["fault"]))}
             case {"do": "list"} if alone:
                 return {"hanging": [_as_json(h) for h in board.hanging], "over": [_as_json(h) for h in board.over]}
             case {"do": "clear"} if alone:
