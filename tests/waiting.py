@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import time
 from collections.abc import Callable
@@ -28,3 +29,13 @@ def wait_until(
         if time.monotonic() > deadline:
             pytest.fail(f"waited {timeout_s:g} s for {what}")
         time.sleep(0.005)
+
+
+async def until(condition: Callable[[], object], what: str, *, timeout_s: float = PATIENCE_S) -> None:
+    """Wait in the event loop until the condition holds; fails where it does not in time."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            while not condition():
+                await asyncio.sleep(0.005)
+    except TimeoutError:
+        pytest.fail(f"waited {timeout_s:g} s for {what}")

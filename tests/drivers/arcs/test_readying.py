@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from brushloop.drivers.arcs import stopping
 from brushloop.drivers.arcs.controller import OutOfReach, QueueFull, RobotMode, SafetyMode, WrongOperationalMode
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
 from brushloop.drivers.errors import MotionFailed, MotionRefused, RpcError
@@ -19,9 +20,12 @@ from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.kinematics import forward, pose_of
 from brushloop.drivers.sim.rig import HOST
+from tests.waiting import until
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
 BEYOND = brush_pose(900.0, 0.0, 250.0)
+BITES_S = 3.0
+"""A watchdog's time-out that no pause of a busy machine reaches, and that a test can wait for."""
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 MakeArm = Callable[..., AuboArcs]
 
@@ -142,30 +146,44 @@ async def test_without_a_message_it_is_just_a_failed_motion(make_arm: MakeArm, c
     assert type(caught.value) is MotionFailed
 
 
-async def test_the_watchdog_is_armed_while_enabled_and_fed(make_arm: MakeArm, cabinet: ArcsServer, notices: list[str]):
-    arm = make_arm(watchdog_s=0.3)
+def feeding() -> bool:
+    return any(task.get_name() == "robot watchdog" for task in asyncio.all_tasks())
+
+
+async def bitten(cabinet: ArcsServer) -> None:
+    """Return once the watchdog has put the arm in a protective stop."""
+    await until(lambda: not cabinet.cabinet.watchdogs, "the watchdog to bite")
+    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
+
+
+async def test_the_watchdog_is_armed_while_enabled_and_fed(
+    make_arm: MakeArm, cabinet: ArcsServer, notices: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(stopping, "FEEDINGS", 1000)
+    arm = make_arm(watchdog_s=60.0)
     await arm.connect()
     assert cabinet.cabinet.watchdogs == {}
     await arm.enable()
-    assert list(cabinet.cabinet.watchdogs) == ["brushloop"]
-    await asyncio.sleep(0.8)
-    assert cabinet.cabinet.power.safety == SafetyMode.NORMAL
+    for feeding_number in range(1, 4):
+        [(key, timer)] = cabinet.cabinet.watchdogs.items()
+        assert key == "brushloop"
+        await until(lambda timer=timer: cabinet.cabinet.watchdogs["brushloop"] is not timer, f"feed {feeding_number}")
     await arm.close()
     assert cabinet.cabinet.watchdogs == {}
-    await asyncio.sleep(0.5)
+    assert not feeding()
     assert cabinet.cabinet.power.safety == SafetyMode.NORMAL
     assert not notices
 
 
 async def test_a_host_that_dies_leaves_a_protective_stop_and_no_motion(make_arm: MakeArm, cabinet: ArcsServer):
-    arm = await enabled(make_arm, watchdog_s=0.3)
-    await arm._motion.move_line(brush_pose(300.0, -220.0, 250.0), 1.0, 800.0)
+    arm = await enabled(make_arm, watchdog_s=BITES_S)
+    await arm._motion.move_line(brush_pose(300.0, -220.0, 250.0), 0.1, 800.0)
     for controller in (arm._state, arm._motion, arm._stop):
         await controller.connection.close()
     arm._enabled = False  # who is dead does not say goodbye
-    await asyncio.sleep(0.5)
-    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
-    assert cabinet.cabinet.world.motion.steady(cabinet.cabinet.now_s())
+    await bitten(cabinet)
+    await until(lambda: cabinet.cabinet.motion.steady(cabinet.cabinet.now_s()), "the arm to rest")
+    assert cabinet.cabinet.motion.exec_id(cabinet.cabinet.now_s()) != -1, "it rests on its way"
 
 
 async def test_a_controller_that_knows_no_watchdog_is_reported_and_used(
@@ -179,7 +197,7 @@ async def test_a_controller_that_knows_no_watchdog_is_reported_and_used(
 
 
 async def test_an_arm_that_cannot_be_stopped_is_left_to_the_watchdog(make_arm: MakeArm, cabinet: ArcsServer):
-    arm = await enabled(make_arm, watchdog_s=0.3)
+    arm = await enabled(make_arm, watchdog_s=BITES_S)
 
     async def fails(_: float) -> None:
         raise MotionFailed("robot", "stop", "not seen at rest")
@@ -187,8 +205,7 @@ async def test_an_arm_that_cannot_be_stopped_is_left_to_the_watchdog(make_arm: M
     arm._stopper.stop = fails  # type: ignore[method-assign]
     await arm.close()
     assert list(cabinet.cabinet.watchdogs) == ["brushloop"]
-    await asyncio.sleep(0.5)
-    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
+    await bitten(cabinet)
 
 
 async def test_an_error_other_than_unknown_method_is_not_taken_for_an_old_controller(
