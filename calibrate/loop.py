@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,8 +22,8 @@ from brushloop.calibrate.compare.place import (
     TABLE_1,
     Alignment,
     Field,
-    Image,
     Key,
+    Pixels,
     Tone,
     brush_of,
     simulated,
@@ -44,7 +44,7 @@ from brushloop.calibrate.report import (
     source_point,
     write_files,
 )
-from brushloop.calibrate.scores import MEASURES, Row, Scores, Stat, find_stat, scores_csv, similarities, statistics
+from brushloop.calibrate.scores import MEASURES, Scores, Stat, find_stat, scores_csv, similarities, statistics
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Interval, interval_over_groups
 from brushloop.model.ccdbsm import DomainError
@@ -64,7 +64,7 @@ AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated
 GOAL_POINTS = 1.0
 """Points by which re-pressed strokes may score below the originals' own repeatability."""
 NOT_AGAIN = "was not pressed again"
-HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), (Alignment.MM, Tone.GRAY)
+HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), KEYS.index((Alignment.MM, Tone.GRAY))
 SHEET_ROWS = slice(32, 96)
 """Rows shown, the middle half: a press is at most half as thick as the field is high."""
 MAX_PAIRS_SHOWN = 150
@@ -91,8 +91,8 @@ class Pair:
 
     original: Press
     again: Press
-    simulated: dict[Key, Image]
-    """The model's press at the recovered depth and tilt, (128, 128) each."""
+    simulated: Pixels
+    """(len(KEYS), 128, 128): the model's press at the recovered depth and tilt."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +203,7 @@ def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
     if not pairs:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(where, f"not one pair can be compared{why}")
-    scores = score_pairs(pairs, originals, first.header.model_copy(update={"source": source}))
+    scores = score_pairs(pairs, originals)
     record = LoopRecord(
         source=source,
         original=first.header.session_id,
@@ -248,17 +248,17 @@ def pair_up(
     return pairs
 
 
-def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press], header: Header) -> Scores:
+def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press]) -> Scores:
     """Score repetition, other presses of the condition and simulation against the original of each pair."""
     alike: dict[Condition, list[Press]] = {}
     for press in originals:
         alike.setdefault(press.condition, []).append(press)
-    scores = Scores([Row.of(pair.original, header) for pair in pairs], (AGAIN, ANOTHER, SIMULATED))
+    labelled = [replace(pair.original, source=pair.again.source) for pair in pairs]
+    scores = Scores(labelled, (AGAIN, ANOTHER, SIMULATED))
     for pair, values in zip(pairs, scores.values, strict=True):
         others = [press.images for press in alike[pair.original.condition] if press is not pair.original]
-        for of_kind, images in zip(values, ([pair.again.images], others, [pair.simulated]), strict=True):
-            stack = [list(image.values()) for image in images]
-            of_kind[:] = similarities(np.array(list(pair.original.images.values())), np.array(stack))
+        compared = [pair.again.images], others, [pair.simulated]
+        values[:] = [similarities(pair.original.images, images) for images in compared]
     return scores
 
 
@@ -349,7 +349,7 @@ def summary(record: LoopRecord) -> Iterator[str]:
 def _shown(pair: Pair, percent: Floats) -> dict[str, Any]:
     """A pair in the page: its CSIM and SSIM, (2,), and its pictures."""
     original, drawn, again = (
-        images[GRAY][SHEET_ROWS] for images in (pair.original.images, pair.simulated, pair.again.images)
+        images[GRAY][SHEET_ROWS] / 255.0 for images in (pair.original.images, pair.simulated, pair.again.images)
     )
     images = {
         "original": ink_uri(original),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
-from brushloop.calibrate.compare.place import Alignment, Field, Tone, brush_of, simulated
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Series, samples, verdicts
 from brushloop.calibrate.fit.brush import FOLDER as FITS
@@ -222,7 +222,8 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
     Raises `UnknownModelError`, and `DomainError` for a press that the model does not predict.
     """
     chosen = _model(brush or Brush(), model)
-    image = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())[Alignment.MM, Tone.GRAY]
+    images = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())
+    image = np.asarray(images[KEYS.index((Alignment.MM, Tone.GRAY))] / 255.0, np.float32)
     edge = chosen.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
     return Prediction(chosen.name, image, edge)
 

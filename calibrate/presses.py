@@ -15,16 +15,14 @@ import numpy as np
 
 from brushloop.calibrate.compare.place import (
     KEYS,
-    Alignment,
     Field,
     Image,
-    Key,
-    captured_mm,
-    captured_normalised,
+    Pixels,
+    captured,
     covered,
-    to_pixels,
 )
 from brushloop.calibrate.errors import CaptureRefused
+from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import Calibration, OpenSession
 from brushloop.calibrate.stroke import PX_PER_MM, Gray, Mask, Params
 from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure, prepare
@@ -32,7 +30,7 @@ from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, re
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.recording import Capture
-from brushloop.sessions.records import Condition, Stroke
+from brushloop.sessions.records import Condition, Header, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
 SPECK_SHARE = 0.002
@@ -45,9 +43,13 @@ Refused = tuple[str, str]
 class Press:
     """A captured press on the millimetre field."""
 
+    session: str
+    """Name of the session."""
+    source: str
+    """Label of its recording."""
     stroke: Stroke
-    images: dict[Key, Image]
-    """(128, 128) in every alignment and tone."""
+    images: Pixels
+    """(len(KEYS), 128, 128): what is compared."""
     coverage: Image
     """(128, 128) share of each pixel of the millimetre field that is ink."""
     anchor_mm: tuple[float, float]
@@ -80,7 +82,7 @@ def cut(press: Press) -> str:
 
 def too_thin(press: Press) -> str:
     """Refuse a press that leaves one of the images blank."""
-    thin = next((key for key, image in press.images.items() if not to_pixels(image).any()), None)
+    thin = next((key for key, image in zip(KEYS, press.images, strict=True) if not image.any()), None)
     return "" if thin is None else f"is too thin to be seen at the scale of {thin[0]} ({thin[1]})"
 
 
@@ -119,7 +121,7 @@ def read_presses(
             prepare({k})
             arrays = store.get(keys[k])
             assert arrays is not None, "it was prepared"
-        press = None if "refused" in arrays else press_of(stroke, arrays)
+        press = None if "refused" in arrays else press_of(session.header, stroke, arrays)
         reasons = (why(press) for why in unless) if press is not None else (str(arrays["refused"]),)
         if reason := next(filter(None, (bad.get(stroke.still, ""), *reasons)), ""):
             refused.append((stroke.stroke_id, reason))
@@ -143,9 +145,8 @@ def prepare_job(job: PrepareJob) -> Arrays:
     except (CaptureRefused, SessionDamaged) as error:
         return {"refused": np.array(error.what)}
     assert prepared.anchor_px is not None, "`prepare_press` refuses a stroke without one"
-    captured = {Alignment.MM: captured_mm, Alignment.SIZE_NORMALISED: captured_normalised}
     return {
-        "images": np.stack([captured[alignment](prepared, tone) for alignment, tone in KEYS]),
+        "images": captured(prepared),
         "coverage": covered(prepared),
         "anchor_mm": np.array(prepared.anchor_px) / PX_PER_MM,
         "measured": np.array(astuple(measure(prepared.mask))),
@@ -154,12 +155,14 @@ def prepare_job(job: PrepareJob) -> Arrays:
     }
 
 
-def press_of(stroke: Stroke, arrays: Arrays) -> Press:
+def press_of(header: Header, stroke: Stroke, arrays: Arrays) -> Press:
     """The press of an entry that is not `refused`."""
     x_mm, y_mm = arrays["anchor_mm"].tolist()
     return Press(
+        header.session_id,
+        source_label(header.source, [header.brush]),
         stroke,
-        dict(zip(KEYS, arrays["images"], strict=True)),
+        arrays["images"],
         arrays["coverage"],
         (x_mm, y_mm),
         Measured(*arrays["measured"].tolist()),

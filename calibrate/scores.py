@@ -8,23 +8,20 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, similarity, to_pixels
+from brushloop.calibrate.compare.place import KEYS, Alignment, Key, Pixels, Tone, similarity
 from brushloop.calibrate.files import replacing
 from brushloop.calibrate.presses import Press
-from brushloop.calibrate.report import source_label
 from brushloop.calibrate.stats import CEILING, Cell, Floats, Integers, Summary, average, summarise
-from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.sessions.disk import csv_text
-from brushloop.sessions.records import Condition, Header, Stroke
+from brushloop.sessions.records import Condition
 
 MEASURES = ("csim", "ssim")
 NUMBERS = ("depth_mm", "reached_mm", "tilt_deg", *MEASURES)
@@ -50,73 +47,47 @@ class Score(NamedTuple):
     """Label of the recording."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A press in the table."""
-
-    session: str
-    source: str
-    """Label of its recording."""
-    stroke: Stroke
-    condition: Condition
-    """As commanded."""
-    measured: Measured
-    cut: bool
-    """Whether it reaches the edge of its photograph, cell or field."""
-    images: Pixels
-    """(len(KEYS), 128, 128): what is compared."""
-    coverage: Pixels
-    """(128, 128): what a model is fitted to."""
-
-    @classmethod
-    def of(cls, press: Press, header: Header) -> Row:
-        """The row of a press in a recording."""
-        images, label = to_pixels(np.stack(list(press.images.values()))), source_label(header.source, [header.brush])
-        about = header.session_id, label, press.stroke, press.condition, press.measured, press.cut
-        return cls(*about, images, to_pixels(press.coverage))
-
-
 class Scores:
     """CSIM and SSIM, from 0 to 1, of every press and model; NaN where there is nothing to compare with."""
 
-    def __init__(self, rows: Sequence[Row], models: Sequence[str]) -> None:
-        self.rows, self.models = tuple(rows), tuple(models)
+    def __init__(self, presses: Sequence[Press], models: Sequence[str]) -> None:
+        self.presses, self.models = tuple(presses), tuple(models)
         """Presses by session and order of capture, and names of models."""
-        self.values = np.full((len(rows), len(models), len(KEYS), 2), np.nan)
+        self.values = np.full((len(presses), len(models), len(KEYS), 2), np.nan)
         cells: dict[tuple[int, Condition], list[int]] = {}
-        order = {name: number for number, name in enumerate(dict.fromkeys(row.session for row in rows))}
-        for number, row in enumerate(rows):
-            cells.setdefault((order[row.session], row.condition), []).append(number)
+        order = {name: number for number, name in enumerate(dict.fromkeys(press.session for press in presses))}
+        for number, press in enumerate(presses):
+            cells.setdefault((order[press.session], press.condition), []).append(number)
         self.cells = [cells[key] for key in sorted(cells)]
-        """Rows of each cell, which is one condition in one session, by session and condition."""
-        self.cell_of: Integers = np.zeros(len(rows), np.int64)
-        """(rows,) number of each row's cell."""
+        """Numbers of the presses of each cell, which is one condition in one session, by session and condition."""
+        self.cell_of: Integers = np.zeros(len(presses), np.int64)
+        """(presses,) number of each press's cell."""
         for number, cell in enumerate(self.cells):
             self.cell_of[cell] = number
 
     def __iter__(self) -> Iterator[Score]:
         """The scores by session, order of capture and model; those that are missing are left out."""
-        for row, of_row in zip(self.rows, self.values, strict=True):
-            pressed = row.condition.depth_mm, row.stroke.reached_mm, row.condition.tilt_deg
-            for model, values in zip(self.models, of_row.tolist(), strict=True):
+        for press, of_press in zip(self.presses, self.values, strict=True):
+            at = press.condition.depth_mm, press.stroke.reached_mm, press.condition.tilt_deg
+            for model, values in zip(self.models, of_press.tolist(), strict=True):
                 for key, (csim, ssim) in zip(KEYS, values, strict=True):
                     if math.isfinite(csim):
-                        yield Score(row.session, row.stroke.stroke_id, *pressed, model, *key, csim, ssim, row.source)
+                        yield Score(press.session, press.stroke.stroke_id, *at, model, *key, csim, ssim, press.source)
 
     def of(self, model: str) -> Floats:
-        """(rows, KEYS, 2) scores of one model."""
+        """(presses, KEYS, 2) scores of one model."""
         return self.values[:, self.models.index(model)]
 
     def of_key(self, model: str, key: Key) -> Floats:
-        """(rows, 2) CSIM and SSIM of one model in one alignment and tone."""
+        """(presses, 2) CSIM and SSIM of one model in one alignment and tone."""
         return self.of(model)[:, KEYS.index(key)]
 
     def conditions(self) -> dict[Condition, list[int]]:
-        """Rows of each condition in any session, sorted by condition."""
-        rows: dict[Condition, list[int]] = {}
+        """Numbers of the presses of each condition in any session, sorted by condition."""
+        numbers: dict[Condition, list[int]] = {}
         for cell in self.cells:
-            rows.setdefault(self.rows[cell[0]].condition, []).extend(cell)
-        return dict(sorted(rows.items()))
+            numbers.setdefault(self.presses[cell[0]].condition, []).extend(cell)
+        return dict(sorted(numbers.items()))
 
 
 def scores_csv(scores: Scores) -> str:
@@ -176,14 +147,15 @@ def statistics(
             yield Stat(model=model, alignment=alignment, tone=tone, cell=cell, csim=csim, ssim=ssim)
 
 
-def similarities(press: NDArray[Any], others: NDArray[Any]) -> Floats:
-    """(KEYS, 2) mean CSIM and SSIM of a press, (KEYS, 128, 128) from 0 to 1, and n others, (n, KEYS, 128, 128).
+def similarities(press: Pixels, others: Sequence[Pixels]) -> Floats:
+    """(KEYS, 2) mean CSIM and SSIM of a press, (KEYS, 128, 128), and others of the same shape.
 
     NaN where there is no other, or it is blank.
     """
+    ink = press / 255.0
 
-    def of_key(k: int, other: NDArray[Any]) -> tuple[float, float]:
-        return similarity(press[k], other[k], KEYS[k][0]) if other[k].any() else (math.nan, math.nan)
+    def of_key(k: int, other: Pixels) -> tuple[float, float]:
+        return similarity(ink[k], other[k] / 255.0, KEYS[k][0]) if other[k].any() else (math.nan, math.nan)
 
     if not len(others):
         return np.full((len(KEYS), 2), np.nan)

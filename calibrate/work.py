@@ -32,7 +32,7 @@ from brushloop.calibrate.errors import CalibrationError, one_line
 from brushloop.calibrate.files import replacing
 
 J = TypeVar("J")
-VERSION = "7"
+VERSION = "8"
 """Part of every key. Increase it when the result of some work for the same input changes."""
 FOLDER = "work"
 """Folder of a session that holds its finished work."""

@@ -95,20 +95,22 @@ def covered(prepared: Prepared) -> Image:
     return _shrunk(prepared.mask.astype(np.float32))
 
 
-def captured_mm(prepared: Prepared, tone: Tone) -> Image:
-    """(128, 128) image of a capture that was rectified to the field."""
-    return to_tone(_shrunk(prepared.soft) if tone is Tone.GRAY else covered(prepared), tone)
+def captured(prepared: Prepared) -> Pixels:
+    """(len(KEYS), 128, 128) images of a capture that was rectified to the field.
 
-
-def captured_normalised(prepared: Prepared, tone: Tone) -> Image:
-    """(128, 128) image with the stroke's length scaled to 100 px and its bounding box in the middle."""
+    If size-normalised, the stroke's length is scaled to 100 px and its bounding box is in the middle.
+    """
     rows, columns = np.flatnonzero(prepared.mask.any(axis=1)), np.flatnonzero(prepared.mask.any(axis=0))
-    source = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
     step_px = (columns[-1] + 1 - columns[0]) / NORMAL_LENGTH_PX
     # Centre without rounding: an offset of half a pixel costs a perfect model several points of SSIM.
     middle = 0.5 * (columns[0] + columns[-1] + 1), 0.5 * (rows[0] + rows[-1] + 1)
     left, top = (float(at - 0.5 * SIZE_PX * step_px) for at in middle)
-    return to_tone(averaged(source, (left, top), step_px, SIZE_PX), tone)
+    images: list[Pixels] = []
+    for alignment, tone in KEYS:
+        ink = prepared.soft if tone is Tone.GRAY else prepared.mask.astype(np.float32)
+        aligned = _shrunk(ink) if alignment is Alignment.MM else averaged(ink, (left, top), step_px, SIZE_PX)
+        images.append(to_pixels(to_tone(aligned, tone)))
+    return np.stack(images)
 
 
 def averaged(
@@ -134,8 +136,8 @@ def to_tone(coverage: Image, tone: Tone) -> Image:
     return coverage if tone is Tone.GRAY else (coverage > 0.5).astype(np.float32)
 
 
-def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> dict[Key, Image]:
-    """Predictions of a press in every alignment and tone, (128, 128) each. May raise `model.ccdbsm.DomainError`.
+def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field) -> Pixels:
+    """(len(KEYS), 128, 128) predictions of a press. May raise `model.ccdbsm.DomainError`.
 
     The press tilts about the tip, then descends: the brush axis meets the paper H tan(alpha) from the zero-touch point,
     toward the side the ferrule leans to.
@@ -143,8 +145,8 @@ def simulated(model: StrokeModel, depth_mm: float, tilt_deg: float, field: Field
     return images_of(model.profile(depth_mm, tilt_deg), depth_mm * math.tan(math.radians(tilt_deg)), field)
 
 
-def images_of(mark: Outline, origin_x_mm: float, field: Field) -> dict[Key, Image]:
-    """A mark in every alignment and tone, (128, 128) each: its exact coverage.
+def images_of(mark: Outline, origin_x_mm: float, field: Field) -> Pixels:
+    """(len(KEYS), 128, 128) images of a mark: its exact coverage.
 
     `origin_x_mm` is the distance of the mark's origin from the zero-touch point.
     """
@@ -154,12 +156,7 @@ def images_of(mark: Outline, origin_x_mm: float, field: Field) -> dict[Key, Imag
     side_mm = SIZE_PX * normal_mm
     views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
     gray = dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(mark, views, SIZE_PX), strict=True))
-    return {(alignment, tone): to_tone(gray[alignment], tone) for alignment, tone in KEYS}
-
-
-def levels_of(images: dict[Key, Image]) -> Pixels:
-    """Images of every key in 256 levels, (len(KEYS), 128, 128)."""
-    return np.stack([to_pixels(images[key]) for key in KEYS])
+    return np.stack([to_pixels(to_tone(gray[alignment], tone)) for alignment, tone in KEYS])
 
 
 def draw_loop(loop: Outline, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,11 @@ class Pressed:
     ink: NDArray[np.floating]
 
 
+def pressed(press: presses.Press) -> Pressed:
+    """A press of a session, as a fit uses it."""
+    return Pressed(press.condition.depth_mm, press.condition.tilt_deg, np.asarray(press.coverage, np.float64))
+
+
 def by_cell(strokes: Sequence[Pressed]) -> dict[Cell, list[Pressed]]:
     """The strokes of each (H, alpha)."""
     cells: dict[Cell, list[Pressed]] = {}
@@ -90,11 +95,9 @@ def grid_of(view: Field) -> Grid:
 def read_presses(session: Path, view: Field, progress: Progress = unseen) -> Captures:
     """Read every usable press of a session. Raises `CalibrationError` where it holds none, or was not calibrated."""
     opened = open_session(session, "press")
-    strokes: list[Pressed] = []
     refused: list[Refused] = []
-    for press in presses.read_presses(opened, view, refused, uncommanded, cut, progress=progress):
-        depth_mm, tilt_deg, _ = astuple(press.condition)
-        strokes.append(Pressed(depth_mm, tilt_deg, np.asarray(press.coverage, np.float64)))
+    usable = presses.read_presses(opened, view, refused, uncommanded, cut, progress=progress)
+    strokes = [pressed(press) for press in usable]
     if not strokes:
         raise CalibrationError(str(opened.recording.path), "holds no press that can be used for a fit")
     brush, grid = brush_of(opened.header), grid_of(view)

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import SIZE_PX, Alignment, similarity, to_pixels
+from brushloop.calibrate.compare.place import SIZE_PX, Alignment, similarity
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell, inked_rows
 from brushloop.calibrate.fit.fit import Prior, fit_presses
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
@@ -72,7 +72,7 @@ class Refit:
     """A fit of the brush to some presses of a session."""
 
     strokes: tuple[Pressed, ...]
-    """In 256 levels, cut to the rows with ink, so that equal presses are equal work for every command."""
+    """Cut to the rows with ink, so that equal presses are equal work for every command."""
     grid: Grid
     radius_mm: float
     length_mm: float
@@ -92,8 +92,7 @@ class Refit:
     ) -> Refit:
         """The fit to these presses, whose ink is on the grid."""
         rows = inked_rows([stroke.ink for stroke in strokes], grid.px_mm)
-        inks = (to_pixels(np.asarray(stroke.ink[rows], np.float32)) / 255.0 for stroke in strokes)
-        cut = tuple(replace(stroke, ink=ink) for stroke, ink in zip(strokes, inks, strict=True))
+        cut = tuple(replace(stroke, ink=stroke.ink[rows]) for stroke in strokes)
         values = None if start is None else start.values
         return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior, values)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of, levels_of
+from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.fit.heldout import RefittedBezier
@@ -135,7 +135,7 @@ def predicted(
     key = key_of("drawn", view, *itertools.chain.from_iterable(parts))
     drawn = store.get(key)
     if drawn is None:
-        drawn = {str(k): levels_of(images_of(*mark, view)) for k, mark in enumerate(marks.values())}
+        drawn = {str(k): images_of(*mark, view) for k, mark in enumerate(marks.values())}
         store.put(key, drawn)
     return dict(zip(marks, (drawn[str(k)] for k in range(len(marks))), strict=True)), refused
 

@@ -16,6 +16,7 @@ from brushloop.calibrate.compare.place import KEYS, TABLE_3, Alignment, Image, P
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import (
     BLUE,
     COLOURS,
@@ -30,7 +31,7 @@ from brushloop.calibrate.report import (
     render,
     source_note,
 )
-from brushloop.calibrate.scores import Row, Stat
+from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import CEILING, Cell
 from brushloop.calibrate.validate import findings
 from brushloop.calibrate.validate.models import (
@@ -140,7 +141,7 @@ def _table_three(report: Report) -> Iterator[tuple[str, list[TableRow]]]:
 
 
 def _extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
-    """Rows of the best and of the worst strokes of a model, from the outermost; none without a model."""
+    """Numbers of the best and of the worst presses of a model, from the outermost; none without a model."""
     if not model:
         return [], []
     csim = outcome.scores.of_key(model, STRICT)[:, 0]
@@ -152,30 +153,30 @@ def _extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
 
 def _pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     """A press with what the model predicts for it, their difference, and their scores: the paper's figures 7 and 8."""
-    row, csim, ssim = outcome.scores.rows[k], np.nan, np.nan
-    captured, drawn = _shown(row.images), outcome.predicted(row)
+    press, csim, ssim = outcome.scores.presses[k], np.nan, np.nan
+    captured, drawn = _shown(press.images), outcome.predicted(press)
     images = {"captured": ink_uri(captured)}
     if model in drawn:
         predicted = _shown(drawn[model])
         images |= {"predicted": ink_uri(predicted), "difference": overlay_uri(captured, predicted)}
         csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k]
-    return {"row": row, "images": images, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
+    return {"press": press, "images": images, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
 
 
 def _side_by_side(outcome: Outcome) -> dict[str, Any]:
     """Some captures next to the prediction of every model: the paper's figures 3, 10 and 11."""
     labels = {model.name: model.info.label for group in outcome.models.values() for model in group}
-    lines: list[tuple[Row, list[str]]] = []
-    for row in (outcome.scores.rows[k] for k in _first_of_cells(outcome, MAX_CELLS)):
-        drawn = outcome.predicted(row)
+    lines: list[tuple[Press, list[str]]] = []
+    for press in (outcome.scores.presses[k] for k in _first_of_cells(outcome, MAX_CELLS)):
+        drawn = outcome.predicted(press)
         predictions = (ink_uri(_shown(drawn[name])) if name in drawn else "" for name in labels)
-        lines.append((row, [ink_uri(_shown(row.images)), *predictions]))
+        lines.append((press, [ink_uri(_shown(press.images)), *predictions]))
     return {"labels": list(labels.values()), "lines": lines}
 
 
 def _first_of_cells(outcome: Outcome, most: int) -> list[int]:
     """The first capture of each condition; with more than `most` of them, of evenly spaced ones."""
-    first = [rows[0] for rows in outcome.scores.conditions().values()]
+    first = [numbers[0] for numbers in outcome.scores.conditions().values()]
     count = min(len(first), most)
     return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
 

@@ -31,8 +31,9 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.loop import AGAIN, LoopRecord
+from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Sealed, load_sealed, source_label
-from brushloop.calibrate.scores import MEASURES, Cell, Row, Scores, Stat, find_stat, statistics
+from brushloop.calibrate.scores import MEASURES, Cell, Scores, Stat, find_stat, statistics
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stats import CEILING, Floats, Summary, ceiling_values
 from brushloop.calibrate.validate.models import (
@@ -217,9 +218,9 @@ def _stats(scores: Scores) -> Iterator[Stat]:
     for model, values in percent.items():
         yield from statistics(model, values, scores.cell_of, None, None if model in presses else ceiling)
     conditions = scores.conditions()
-    for condition, rows in conditions.items() if len(conditions) <= MAX_CELLS else ():
+    for condition, at in conditions.items() if len(conditions) <= MAX_CELLS else ():
         for model, values in percent.items():
-            yield from statistics(model, values[rows], scores.cell_of[rows], (condition.depth_mm, condition.tilt_deg))
+            yield from statistics(model, values[at], scores.cell_of[at], (condition.depth_mm, condition.tilt_deg))
 
 
 def _models(outcome: Outcome) -> Iterator[ModelInfo]:
@@ -231,18 +232,18 @@ def _models(outcome: Outcome) -> Iterator[ModelInfo]:
 
 
 def _session(session: FittedSession, scores: Scores) -> Session:
-    rows = [row for row in scores.rows if row.session == session.header.session_id]
+    presses = [press for press in scores.presses if press.session == session.header.session_id]
     return Session(
         header=session.header,
         recording=session.recording.path.name,
         recording_sha256=session.sha256,
         strokes=len(session.strokes),
-        compared=len(rows),
-        cut=tuple(row.stroke.stroke_id for row in rows if row.cut),
+        compared=len(presses),
+        cut=tuple(press.stroke.stroke_id for press in presses if press.cut),
         calibration=session.calibration,
         fit="" if session.fit is None else session.fit.digest,
-        size_ratio=_size_ratio(session.header, rows),
-        deepest_miss=max((row.stroke for row in rows), key=missed_mm, default=None),
+        size_ratio=_size_ratio(session.header, presses),
+        deepest_miss=max((press.stroke for press in presses), key=missed_mm, default=None),
         collected=collected_in(session.recording.path.parent),
     )
 
@@ -272,17 +273,17 @@ def collected_in(folder: Path) -> Collected | None:
     )
 
 
-def _size_ratio(header: Header, rows: Sequence[Row]) -> tuple[float, float] | None:
+def _size_ratio(header: Header, presses: Sequence[Press]) -> tuple[float, float] | None:
     """Mean ratio of length and width of uncut marks to those of CCD-BSM for a brush of this size."""
     from brushloop.model.ccdbsm import ccdbsm
 
     brush = brush_of(header)
     ratios: list[tuple[float, float]] = []
-    for row in rows:
+    for press in presses:
         with suppress(DomainError):
-            mark = ccdbsm(brush, row.condition.depth_mm, row.condition.tilt_deg)
-            length, width = row.measured.length_mm / mark.length_mm[0], row.measured.breadth_mm / mark.width_mm[0]
-            if not row.cut:
+            mark, measured = ccdbsm(brush, press.condition.depth_mm, press.condition.tilt_deg), press.measured
+            if not press.cut:
+                length, width = measured.length_mm / mark.length_mm[0], measured.breadth_mm / mark.width_mm[0]
                 ratios.append((float(length), float(width)))
     if not ratios:
         return None

@@ -21,14 +21,13 @@ from brushloop.calibrate.compare.place import (
     Tone,
     brush_of,
     images_of,
-    levels_of,
     similarity,
 )
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.captures import Pressed, grid_of
+from brushloop.calibrate.fit.captures import Pressed, grid_of, pressed
 from brushloop.calibrate.fit.heldout import MAX_FOLDS, Refit, RefittedBezier, leave_out, refit_bezier, refits
-from brushloop.calibrate.presses import read_presses, too_thin, uncommanded
-from brushloop.calibrate.scores import Row, Scores, similarities
+from brushloop.calibrate.presses import Press, read_presses, too_thin, uncommanded
+from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.stats import others_of
 from brushloop.calibrate.validate.models import (
     ANOTHER,
@@ -118,10 +117,10 @@ class Outcome:
     steps: Sequence[Step] = ()
     """Similarity by number of fitted presses; empty without ablations."""
 
-    def predicted(self, row: Row) -> dict[str, Pixels]:
+    def predicted(self, press: Press) -> dict[str, Pixels]:
         """(len(KEYS), 128, 128) of a press by the models that predict it."""
-        [store] = (session.store for session in self.sessions if session.header.session_id == row.session)
-        return predicted(self.models[row.session], row.condition, self.request.view, store)[0]
+        [store] = (session.store for session in self.sessions if session.header.session_id == press.session)
+        return predicted(self.models[press.session], press.condition, self.request.view, store)[0]
 
 
 def validate_presses(
@@ -147,15 +146,19 @@ def validate_presses(
                 "--model", f"{name!r} is not one of: {names}; some need a fit, --generator or --tune"
             )
     refused: list[Refused] = []
-    rows: list[Row] = []
+    presses: list[Press] = []
     for session in sessions:
-        name = session.header.session_id
-        of_session = list(_rows(session, request.view, refused, scheduler, progress))
+        name, left_out = session.header.session_id, list[tuple[str, str]]()
+        reasons = uncommanded, too_thin
+        of_session = list(
+            read_presses(session, request.view, left_out, *reasons, scheduler=scheduler, progress=progress)
+        )
+        refused += (Refused(name, *reason) for reason in left_out)
         every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, work, progress)])
         models[name] = [model for model in every if not request.models or model.name in request.models]
-        rows += of_session
+        presses += of_session
     names = list(dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group])))
-    scores = Scores(rows, (*names, ANOTHER))
+    scores = Scores(presses, (*names, ANOTHER))
     for session in sessions:
         _score(scores, session, models[session.header.session_id], request.view, refused, scheduler, progress)
     steps: list[Step] = []
@@ -164,34 +167,29 @@ def validate_presses(
     return Outcome(sessions, request, models, scores, refused, steps)
 
 
-def _rows(
-    session: FittedSession, view: Field, refused: list[Refused], scheduler: Scheduler, progress: Progress
-) -> Iterator[Row]:
-    """Yield the presses of a session that can be compared."""
-    left_out: list[tuple[str, str]] = []
-    for press in read_presses(session, view, left_out, uncommanded, too_thin, scheduler=scheduler, progress=progress):
-        yield Row.of(press, session.header)
-    refused += (Refused(session.header.session_id, *reason) for reason in left_out)
-
-
 def _held_out(
-    session: FittedSession, rows: Sequence[Row], request: Request, scheduler: Scheduler, work: Path, progress: Progress
+    session: FittedSession,
+    presses: Sequence[Press],
+    request: Request,
+    scheduler: Scheduler,
+    work: Path,
+    progress: Progress,
 ) -> Iterator[Model]:
     """Yield the models fitted to the session without the cells that they predict."""
     view, wanted = request.view, request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
     if request.held_out and (FITTED_HELD_OUT in wanted or BEZIER_REFITTED in wanted):
-        left_out = _left_out(rows, MAX_FOLDS)
-        presses = _refitted(session, left_out, view, scheduler, progress)
-        if presses:
-            yield held_out(BRUSH_LEFT_OUT, presses)
+        left_out = _left_out(presses, MAX_FOLDS)
+        fits = _refitted(session, left_out, view, scheduler, progress)
+        if fits:
+            yield held_out(BRUSH_LEFT_OUT, fits)
         if left_out:
             beziers = {cell: _bezier(others, view) for fold, others in left_out for cell in fold}
             yield held_out(BEZIER_LEFT_OUT, beziers)
     if request.tune_steps:
-        left_out = _left_out(rows, FOLDS)
-        presses = _refitted(session, left_out, view, scheduler, progress)
+        left_out = _left_out(presses, FOLDS)
+        fits = _refitted(session, left_out, view, scheduler, progress)
         for generator in request.generators:
-            folds = [(fold, presses.get(fold[0])) for fold, _ in left_out]
+            folds = [(fold, fits.get(fold[0])) for fold, _ in left_out]
             files = tuned_by_cell(session, folds, generator, request.tune_steps, work, progress)
             if files:
                 yield tuned(files, brush_of(session.header))
@@ -201,12 +199,12 @@ LeftOut = list[tuple[list[Condition], list[Pressed]]]
 """Cells that are left out together, and the presses of all others that a fit uses."""
 
 
-def _left_out(rows: Sequence[Row], most: int) -> LeftOut:
+def _left_out(presses: Sequence[Press], most: int) -> LeftOut:
     """At most so many groups of cells, with the uncut presses of the others; none for a single cell."""
-    cells: dict[Condition, list[Pressed]] = {row.condition: [] for row in sorted(rows, key=lambda row: row.condition)}
-    for row in rows:
-        if not row.cut:
-            cells[row.condition].append(_pressed(row))
+    cells: dict[Condition, list[Pressed]] = {at: [] for at in sorted({press.condition for press in presses})}
+    for press in presses:
+        if not press.cut:
+            cells[press.condition].append(pressed(press))
     return leave_out(cells, most)
 
 
@@ -219,13 +217,8 @@ def _refitted(
     start, grid = session.fit.press(), grid_of(view)
     jobs = [Refit.of(others, grid, start.radius_mm, start.length_mm, start=start) for _, others in left_out]
     what = f"{session.header.session_id}: cells left out in turn"
-    presses = refits(jobs, session.store, scheduler, what, progress)
-    return {cell: press for (fold, _), press in zip(left_out, presses, strict=True) for cell in fold}
-
-
-def _pressed(row: Row) -> Pressed:
-    """The coverage of a row, as a fit uses it."""
-    return Pressed(row.condition.depth_mm, row.condition.tilt_deg, row.coverage / 255.0)
+    fits = refits(jobs, session.store, scheduler, what, progress)
+    return {cell: fit for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
 
 
 def _bezier(strokes: Sequence[Pressed], view: Field) -> RefittedBezier | None:
@@ -236,14 +229,14 @@ def _bezier(strokes: Sequence[Pressed], view: Field) -> RefittedBezier | None:
         return None
 
 
-ScoreJob = tuple[Pixels, tuple[Pixels, ...]]
-"""A press (len(KEYS), 128, 128), and for each comparison (n, len(KEYS), 128, 128), whose scores are averaged."""
+ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]
+"""A press (len(KEYS), 128, 128), and the images of each comparison, of that shape, whose scores are averaged."""
 
 
 def score_job(job: ScoreJob) -> Arrays:
     """`values` (comparisons, KEYS, 2): CSIM and SSIM, NaN where there is nothing to compare with."""
-    press, against = job
-    return {"values": np.array([similarities(press / 255.0, images / 255.0) for images in against])}
+    press, compared = job
+    return {"values": np.array([similarities(press, images) for images in compared])}
 
 
 def _score(
@@ -256,28 +249,28 @@ def _score(
     progress: Progress,
 ) -> None:
     """Fill the table for one session: every press against every model, and against other presses of its cell."""
-    rows, columns = scores.rows, [scores.models.index(name) for name in (*(model.name for model in models), ANOTHER)]
-    cells = [cell for cell in scores.cells if rows[cell[0]].session == session.header.session_id]
-    places: dict[str, list[int]] = {}
-    """Rows by key of their job: equal presses share one."""
+    columns = [scores.models.index(name) for name in (*(model.name for model in models), ANOTHER)]
+    cells = [cell for cell in scores.cells if scores.presses[cell[0]].session == session.header.session_id]
+    numbers: dict[str, list[int]] = {}
+    """Numbers of presses by the key of their job: equal presses share one."""
 
     def jobs() -> Iterator[tuple[str, ScoreJob]]:
         for cell in cells:
-            images, reasons = predicted(models, rows[cell[0]].condition, view, session.store)
+            presses = [scores.presses[k] for k in cell]
+            images, reasons = predicted(models, presses[0].condition, view, session.store)
             for why in reasons.values():
-                refused.extend(Refused(rows[k].session, rows[k].stroke.stroke_id, why) for k in cell)
-            none = np.zeros((0,), np.uint8)
-            predictions = [images[model.name][np.newaxis] if model.name in images else none for model in models]
-            for number, k in enumerate(cell):
-                others = [rows[cell[other]].images for other in others_of(number, len(cell))]
-                against = (*predictions, np.array(others))
-                key = key_of("score", rows[k].images, *against)
-                places.setdefault(key, []).append(k)
-                yield key, (rows[k].images, against)
+                refused.extend(Refused(press.session, press.stroke.stroke_id, why) for press in presses)
+            predictions = [[images[model.name]] if model.name in images else [] for model in models]
+            for number, press in enumerate(presses):
+                others = [presses[other].images for other in others_of(number, len(cell))]
+                compared = (*predictions, others)
+                key = key_of("score", press.images, *map(len, compared), *itertools.chain.from_iterable(compared))
+                numbers.setdefault(key, []).append(cell[number])
+                yield key, (press.images, compared)
 
     what, count = f"{session.header.session_id}: compared", sum(map(len, cells))
     for key, arrays in counted(scheduler.finished(score_job, jobs(), session.store), what, count, progress):
-        scores.values[np.ix_(places[key], columns)] = arrays["values"]
+        scores.values[np.ix_(numbers[key], columns)] = arrays["values"]
 
 
 def _similarity_by_strokes(
@@ -286,12 +279,12 @@ def _similarity_by_strokes(
     """Yield scores of fits from few presses on others of the session; none for a session with too few presses."""
     name, brush, grid = session.header.session_id, brush_of(session.header), grid_of(view)
     trials = list(_trials(name, number, scores))
-    fitted = [[_pressed(row) for row in few] for few, _ in trials]
+    fitted = [[pressed(press) for press in few] for few, _ in trials]
     jobs = [Refit.of(few, grid, float(brush.radius_mm), float(brush.length_mm)) for few in fitted]
-    presses = refits(jobs, session.store, scheduler, "fits from few strokes")
+    fits = refits(jobs, session.store, scheduler, "fits from few strokes")
     values: dict[tuple[int, str], list[tuple[float, float]]] = {}
-    for (_, others), few, press in zip(trials, fitted, presses, strict=True):
-        for label, model in (("CCD-BSM", press), ("Bézier", _bezier(few, view))):
+    for (_, others), few, fit in zip(trials, fitted, fits, strict=True):
+        for label, model in (("CCD-BSM", fit), ("Bézier", _bezier(few, view))):
             if model is not None:
                 values.setdefault((len(few), label), []).extend(_on_others(model, others, view))
     for (count, label), of_model in sorted(values.items()):
@@ -299,18 +292,21 @@ def _similarity_by_strokes(
         yield Step(name, count, label, csim, ssim, len(of_model))
 
 
-def _on_others(model: FittedPress | RefittedBezier, rows: Sequence[Row], view: Field) -> Iterator[tuple[float, float]]:
-    """Yield CSIM and SSIM in millimetres, binary, of each row."""
-    outlines = {at: model.outline(at.depth_mm, at.tilt_deg) for at in {row.condition for row in rows}}
-    images = {at: levels_of(images_of(outline, 0.0, view))[MM_BINARY] / 255.0 for at, outline in outlines.items()}
-    for row in rows:
-        yield similarity(row.images[MM_BINARY] / 255.0, images[row.condition], Alignment.MM)
+def _on_others(
+    model: FittedPress | RefittedBezier, presses: Sequence[Press], view: Field
+) -> Iterator[tuple[float, float]]:
+    """Yield CSIM and SSIM in millimetres, binary, of each press."""
+    conditions = {press.condition for press in presses}
+    images = {at: images_of(model.outline(at.depth_mm, at.tilt_deg), 0.0, view) for at in conditions}
+    for press in presses:
+        seen, drawn = (stack[MM_BINARY] / 255.0 for stack in (press.images, images[press.condition]))
+        yield similarity(seen, drawn, Alignment.MM)
 
 
-def _trials(name: str, number: int, scores: Scores) -> Iterator[tuple[list[Row], list[Row]]]:
+def _trials(name: str, number: int, scores: Scores) -> Iterator[tuple[list[Press], list[Press]]]:
     """Yield the presses to fit and those to score on, of session `number`."""
-    rows = scores.rows
-    cells = [[k for k in cell if rows[k].session == name and not rows[k].cut] for cell in scores.cells]
+    presses = scores.presses
+    cells = [[k for k in cell if presses[k].session == name and not presses[k].cut] for cell in scores.cells]
     for draw in range(DRAWS):
         rng = np.random.default_rng([draw, number])
         # Every cell once before any cell twice, as a person would choose.
@@ -321,4 +317,4 @@ def _trials(name: str, number: int, scores: Scores) -> Iterator[tuple[list[Row],
             left = order[count:]
             if len(left) >= MIN_LEFT:
                 others = sorted(left[:: max(1, -(-len(left) // MAX_SCORED))])
-                yield [rows[k] for k in order[:count]], [rows[k] for k in others]
+                yield [presses[k] for k in order[:count]], [presses[k] for k in others]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import SIZE_PX, Field, Tone, captured_mm
+from brushloop.calibrate.compare.place import SIZE_PX, Field, covered
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.stroke import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
@@ -93,4 +93,4 @@ def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uin
         prepared = prepare(raster, anchor_px, "the capture", Params(), patch_px)
     except CaptureRefused:
         return raster, None
-    return raster, captured_mm(prepared, Tone.BINARY) > 0.5
+    return raster, covered(prepared) > 0.5

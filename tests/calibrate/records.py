@@ -9,24 +9,24 @@ import numpy as np
 
 from brushloop.calibrate.compare.place import KEYS, Tone
 from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, table_1, verdicts
-from brushloop.calibrate.scores import Row, Scores
+from brushloop.calibrate.presses import Press
+from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WrittenRecord, table_3
-from brushloop.sessions.records import Condition, Source, Stroke
+from brushloop.sessions.records import Source, Stroke
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
 
 
 def pair_scores(step: float = 0.001) -> Scores:
     """Six presses of three cells, each pressed again: .94 like its original, another press .95."""
-    blank, sizes = np.zeros((len(KEYS) + 1, 128, 128), np.uint8), Measured(1.0, 1.0, 1.0, 1.0, 1.0)
-    rows = [
-        Row("grid", "", Stroke(stroke_id=f"{k:03d}", kind="press", still=k), at, sizes, False, blank[:-1], blank[-1])
-        for k in range(6)
-        for at in [Condition(11.0 + k // 2, 0.0)]
-    ]
-    scores = Scores(rows, tuple(LEVELS))
+    blank, sizes = np.zeros((len(KEYS), 128, 128), np.uint8), Measured(1.0, 1.0, 1.0, 1.0, 1.0)
+    presses: list[Press] = []
+    for k in range(6):
+        stroke = Stroke(stroke_id=f"{k:03d}", kind="press", still=k, depth_mm=11.0 + k // 2, tilt_deg=0.0)
+        presses.append(Press("grid", "", stroke, blank, np.zeros((128, 128), np.float32), (0.0, 0.0), sizes, False, ()))
+    scores = Scores(presses, tuple(LEVELS))
     levels = np.array(list(LEVELS.values())) + step * np.arange(6)[:, None]
     scores.values[:] = np.stack([levels, levels - 0.1], axis=-1)[:, :, None]
     return scores

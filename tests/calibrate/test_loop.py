@@ -19,7 +19,6 @@ from brushloop.calibrate.loop import (
     verdicts,
 )
 from brushloop.calibrate.presses import PrepareJob, Press, prepare_job, press_of
-from brushloop.calibrate.scores import Scores
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_model
@@ -31,6 +30,7 @@ from tests.calibrate.given import CALIBRATION
 MODEL = stroke_model("ccd-bsm", Brush())
 ANCHOR, CELL = (60.0, 40.0), (30.0, 28.0, 40.0, 24.0)
 STRICT = (Alignment.MM, Tone.BINARY)
+HEADER = Header(session_id="grid", source=Source.LOOPBACK, software="test")
 
 
 def photograph(depth_mm: float, tilt_deg: float) -> np.ndarray:
@@ -52,17 +52,13 @@ def press(name: str, shown: tuple[float, float], asked: tuple[float, float], of:
         again_of=of,
     )
     capture = Capture(stroke, encode_png(photograph(*shown)), f"test {name}")
-    return press_of(stroke, prepare_job(PrepareJob(capture, CALIBRATION, Field())))
+    return press_of(HEADER, stroke, prepare_job(PrepareJob(capture, CALIBRATION, Field())))
 
 
 def paired(originals: Iterable[Press], again: Iterable[Press]) -> tuple[list[Pair], dict[str, str]]:
     """Pairs, and why presses are in none."""
     refused: list[tuple[str, str]] = []
     return pair_up(list(originals), list(again), MODEL, Field(), refused), dict(refused)
-
-
-def scored(pairs: list[Pair], originals: Iterable[Press]) -> Scores:
-    return score_pairs(pairs, originals, Header(session_id="grid", source=Source.LOOPBACK, software="test"))
 
 
 ORIGINALS = [
@@ -81,7 +77,7 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
     names = [(pair.original.stroke.stroke_id, pair.again.stroke.stroke_id) for pair in pairs]
     assert names == [("a-r01", "a-r01~1"), ("a-r02", "a-r02~1")]
     assert refused == {"b-r01": "was not pressed again"}
-    scores = scored(pairs, ORIGINALS)
+    scores = score_pairs(pairs, ORIGINALS)
     csim = {what: scores.of_key(what, STRICT)[:, 0] for what in scores.models}
     assert csim[AGAIN].min() == pytest.approx(1.0)
     assert csim[ANOTHER].max() < 0.98
@@ -96,7 +92,7 @@ def test_a_press_made_again_as_it_was_beats_the_other_press_of_its_cell() -> Non
 
 def test_a_press_made_again_too_deep_fails_and_says_so() -> None:
     again = [press("a-r01~1", (18.0, 5.0), (18.0, 5.0), "a-r01")]
-    scores = scored(paired(ORIGINALS, again)[0], ORIGINALS)
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
     [strict] = [v for v in verdicts(scores) if (v.alignment, v.tone, v.measure) == (*STRICT, "csim")]
     assert strict.difference < -2.0
     assert not strict.holds
@@ -120,6 +116,6 @@ def test_what_repeats_nothing_is_named() -> None:
 
 def test_an_original_alone_in_its_cell_has_no_repeatability() -> None:
     again = [press("b-r01~1", (19.0, 0.0), (19.0, 0.0), "b-r01")]
-    scores = scored(paired(ORIGINALS, again)[0], ORIGINALS)
+    scores = score_pairs(paired(ORIGINALS, again)[0], ORIGINALS)
     assert np.isnan(scores.of(ANOTHER)).all()
     assert list(verdicts(scores)) == []

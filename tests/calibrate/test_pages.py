@@ -77,10 +77,11 @@ def _loop(folder: Path) -> str:
     measured = Measured(length_mm=15.0, width_mm=4.0, mid_width_mm=4.0, breadth_mm=4.0, area_mm2=60.0)
 
     def press(name: str, depth_mm: float, end: int) -> Press:
-        image = np.zeros((128, 128), np.float32)
-        image[58:70, 40:end] = 1.0
+        image = np.zeros((128, 128), np.uint8)
+        image[58:70, 40:end] = 255
         stroke = Stroke(stroke_id=name, kind="press", still=0, depth_mm=depth_mm, tilt_deg=5.0)
-        return Press(stroke, dict.fromkeys(KEYS, image), image, (29.0, 19.0), measured, False, ())
+        images = np.stack([image] * len(KEYS))
+        return Press("grid", "", stroke, images, image / 255.0, (29.0, 19.0), measured, False, ())
 
     first, second = press("a-r01", 15.0, 90), press("a-r02", 15.0, 88)
     pairs = [Pair(first, press("a-r01~1", 14.6, 89), first.images)]
@@ -93,7 +94,7 @@ def _loop(folder: Path) -> str:
         )
         for name in ("grid", "replay")
     )
-    scores = score_pairs(pairs, [first, second], original.header)
+    scores = score_pairs(pairs, [first, second])
     rows = {"table_1": tuple(table_1(scores)), "verdicts": tuple(verdicts(scores))}
     record = loop_record("grid", "ab", refused=(("a-r02", NOT_AGAIN), ("x<u>", "is blank")), **rows)
     return write_loop(record, (original, again), pairs, scores, folder / "loop").read_text(encoding="utf-8")

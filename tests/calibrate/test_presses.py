@@ -75,8 +75,8 @@ def read(
 
 
 def same(one: Press, other: Press) -> bool:
-    images = all(np.array_equal(one.images[key], other.images[key]) for key in one.images)
-    return images and np.array_equal(one.coverage, other.coverage) and one.measured == other.measured
+    pictures = (one.images, other.images), (one.coverage, other.coverage)
+    return all(np.array_equal(*pair) for pair in pictures) and one.measured == other.measured
 
 
 def test_fit_and_validate_do_no_work_twice(session: Path, tmp_path: Path, calls: Counter[str]) -> None:

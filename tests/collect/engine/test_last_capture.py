@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brushloop.calibrate.compare.place import Alignment, Field, Tone, simulated
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, simulated
 from brushloop.collect.engine.last_capture import LastCapture, mark_of
 from brushloop.model.fitted import FittedPress
 from brushloop.model.strokes import stroke_model
@@ -20,7 +20,7 @@ BRUSH = FittedPress(6.0, 48.0)
 def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float) -> None:
     mark = mark_of(BRUSH, Condition(depth_mm, tilt_deg))
     model = stroke_model("ccd-bsm", BRUSH)
-    exact = simulated(model, depth_mm, tilt_deg, Field())[Alignment.MM, Tone.BINARY] > 0.5
+    exact = simulated(model, depth_mm, tilt_deg, Field())[KEYS.index((Alignment.MM, Tone.BINARY))] > 0
     assert mark is not None
     assert exact.sum() > 100
     assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()
