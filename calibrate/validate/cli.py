@@ -30,7 +30,6 @@ def validate(
     ] = False,
     curves: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a training, for figures 9 and 12.")] = None,
     held_out: Annotated[bool, typer.Option(help="Fit to other cells, each cell left out in turn.")] = True,
-    tune: Annotated[int, typer.Option(min=0, help="Steps to tune each generator on other cells; 0: none.")] = 0,
     scheduler: Annotated[str, typer.Option(help="An existing Dask cluster, as tcp://host:8786.")] = "",
     workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Threads; all cores by default.")] = None,
 ) -> None:
@@ -53,7 +52,6 @@ def validate(
         gates=tuple(gate or ()),
         ablations=ablations,
         held_out=held_out,
-        tune_steps=tune,
         out=out,
         scheduler=scheduler,
         workers=workers,
@@ -90,7 +88,7 @@ def captures(
     opened = [open_session(place) for place in session]
     one_source(opened)
     aligned = align_captures(opened, generator)
-    count = write_captures(aligned, out)
+    write_captures(aligned, out)
     for name, why in aligned.left_out:
         say(f"left out: {name}: {why}")
-    say(f"{count} presses ({aligned.source}): {out}")
+    say(f"{len(aligned.images)} presses ({aligned.source}): {out}")

@@ -37,7 +37,7 @@ from brushloop.sessions.records import Source
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "validation"
-WORK = "work"
+LOCK = ".lock"
 LOOP, WRITTEN = "loop", "written"
 """Folders of a session, where its loop and its characters are looked for; `written` also beside all sessions."""
 MAX_PICTURE_BYTES = 16 * 1024 * 1024
@@ -91,8 +91,6 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     """
     for text in request.gates:
         parse_gate(text)
-    if request.tune_steps and not request.generators:
-        raise CalibrationError("--tune", "needs a --generator to tune")
     curves = [read_curve(text) for text in request.curves]
     folder = _folder(request)
     check_writable(folder)
@@ -104,13 +102,13 @@ def validate(request: Request, progress: Progress = unseen) -> ValidationOutput:
     if kinds == {"drag"}:
         return _drags(request, sessions, folder, progress)
     beside = find_beside(sessions)
-    (folder / WORK).mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     try:
         with (
-            FileLock(folder / WORK / "lock", timeout=0),
+            FileLock(folder / LOCK, timeout=0),
             cluster(request.scheduler) if request.scheduler else threads(request.workers) as scheduler,
         ):
-            outcome = validate_presses(sessions, request, scheduler, folder / WORK, progress)
+            outcome = validate_presses(sessions, request, scheduler, progress)
             return ValidationOutput(folder, _write(outcome, folder, curves, beside), notes=tuple(beside.notes))
     except Timeout:
         raise CalibrationError(str(folder), "another validation is writing there") from None

@@ -17,7 +17,7 @@ from brushloop.calibrate.fit.heldout import RefittedBezier
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.work import Store, key_of
-from brushloop.model.ccdbsm import Brush, DomainError
+from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import NAME as FITTED
 from brushloop.model.fitted import FittedPress
 from brushloop.model.outline import Outline
@@ -31,13 +31,12 @@ PUBLISHED = "as published"
 HELD_OUT = "fitted, held-out cells"
 PRESSES = "captured presses"
 FITTED_HELD_OUT, BEZIER_REFITTED = "ccd-bsm-heldout", "bezier-refitted"
-GENERATOR_HELD_OUT = "ccd-bsmg-heldout"
 ANOTHER = "another press"
 """A capture predicted by other captures of its cell, averaged: how well one press predicts another."""
 LAMBDAS = {"ccd-bsm-lambda-1": 1.0, "ccd-bsm-lambda-pi/2": 0.5 * math.pi}
 """Values compared in addition to lambda = pi, which is CCD-BSM itself: the paper's figure 3."""
 ORDER = (
-    *("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED, FITTED_HELD_OUT, "bezier", BEZIER_REFITTED),
+    *("ccd-bsmg", "ccd-bsm", FITTED, FITTED_HELD_OUT, "bezier", BEZIER_REFITTED),
     *("ellipse", "line", "circle"),
 )
 """Of the paper's tables, calibrated next to uncalibrated."""
@@ -182,22 +181,6 @@ def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBez
         return fit.outline(at.depth_mm, at.tilt_deg), 0.0
 
     return Model(info, mark)
-
-
-def tuned(files: Mapping[Condition, Path], brush: Brush) -> Model:
-    """A generator tuned on all cells except the one it predicts."""
-    from brushloop.model.generator.stroke import load_generator
-
-    loaded = {file: load_generator(file, brush) for file in set(files.values())}
-    first = next(iter(loaded.values()))
-    info = ModelInfo(
-        name=f"{first.name}-heldout",
-        label=f"{first.label} calibrated",
-        definition="The generator, fine-tuned on captures of other cells (left out by fifths) and on images of the "
-        "CCD-BSM that was fitted to them, if there is a fit; its outline.",
-        basis=HELD_OUT,
-    )
-    return Model(info, lambda at: _pressed(loaded[files[at]], at))
 
 
 def _of_model(model: StrokeModel, basis: str, **changes: str) -> Model:

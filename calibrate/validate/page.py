@@ -37,14 +37,13 @@ from brushloop.calibrate.validate import findings
 from brushloop.calibrate.validate.models import (
     BEZIER_REFITTED,
     FITTED_HELD_OUT,
-    GENERATOR_HELD_OUT,
     FittedSession,
     ModelInfo,
 )
 from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, Session, TableRow, table_1, table_2, table_3
 from brushloop.calibrate.validate.run import Outcome
 
-CELL_COLUMNS = ("ccd-bsmg", GENERATOR_HELD_OUT, "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
+CELL_COLUMNS = ("ccd-bsmg", "ccd-bsm", FITTED_HELD_OUT, BEZIER_REFITTED, CEILING)
 GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
 MAX_REFUSED = 200
 ROWS = slice(32, 96)

@@ -40,7 +40,6 @@ from brushloop.calibrate.validate.models import (
     ANOTHER,
     FITTED,
     FITTED_HELD_OUT,
-    GENERATOR_HELD_OUT,
     KINDS_OF_PRESS,
     LAMBDAS,
     FittedSession,
@@ -305,7 +304,7 @@ class TableRow(NamedTuple):
 
 def table_1(report: Report) -> list[TableRow]:
     """Rows of the generated models and robot writing, with calibrated models and the ceiling."""
-    calibrated = [name for name in (FITTED_HELD_OUT, GENERATOR_HELD_OUT) if report.model(name) is not None]
+    calibrated = [FITTED_HELD_OUT] if report.model(FITTED_HELD_OUT) is not None else []
     rows = [_row(report, name, TABLE_1[name]) for name in TABLE_1 if name != ROBOT_WRITING]
     rows += robot_writing(report) or [_row(report, ROBOT_WRITING, TABLE_1[ROBOT_WRITING])]
     return rows + [_row(report, name) for name in (*calibrated, ANOTHER, CEILING)]

@@ -35,16 +35,13 @@ from brushloop.calibrate.validate.models import (
     BEZIER_REFITTED,
     BRUSH_LEFT_OUT,
     FITTED_HELD_OUT,
-    GENERATOR_HELD_OUT,
     FittedSession,
     Model,
     held_out,
     in_order,
     known_models,
     predicted,
-    tuned,
 )
-from brushloop.calibrate.validate.tuning import FOLDS, tuned_by_cell
 from brushloop.calibrate.work import Arrays, Scheduler, key_of
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.records import Condition
@@ -77,8 +74,6 @@ class Request:
     gates: tuple[str, ...] = ()
     ablations: bool = False
     held_out: bool = True
-    tune_steps: int = 0
-    """Tuning steps of each generator on other cells; 0 means no tuning."""
     out: Path | None = None
     scheduler: str = ""
     workers: int | None = None
@@ -124,9 +119,9 @@ class Outcome:
 
 
 def validate_presses(
-    sessions: Sequence[FittedSession], request: Request, scheduler: Scheduler, work: Path, progress: Progress = unseen
+    sessions: Sequence[FittedSession], request: Request, scheduler: Scheduler, progress: Progress = unseen
 ) -> Outcome:
-    """Compare every model with every press. Tuned generators are kept in the folder `work`.
+    """Compare every model with every press.
 
     Raises `CalibrationError` for an unknown model, or if two sessions have the same name.
     """
@@ -138,13 +133,10 @@ def validate_presses(
         raise CalibrationError(sessions[-1].header.session_id, "two sessions have this name")
     possible = [*(model.name for known in models.values() for model in known), BEZIER_REFITTED]
     possible += [FITTED_HELD_OUT] if any(session.fit for session in sessions) else []
-    possible += [GENERATOR_HELD_OUT] if request.tune_steps else []
     for name in request.models:
         if name not in possible:
             names = ", ".join(dict.fromkeys(possible))
-            raise CalibrationError(
-                "--model", f"{name!r} is not one of: {names}; some need a fit, --generator or --tune"
-            )
+            raise CalibrationError("--model", f"{name!r} is not one of: {names}; some need a fit or --generator")
     refused: list[Refused] = []
     presses: list[Press] = []
     for session in sessions:
@@ -154,7 +146,7 @@ def validate_presses(
             read_presses(session, request.view, left_out, *reasons, scheduler=scheduler, progress=progress)
         )
         refused += (Refused(name, *reason) for reason in left_out)
-        every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, work, progress)])
+        every = in_order([*models[name], *_held_out(session, of_session, request, scheduler, progress)])
         models[name] = [model for model in every if not request.models or model.name in request.models]
         presses += of_session
     names = list(dict.fromkeys(model.name for model in in_order([m for group in models.values() for m in group])))
@@ -168,12 +160,7 @@ def validate_presses(
 
 
 def _held_out(
-    session: FittedSession,
-    presses: Sequence[Press],
-    request: Request,
-    scheduler: Scheduler,
-    work: Path,
-    progress: Progress,
+    session: FittedSession, presses: Sequence[Press], request: Request, scheduler: Scheduler, progress: Progress
 ) -> Iterator[Model]:
     """Yield the models fitted to the session without the cells that they predict."""
     view, wanted = request.view, request.models or (FITTED_HELD_OUT, BEZIER_REFITTED)
@@ -185,14 +172,6 @@ def _held_out(
         if left_out:
             beziers = {cell: _bezier(others, view) for fold, others in left_out for cell in fold}
             yield held_out(BEZIER_LEFT_OUT, beziers)
-    if request.tune_steps:
-        left_out = _left_out(presses, FOLDS)
-        fits = _refitted(session, left_out, view, scheduler, progress)
-        for generator in request.generators:
-            folds = [(fold, fits.get(fold[0])) for fold, _ in left_out]
-            files = tuned_by_cell(session, folds, generator, request.tune_steps, work, progress)
-            if files:
-                yield tuned(files, brush_of(session.header))
 
 
 LeftOut = list[tuple[list[Condition], list[Pressed]]]

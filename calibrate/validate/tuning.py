@@ -1,9 +1,4 @@
-"""Captured presses in a generator's image format, for `brushloop train tune`, and a generator judged on unseen cells.
-
-It is judged on cells that it was not tuned on: the tuning sees the captures of all other cells and, if the session was
-fitted, images of the CCD-BSM fitted to those same captures, as the paper's generator learns from CCD-BSM. Each fold of
-cells has its own tuning, in a folder named after a hash of its inputs; a killed one resumes from its checkpoint.
-"""
+"""Captured presses in a generator's image format, for `brushloop train tune`."""
 
 from __future__ import annotations
 
@@ -21,22 +16,10 @@ from brushloop.calibrate.report import source_label
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.preprocess import Prepared
-from brushloop.calibrate.work import key_of
 from brushloop.model.ccdbsm import DomainError
-from brushloop.model.fitted import FittedPress
 from brushloop.model.generator.config import ANCHOR_SHARE, INPUTS, Placement, Target
-from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.errors import SessionDamaged
 from brushloop.sessions.records import Condition
-from brushloop.sessions.terminal import Progress
-
-FOLDS = 5
-"""Number of folds: cells are left out by fifths, since a tuning takes a minute."""
-LEARNING_RATE = 2e-3
-IMAGES = 400
-"""Number of images of the fitted CCD-BSM added to the captures; drawn evenly from the generator's ranges."""
-HELD_OUT = 0.1
-"""Share of the captures that is not tuned on; used only for the training's curve."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,73 +68,18 @@ def align_captures(sessions: Sequence[OpenSession], generator: Path) -> AlignedP
     return aligned
 
 
-def write_captures(
-    aligned: AlignedPresses, out: Path, leave_out: Sequence[Condition] = (), fit: FittedPress | None = None
-) -> int:
-    """Write the file for `brushloop train tune`, without some cells; return the number of presses.
-
-    With a `fit` of the brush, images that it draws are added. Raises `CalibrationError` if fewer than two conditions
-    are left.
-    """
-    from brushloop.model.fitted import fitted_model
+def write_captures(aligned: AlignedPresses, out: Path) -> None:
+    """Write the file for `brushloop train tune`. Raises `CalibrationError` for fewer than two conditions."""
     from brushloop.model.generator.data import save_captures
 
-    target = aligned.target
-    chosen = [k for k, condition in enumerate(aligned.conditions) if condition not in leave_out]
-    inputs = np.array([(aligned.conditions[k].depth_mm, aligned.conditions[k].tilt_deg) for k in chosen])
-    images = np.array([aligned.images[k] for k in chosen])
-    if fit is not None:
-        drawn = target.draw(IMAGES, (0,))
-        images = np.concatenate([images, target.images(drawn, fitted_model(fit))])
-        inputs = np.concatenate([inputs, drawn])
-    conditions = len(np.unique(inputs, axis=0))
+    target, conditions = aligned.target, len(set(aligned.conditions))
     if conditions < 2:
         raise CalibrationError(str(out), f"{conditions} conditions are left, at least 2 are needed to tune on")
     out.parent.mkdir(parents=True, exist_ok=True)
-    columns = dict(zip(INPUTS, inputs.T.tolist(), strict=True))
-    save_captures(out, columns, images.astype(np.float32), target.px_mm, str(target.placement), aligned.source)
-    return len(chosen)
-
-
-def tuned_by_cell(
-    session: OpenSession,
-    folds: Sequence[tuple[Sequence[Condition], FittedPress | None]],
-    generator: Path,
-    steps: int,
-    work: Path,
-    progress: Progress,
-) -> dict[Condition, Path]:
-    """File of the generator tuned without each cell, by cell; empty for fewer than two cells.
-
-    `folds` are the cells that are left out together and the brush that was fitted without them, None for a session
-    without a fit. Raises what `load_generator` and training raise.
-    """
-    from brushloop.model.generator.data import TuningFiles
-    from brushloop.model.generator.train import run_training
-
-    digest = file_sha256(generator)
-    files: dict[Condition, Path] = {}
-    aligned: AlignedPresses | None = None
-    for number, (fold, fit) in enumerate(folds):
-        brush = () if fit is None else (fit.values, fit.edges, fit.ends)
-        inputs = session.sha256, session.calibration_digest, digest, steps, LEARNING_RATE, fold, IMAGES, *brush
-        folder = work / "tuned" / key_of("tune", *inputs)[:32]
-        path = folder / "generator.safetensors"
-        if not path.exists():
-            captures = folder / "captures.safetensors"
-            if not captures.exists():
-                aligned = aligned or align_captures([session], generator)
-                write_captures(aligned, captures, fold, fit)
-            what = f"{session.header.session_id}: generator tuned, cells left out by fifths"
-
-            def stepped(step: int, what: str = what, before: int = number * steps) -> None:
-                progress(what, before + step, len(folds) * steps)
-
-            tuning = TuningFiles(generator, captures)
-            settings = {"learning_rate": LEARNING_RATE, "validate_every": max(1, steps // 4), "picture_every": steps}
-            run_training(tuning.config(HELD_OUT, steps=steps, seed=0, **settings), folder, stepped, tuning)
-        files |= dict.fromkeys(fold, path)
-    return files
+    inputs = [(at.depth_mm, at.tilt_deg) for at in aligned.conditions]
+    columns = dict(zip(INPUTS, map(list, zip(*inputs, strict=True)), strict=True))
+    images = np.array(aligned.images, np.float32)
+    save_captures(out, columns, images, target.px_mm, str(target.placement), aligned.source)
 
 
 def _placed(prepared: Prepared, target: Target) -> Image:

@@ -73,8 +73,7 @@ def test_a_second_run_does_no_work_again(session: Path, tmp_path: Path, monkeypa
 
 
 def test_two_at_a_time_in_one_folder_are_refused(session: Path, tmp_path: Path) -> None:
-    (tmp_path / "work").mkdir()
-    with FileLock(tmp_path / "work" / "lock"):
+    with FileLock(tmp_path / ".lock"):
         ran = CliRunner().invoke(app, ["validate", str(session), "--out", str(tmp_path)])
     assert "another validation is writing there" in str(ran.exception)
 
