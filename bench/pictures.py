@@ -29,17 +29,16 @@ from textual.pilot import Pilot
 from bench.harness import ROOT
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import CollectAborted
+from brushloop.collect.operator import Prompt
 from brushloop.collect.start import engine_for
-from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Question, Target
-from brushloop.collect.teach.wizard import Wizard, watched
+from brushloop.collect.teach.day import Day, Target
+from brushloop.collect.teach.wizard import Wizard
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.start_screen import Paths, SessionBrowser, StartScreen
-from brushloop.collect.tui.teach_app import TeachApp
-from brushloop.collect.tui.teach_guide import ScreenGuide
+from brushloop.collect.tui.teach_app import ScreenGuide, TeachApp
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.drivers.sim.config import SimConfig, View
@@ -247,31 +246,31 @@ class _Person:
         self._number = 0
         self._held = 0
 
-    async def question(self) -> Question | None:
+    async def question(self) -> Prompt | None:
         """The next question; None once the day is over."""
         deadline = time.monotonic() + DAY_WAIT_S
         while time.monotonic() < deadline:
             await self._pilot.pause(0.2)
             if self._app.teaching.finished:
                 return None
-            question, prompt = self._app.teaching.guide.question, self._app.first_day.prompt
-            if question is not None and prompt is not None and prompt.number > self._number:
+            prompt = self._app.first_day.prompt
+            if prompt is not None and prompt.number > self._number:
                 self._number = prompt.number
                 await self._pilot.pause(0.5)
-                return question
+                return prompt
         raise TimeoutError(f"no question in {DAY_WAIT_S:g} s")
 
-    async def answer(self, question: Question) -> None:
+    async def answer(self, prompt: Prompt) -> None:
         """Answer it as somebody would who reads it for the first time."""
-        if question.target is not None:
-            await self._bring(question.target)
+        if (target := self._app.teaching.guide.target) is not None:
+            await self._bring(target)
             await self._pilot.press("enter")
-        elif question.kind in ("text", "number"):
-            for letter in self._typed(question.text.lower()):
+        elif prompt.read is not None:
+            for letter in self._typed(prompt.question.lower()):
                 await self._pilot.press(letter)
             await self._pilot.press("enter")
         else:
-            await self._pilot.press(self._chosen(question))
+            await self._pilot.press(self._chosen(prompt))
 
     async def _bring(self, target: Target) -> None:
         index = self._held if target.kind == "hold-board" else target.index
@@ -296,36 +295,34 @@ class _Person:
         }
         return next((answer for part, answer in answers.items() if part in words), "")
 
-    def _chosen(self, question: Question) -> str:
+    def _chosen(self, prompt: Prompt) -> str:
         """The key that lets the arm move, what fills the well, and yes to what is offered; otherwise no."""
-        if "moves by itself" in question.text:
+        if "moves by itself" in prompt.question:
             return "a"
-        if "well filled" in question.text:
+        if "well filled" in prompt.question:
             ink = self._lab.seen().ink
             return "n" if ink is None else "i" if ink[0] == "ink-station" else "p"
-        return "enter" if question.default else "y" if "Agreed?" in question.text else "n"
+        return "enter" if prompt.default else "y" if "Agreed?" in prompt.question else "n"
 
 
 async def _day(lab: UnknownLab, loop: asyncio.AbstractEventLoop) -> None:
     rig = Path("rig.toml")
 
     async def work(guide: ScreenGuide) -> Path | None:
-        day = Day(guide, rig, HostClock(), armed=True)
-        async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
-            return await Wizard(day).run()
+        return await Wizard(Day(guide, rig, HostClock(), armed=True)).run()
 
     app, taken = TeachApp(work, str(rig)), set[str]()
     async with app.run_test(size=DAY_SIZE) as pilot:
         person = _Person(app, pilot, lab, loop)
-        while (question := await person.question()) is not None:
-            if question.text.startswith("How to go on"):
+        while (prompt := await person.question()) is not None:
+            if prompt.question.startswith("How do you want to go on"):
                 raise RuntimeError("\n".join(app.teaching.guide.findings[-1].lines))
-            words = question.text.lower()
+            words = prompt.question.lower()
             for name in (name for part, name in PICTURES.items() if part in words and name not in taken):
                 taken.add(name)
                 _save(app, f"first-day-{name}", f"brushloop rig new, loopback rig: {name}")
-            sys.stdout.write(f"{question.text}\n")
-            await person.answer(question)
+            sys.stdout.write(f"{prompt.question}\n")
+            await person.answer(prompt)
     app.teaching.join()
 
 

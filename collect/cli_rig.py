@@ -13,7 +13,7 @@ import typer
 from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
-    from brushloop.collect.tui.teach_guide import ScreenGuide
+    from brushloop.collect.tui.teach_app import ScreenGuide
 
 app = typer.Typer(
     help="Teach a rig on its first day; show and check its rig.toml.",
@@ -57,16 +57,14 @@ def _teach(rig: Path, step: str | None, *, arm: bool) -> None:
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ConfigError("rig", "", "a rig is taught on a screen: run this command in a terminal")
 
-    async def watched_day(guide: ScreenGuide) -> Path | None:
+    async def work(guide: ScreenGuide) -> Path | None:
         from brushloop.collect.teach.day import Day
-        from brushloop.collect.teach.wizard import Wizard, watched
+        from brushloop.collect.teach.wizard import Wizard
 
-        day = Day(guide, rig, HostClock(), armed=arm)
-        async with watched(day, guide.see_pose, guide.see_picture, lambda: guide.looking):
-            wizard = Wizard(day)
-            return await (wizard.run() if step is None else wizard.again(step))
+        wizard = Wizard(Day(guide, rig, HostClock(), armed=arm))
+        return await (wizard.run() if step is None else wizard.again(step))
 
-    if (written := run_teaching(watched_day, str(rig))) is not None:
+    if (written := run_teaching(work, str(rig))) is not None:
         say(f"{written} is written, with how each value was obtained. Next: brushloop rig check {written}")
 
 

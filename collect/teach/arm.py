@@ -1,4 +1,4 @@
-"""Step 1: find the arm. Its address is asked for; all else is read: nothing is set, powered or moved."""
+"""Step 1: find the arm; and what every step reads of it. Its address is asked for: nothing is set, powered or moved."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.doctor import Finding
 from brushloop.collect.rig.report import Scrubber, numbers_only, transcript, write_archive
-from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.store import Notebook
-from brushloop.drivers.arcs.controller import LOOPBACK_CONTROL_BOX, MOVING_ALLOWED, Controller, six
+from brushloop.collect.teach.day import Asked, Day, Step, Target
+from brushloop.collect.teach.store import Notebook, touch_of
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, six
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
 from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire
 
-RTDE_PORT = 30010
+ARCS_PORT, RTDE_PORT = 30004, 30010
 NAMES = {
     "robot.host": "<host>",
     "aside.address": "<host>",
@@ -46,36 +45,30 @@ MOST_CHARACTERS = 100
 """Of a name that a cabinet reports; the notebook has no room for more than a few of these."""
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
-    """Where a controller listens."""
+def address_of(text: str) -> tuple[str, int]:
+    """Host and port from `HOST` or `HOST:PORT`. Raises ValueError, worded for the person who typed it."""
+    host, _, port = text.strip().partition(":")
+    if not host or any(c.isspace() for c in host):
+        raise ValueError(f"{text!r} is not an address like 192.0.2.7 or 192.0.2.7:{ARCS_PORT}")
+    port = port or str(ARCS_PORT)
+    if not (port.isdecimal() and len(port) <= 5 and 1 <= int(port) <= 65535):
+        raise ValueError(f"port {port!r} is not a number from 1 to 65535")
+    return host, int(port)
 
-    host: str
-    port: int = 30004
 
-    @classmethod
-    def of(cls, text: str) -> Address:
-        """From `HOST` or `HOST:PORT`. Raises ValueError."""
-        host, _, port = text.strip().partition(":")
-        if not host or any(c.isspace() for c in host):
-            raise ValueError(f"{text!r} is not an address like 192.0.2.7 or 192.0.2.7:30004")
-        port = port or "30004"
-        if not (port.isdecimal() and len(port) <= 5 and 1 <= int(port) <= 65535):
-            raise ValueError(f"port {port!r} is not a number from 1 to 65535")
-        return cls(host, int(port))
-
-    def __str__(self) -> str:
-        return f"{self.host}:{self.port}"
+ADDRESS = Asked(
+    "aside.address",
+    f"Address of the cabinet (pendant: Settings, Network), as 192.0.2.7 or 192.0.2.7:{ARCS_PORT}",
+    read=lambda line: "{}:{}".format(*address_of(line)),
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Cabinet:
     """What a cabinet reports about itself and its arm."""
 
-    framing: Framing
-    model: str
-    box: str
-    firmware: str
+    who: str
+    """Model, control box and software."""
     robot_mode: str
     safety_mode: str
     operational_mode: str
@@ -100,22 +93,17 @@ class ArmReader:
     async def _name(self, method: str) -> str:
         return str(await self._ask(method))[:MOST_CHARACTERS]
 
-    async def tool(self) -> tuple[float, ...]:
-        """Flange to tool as the cabinet has it: x, y, z in m, rx, ry, rz in rad."""
-        return tuple(six("getTcpOffset", await self._ask("RobotConfig.getTcpOffset")))
-
     async def flange(self) -> Pose:
         """Wait until the arm is held still, and return the pose of the flange in the base frame.
 
-        From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter. Raises
-        `DeviceTimeout` if the arm keeps moving.
+        Raises `DeviceTimeout` if the arm keeps moving.
         """
-        before = await self.flange_now()
+        before = await self._flange_now()
         try:
             async with asyncio.timeout(PATIENCE_S):
                 while True:
                     await asyncio.sleep(STILL_S)
-                    here = await self.flange_now()
+                    here = await self._flange_now()
                     moved_mm, turned_deg = distance(before, here)
                     if moved_mm < STILL_MM and turned_deg < STILL_DEG:
                         return here
@@ -125,22 +113,24 @@ class ArmReader:
                 DEVICE, "getTcpPose", f"the arm did not rest for {PATIENCE_S:g} s", remedy="Hold it still."
             ) from None
 
-    async def flange_now(self) -> Pose:
-        """Pose of the flange in the base frame, whether or not the arm rests."""
-        tool = await self.tool()
+    async def _flange_now(self) -> Pose:
+        """From the cabinet's tool pose, with its tool taken off again: whatever is set there does not matter."""
+        tool = six("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
         at = from_wire(six("getTcpPose", await self._ask("RobotState.getTcpPose")))
         turn = Rotation.from_quat(at.quaternion) * Rotation.from_euler("ZYX", tool[5:2:-1]).inv()
         x, y, z = np.array(at.position_mm) - turn.apply(1e3 * np.array(tool[:3]))
         qx, qy, qz, qw = (float(v) for v in turn.as_quat())
         return Pose(float(x), float(y), float(z), qx, qy, qz, qw)
 
-    async def cabinet(self, framing: Framing) -> Cabinet:
+    async def cabinet(self) -> Cabinet:
         """Everything that the cabinet reports about itself."""
         call = self._controller.connection.call
-        firmware = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
+        software = f"interface {await call('SystemInfo.getInterfaceVersionCode')}"
         with contextlib.suppress(RpcError):
-            firmware += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
-        tool, level = await self.tool(), await self._ask("RobotConfig.getCollisionLevel")
+            software += f", {await call('SystemInfo.getControlSoftwareFullVersion')}"
+        model, box = await self._name("RobotConfig.getRobotType"), await self._name("RobotConfig.getControlBoxType")
+        tool = six("getTcpOffset", await self._ask("RobotConfig.getTcpOffset"))
+        level = await self._ask("RobotConfig.getCollisionLevel")
         if type(level) is not int:
             raise ProtocolViolation(DEVICE, "getCollisionLevel", f"expected a whole number, got {level!r}")
         payload = await self._ask("RobotConfig.getPayload")
@@ -150,10 +140,7 @@ class ArmReader:
         except (TypeError, ValueError):
             raise ProtocolViolation(DEVICE, "getPayload", f"expected mass and centre, got {payload!r}") from None
         return Cabinet(
-            framing,
-            await self._name("RobotConfig.getRobotType"),
-            await self._name("RobotConfig.getControlBoxType"),
-            firmware[:MOST_CHARACTERS],
+            f"{model} ({box}), {software[:MOST_CHARACTERS]}",
             await self._name("RobotState.getRobotModeType"),
             await self._name("RobotState.getSafetyModeType"),
             await self._name("RobotManage.getOperationalMode"),
@@ -171,9 +158,9 @@ def tip_of(flange: Pose, offset_mm: Sequence[float]) -> tuple[float, float, floa
 
 
 @contextlib.asynccontextmanager
-async def reading(address: Address, framing: Framing) -> AsyncGenerator[ArmReader]:
+async def reading(host: str, port: int, framing: Framing) -> AsyncGenerator[ArmReader]:
     """Connect to a controller, yield a reader, and disconnect. Raises `WrongGeneration` and other `DeviceError`s."""
-    connection = RpcConnection(address.host, address.port, framing=framing)
+    connection = RpcConnection(host, port, framing=framing)
     controller = Controller(connection)
     try:
         await open_arcs(connection, AUBOPE_PORT)
@@ -187,18 +174,36 @@ async def reading(address: Address, framing: Framing) -> AsyncGenerator[ArmReade
 @contextlib.asynccontextmanager
 async def taught_arm(notebook: Notebook) -> AsyncGenerator[ArmReader]:
     """The arm that was taught, for reading only."""
-    address = Address(str(notebook.get("robot.host")), int(notebook.number("robot.port")))
-    async with reading(address, notebook.framing) as reader:
+    host, port = str(notebook.get("robot.host")), int(notebook.number("robot.port"))
+    async with reading(host, port, notebook.framing) as reader:
         yield reader
 
 
-async def find_framing(address: Address) -> Framing:
-    """The framing that the controller answers. Raises `WrongGeneration`, or the first framing's `DeviceError`."""
+async def touch(
+    day: Day, reader: ArmReader, target: Target, how: str, name: str, *, may_skip: bool = False
+) -> Pose | None:
+    """Ask for the tip to be brought to a thing, and note the flange's pose there; None if the person skips it.
+
+    A thing that was touched before is not asked for again.
+    """
+    if name in day.notebook.touches:
+        return day.notebook.touches[name].pose()
+    if not await day.brought(how, target, may_skip=may_skip):
+        return None
+    flange = await reader.flange()
+    day.save(day.notebook.with_touch(name, touch_of(flange)))
+    x, y, z = flange.position_mm
+    await day.say(f"{name}: the flange is at ({x:.2f}, {y:.2f}, {z:.2f}) mm")
+    return flange
+
+
+async def find_framing(host: str, port: int) -> tuple[Framing, Cabinet]:
+    """The framing that the controller answers, and what it reports. Raises the first framing's `DeviceError`."""
     first: DeviceError | None = None
     for framing in FRAMINGS:
         try:
-            async with reading(address, framing):
-                return framing
+            async with reading(host, port, framing) as reader:
+                return framing, await reader.cabinet()
         except ConnectionLost:
             raise
         except (DeviceTimeout, ProtocolViolation) as error:
@@ -207,7 +212,7 @@ async def find_framing(address: Address) -> Framing:
     raise first
 
 
-async def answers(host: str, port: int, within_s: float = 3.0) -> bool:
+async def answers(host: str, port: int, within_s: float = 5.0) -> bool:
     """Whether anything listens there."""
     try:
         async with asyncio.timeout(within_s):
@@ -227,22 +232,22 @@ class ArmStep(Step):
     title = "Find the arm"
     minutes = 3
     needs = ()
+    observes = (ADDRESS.field,)
 
     async def teach(self, day: Day) -> None:
-        """Ask for the address and read everything else. Raises `CannotTeach`, `DeviceError`."""
-        address = await self._address(day)
-        await day.working(f"asking {address} who it is")
-        framing = await find_framing(address)
-        async with reading(address, framing) as reader:
-            cabinet = await reader.cabinet(framing)
+        """Ask for the address and read everything else. Raises `DeviceError`."""
+        await day.values("arm", ADDRESS)
+        host, port = address_of(str(day.notebook.get(ADDRESS.field)))
+        await day.working(f"asking {host}:{port} who it is")
+        framing, cabinet = await find_framing(host, port)
+        tcp = [f"{v:.1f}" for v in cabinet.tcp_mm_deg]
         await day.say(
-            f"{address} answers in the {framing} framing: {cabinet.model} ({cabinet.box}), {cabinet.firmware}",
+            f"{host}:{port} answers in the {framing} framing: {cabinet.who}",
             f"robot mode {cabinet.robot_mode}, safety {cabinet.safety_mode}, mode switch {cabinet.operational_mode}",
-            f"tool set on the pendant: {_listed(cabinet.tcp_mm_deg[:3])} mm, turned by "
-            f"{_listed(cabinet.tcp_mm_deg[3:])} deg; payload {cabinet.payload_kg:g} kg; "
-            f"collision level {cabinet.collision_level}",
+            f"tool set on the pendant: {', '.join(tcp[:3])} mm, turned by {', '.join(tcp[3:])} deg; "
+            f"payload {cabinet.payload_kg:g} kg; collision level {cabinet.collision_level}",
         )
-        if doubt := doubtful_tool(cabinet):
+        if doubt := doubtful_tool(math.hypot(*cabinet.tcp_mm_deg[:3])):
             await day.say(doubt, tone="warning")
         if cabinet.safety_mode not in MOVING_ALLOWED:
             await day.say(
@@ -250,76 +255,31 @@ class ArmStep(Step):
                 "Look at the pendant; this program clears nothing.",
                 tone="warning",
             )
-        rtde = RTDE_PORT
-        if address.port != Address("").port:
-            question = f"Port that sends poses ({RTDE_PORT} on a cabinet; press Enter unless yours differs)"
-            text = await day.text(question, str(RTDE_PORT))
-            rtde = int(text) if text.isdecimal() and 0 < int(text) < 65536 else RTDE_PORT
-        pushed = await answers(address.host, rtde)
+        pushed, as_set = await answers(host, RTDE_PORT), "as set on the pendant"
         with day.together():
-            self._keep(day, address, cabinet, rtde if pushed else None)
-
-    async def _address(self, day: Day) -> Address:
-        question = "Address of the cabinet (pendant: Settings, Network), as 192.0.2.7 or 192.0.2.7:30004"
-        try:
-            address = Address.of(await day.text(question, str(day.notebook.get("aside.address") or "")))
-        except ValueError as error:
-            raise CannotTeach(f"{error}.", "Type the address that the pendant shows.") from None
-        day.keep("arm", "aside.address", str(address), "typed")
-        there = await answers(address.host, address.port)
-        if there == (address.port == AUBOPE_PORT) and await answers(address.host, AUBOPE_PORT):
-            raise CannotTeach(
-                f"{address.host} answers on port {AUBOPE_PORT}, where the older software AUBOPE (V4) listens, and not "
-                "where ARCS does:",
-                "it is not supported. Ask the maker for the upgrade to ARCS.",
-            )
-        if not there:
-            raise CannotTeach(
-                f"nothing answers at {address}.",
-                "Check the address on the pendant, the cable, and that this computer is in the same network; then try "
-                "again.",
-            )
-        return address
-
-    def _keep(self, day: Day, address: Address, cabinet: Cabinet, rtde: int | None) -> None:
-        as_set = "as set on the pendant"
-        day.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.model} ({cabinet.box}) answered, {cabinet.firmware}")
-        day.keep("arm", "robot.host", address.host, "typed, and answered")
-        day.keep("arm", "robot.port", address.port, "answered")
-        day.keep("arm", "robot.framing", cabinet.framing, "the first that the controller answered")
-        if rtde is not None:
-            day.keep("arm", "robot.rtde_port", rtde, "answered, and sends poses")
-        day.keep("arm", "robot.payload_kg", cabinet.payload_kg, as_set, "kg", known="not weighed")
-        day.keep("arm", "robot.payload_cog_mm", list(cabinet.payload_cog_mm), as_set, "mm", known="not measured")
-        if cabinet.collision_level:
-            day.keep("arm", "robot.collision_level", cabinet.collision_level, as_set)
-        day.keep("arm", "aside.pendant_tcp_mm", list(cabinet.tcp_mm_deg[:3]), as_set)
-        day.keep("arm", "aside.simulated", cabinet.box == LOOPBACK_CONTROL_BOX, "as the controller reports")
-
-    def summary(self, notebook: Notebook) -> str:
-        """The address."""
-        return f"{notebook.get('robot.host')}:{notebook.get('robot.port')}"
+            day.keep("arm", "robot.kind", "aubo-arcs", f"{cabinet.who} answered")
+            day.keep("arm", "robot.host", host, "typed, and answered")
+            day.keep("arm", "robot.port", port, "answered")
+            day.keep("arm", "robot.framing", framing, "the first that the controller answered")
+            if pushed:
+                day.keep("arm", "robot.rtde_port", RTDE_PORT, "answered, and sends poses")
+            day.keep("arm", "robot.payload_kg", cabinet.payload_kg, as_set, "kg", known="not weighed")
+            day.keep("arm", "robot.payload_cog_mm", list(cabinet.payload_cog_mm), as_set, "mm", known="not measured")
+            if cabinet.collision_level:
+                day.keep("arm", "robot.collision_level", cabinet.collision_level, as_set)
 
 
-def doubtful_tool(cabinet: Cabinet) -> str:
-    """What is wrong with the tool set on the pendant, and what it means; empty if it is plausible."""
-    length_mm = math.hypot(*cabinet.tcp_mm_deg[:3])
+def doubtful_tool(length_mm: float) -> str:
+    """What is wrong with the length of the tool set on the pendant; empty if it is plausible."""
     if length_mm > LONGEST_TOOL_MM and SHORTEST_TOOL_MM <= length_mm / 1e3 <= LONGEST_TOOL_MM:
-        wrong, meant_mm = "millimetres were typed where metres are taken", length_mm / 1e3
+        wrong = f"millimetres were typed where metres are taken, and {length_mm / 1e3:.0f} mm are meant"
     elif 0.0 < length_mm < 1.0:
-        wrong, meant_mm = "metres were typed where millimetres are taken", 1e3 * length_mm
+        wrong = f"metres were typed where millimetres are taken, and {1e3 * length_mm:.0f} mm are meant"
     elif length_mm > LONGEST_TOOL_MM:
-        return f"The pendant's tool is {length_mm:.0f} mm long: no brush is. It is measured in the third step"
+        wrong = "no brush is"
     else:
         return ""
-    return (
-        f"The pendant's tool is {length_mm:.3g} mm long: {wrong}, and {meant_mm:.0f} mm are meant. It is measured in "
-        "the third step and replaced"
-    )
-
-
-def _listed(values: tuple[float, ...]) -> str:
-    return ", ".join(f"{v:.1f}" for v in values)
+    return f"The pendant's tool is {length_mm:.3g} mm long: {wrong}. It is measured in the third step and replaced"
 
 
 async def write_first_report(path: Path, notebook: Notebook) -> None:
@@ -329,7 +289,7 @@ async def write_first_report(path: Path, notebook: Notebook) -> None:
     """
     scrubber = Scrubber({str(notebook.get(field) or ""): stands_for for field, stands_for in NAMES.items()})
     how = "" if (kind := notebook.values.get("robot.kind")) is None else kind.how
-    typed = str(notebook.get("aside.address") or "")
+    typed = str(notebook.get(ADDRESS.field) or "")
     known = {
         "framing": notebook.framing,
         "findings": [scrubber.value(Finding("robot", typed, answers=bool(how), notes=how).as_json())],
@@ -337,6 +297,5 @@ async def write_first_report(path: Path, notebook: Notebook) -> None:
         "taught": numbers_only(notebook.table("")),
         "touched": {name: touch.position_mm for name, touch in notebook.touches.items()},
     }
-    address = Address.of(typed) if typed else None
-    answers = "" if address is None else await transcript(address.host, address.port, notebook.framing, scrubber)
-    write_archive(path, known, {"arcs.jsonl": answers})
+    said = await transcript(*address_of(typed), notebook.framing, scrubber) if typed else ""
+    write_archive(path, known, {"arcs.jsonl": said})

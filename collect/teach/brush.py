@@ -14,8 +14,7 @@ from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
 from brushloop.collect.rig.config_devices import ForceConfig
 from brushloop.collect.rig.devices import make_force
-from brushloop.collect.teach.day import Asked, Day, Step
-from brushloop.collect.teach.guide import Question, Target
+from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.sheet_fit import corners_of
 from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import ForceSample
@@ -69,7 +68,16 @@ BRUSH = (
     Asked("brush.name", "Name of the brush, for the record", default="brush"),
     Asked("aside.ink", "What keeps the ink well filled?", choices=(NONE, STATION, PUMP)),
 )
-PORT = Asked("ink.device.port", "Its serial line, such as /dev/serial/by-id/usb-…")
+
+
+def _line_named(line: str) -> str:
+    """The serial line that was typed. Raises ValueError for none."""
+    if not line:
+        raise ValueError("no serial line was named; `ls -l /dev/serial/by-id /dev/tty*` lists what there is")
+    return line
+
+
+PORT = Asked("ink.device.port", "Its serial line, such as /dev/serial/by-id/usb-…", read=_line_named)
 DELIVERY = Asked(
     "ink.device.ml_per_revolution",
     "Delivery per revolution, by weighing ten of them",
@@ -95,10 +103,7 @@ class BrushStep(Step):
         kind = day.notebook.get("aside.ink")
         if kind != NONE.key and "ink.device.kind" not in day.notebook.values:
             await day.values("brush", PORT)
-            if not (port := str(day.notebook.get(PORT.field))):
-                day.save(day.notebook.without(PORT.field))
-                remedy = "Type its path; `ls -l /dev/serial/by-id /dev/tty*` lists what there is."
-                raise CannotTeach("no serial line was named.", remedy)
+            port = str(day.notebook.get(PORT.field))
             device: InkTable = InkStationConfig(kind="ink-station", port=port)
             if kind == PUMP.key:
                 await day.values("brush", DELIVERY)
@@ -125,15 +130,33 @@ class BrushStep(Step):
         finally:
             await device.close()
 
-    def summary(self, notebook: Notebook) -> str:
-        """R, L and the deepest press."""
-        radius, length, deepest = (notebook.number(f"brush.{name}_mm") for name in ("radius", "length", "max_depth"))
-        return f"R {radius:g}, L {length:g}, deepest press {deepest:g} mm"
 
-
-BUS = Asked("aside.bus", "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor")
 CHANNEL = "can0"
 """Channel of a gateway, unless one was typed."""
+
+
+def _addressed(bus: str) -> dict[str, str | int]:
+    """The fields of `[force]` for what was typed. Raises ValueError."""
+    if not bus:
+        return {}
+    host, colon, rest = bus.partition(":")
+    if not colon:
+        return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus}
+    port, _, channel = rest.partition("/")
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f"{bus!r} is no bus: type can0, or HOST:PORT/can0 of a gateway")
+    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or CHANNEL}
+    return {**at, "host": host, "port": int(port)}
+
+
+def _bus(line: str) -> str:
+    _addressed(line)
+    return line
+
+
+BUS = Asked(
+    "aside.bus", "CAN bus of the force sensor: can0, or HOST:PORT/can0 of a gateway; Enter: no sensor", read=_bus
+)
 REST_S = 1.0
 """How long the sensor is listened to with nothing touching."""
 WAIT_S = 8.0
@@ -157,15 +180,13 @@ class ForceStep(Step):
     title = "Force sensor"
     minutes = 3
     needs = ("sheet",)
-    observes = ("force.", "touch.", "aside.bus", "aside.force_noise_n")
+    observes = ("force.", "touch.", "aside.bus")
 
     async def teach(self, day: Day) -> None:
         """Find the sensor and have it pushed. Raises `CannotTeach`, `DeviceError`."""
         await day.values("force", BUS)
-        with day.touched_again_if_refused("aside.bus"):
-            fields = _addressed(str(day.notebook.get("aside.bus")))
         with day.together():
-            for field, value in fields.items():
+            for field, value in _addressed(str(day.notebook.get("aside.bus"))).items():
                 day.keep("force", f"force.{field}", value, "typed")
             if day.notebook.get("force.channel") == LOOPBACK_CHANNEL:
                 how = "simulated time may run faster than rounds arrive: allowed on the loopback rig's bus alone"
@@ -194,7 +215,7 @@ class ForceStep(Step):
                 "Push the tip of the brush gently up with a finger for a second, along the brush toward the flange, "
                 "then take the finger away."
             )
-            await day.ask(Question("bring", how, target=Target("push-sensor")))
+            await day.brought(how, Target("push-sensor"))
             await day.working("waiting for the end of the push")
             force_n = await self._push(samples)
         finally:
@@ -207,9 +228,7 @@ class ForceStep(Step):
                 "The sensor counts a push toward the flange as positive: it is mounted, or wired, the other way round "
                 "than usual. push_axis takes this into account; nothing has to be changed."
             )
-        with day.together():
-            day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
-            day.keep("force", "aside.force_noise_n", noise_n, f"{REST_S:g} s with nothing touching", "N")
+        day.keep("force", "touch.force.push_axis", axis, how, known="direction within 35 deg, sign certain")
 
     async def _push(self, samples: list[ForceSample]) -> NDArray[np.float64]:
         """Mean force of the strongest tenth of a second, once the push is over or has been waited for."""
@@ -235,27 +254,6 @@ class ForceStep(Step):
             "touch.points_mm": taught("force", points.tolist(), f"{INSET_MM:g} mm inside the sheet's corners"),
             "touch.lean_deg": taught("force", widest_deg, leans),
         }
-
-    def summary(self, notebook: Notebook) -> str:
-        """The bus and the axis."""
-        if not notebook.get("aside.bus"):
-            return "none"
-        sign = "+" if notebook.numbers("touch.force.push_axis")[2] > 0.0 else "-"
-        return f"{notebook.get('aside.bus')}, a push is along {sign}z"
-
-
-def _addressed(bus: str) -> dict[str, str | int]:
-    """The fields of `[force]` for what was typed. Raises `CannotTeach`."""
-    if not bus:
-        return {}
-    host, colon, rest = bus.partition(":")
-    if not colon:
-        return {"kind": "sri-m8123", "interface": "socketcan", "channel": bus}
-    port, _, channel = rest.partition("/")
-    if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise CannotTeach(f"{bus!r} is no bus.", "Type can0, or HOST:PORT/can0 of a gateway.")
-    at = {"kind": "sri-m8123", "interface": "socketcand", "channel": channel or CHANNEL}
-    return {**at, "host": host, "port": int(port)}
 
 
 def strongest(samples: list[ForceSample], over: int = 20) -> NDArray[np.float64]:

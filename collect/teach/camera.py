@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import itertools
 import time
 from collections.abc import AsyncGenerator, Sequence
 from pathlib import Path
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import (
     GOOD_VIEWS,
-    LensFile,
     distinct_views,
     fit_lens,
     guidance,
@@ -30,8 +28,7 @@ from brushloop.calibrate.files import read_gray
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.optics import gray
-from brushloop.collect.teach.day import Asked, Day, Step
-from brushloop.collect.teach.guide import Brought, Question, Target
+from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook
 from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
@@ -41,12 +38,12 @@ from brushloop.drivers.host import Clock
 Gray = NDArray[np.uint8]
 LATE_MS = 2500.0
 """Until the delay is measured, a picture counts as taken this long before it came: no useful camera is slower."""
-RATE_S = 2.0
-"""How long frames are counted."""
+RATE_S, LIVE_S = 2.0, 0.3
+"""How long frames are counted, and how often one is shown to a person who guides something."""
 TILE_PX, NUMBER_PX = (480, 360), 64
 """Width and height of one picture beside others, and the side of the square with its number."""
 VIEW = "aside.lens_view_"
-"""Beginning of the names of the photographs of the held board: their digests."""
+"""Beginning of the fields for the photographs of the held board: the names of their files."""
 MOST_VIEWS = 20
 HOLD = (
     "flat in the middle of the picture",
@@ -94,7 +91,7 @@ class CameraStep(Step):
     title = "Find the camera"
     minutes = 12
     needs = ("arm",)
-    observes = ("camera.", *PRINTED, "aside.sources", "aside.frame_rate_hz", "aside.lens_folder", VIEW)
+    observes = ("camera.", *PRINTED, "aside.sources", "aside.frame_rate_hz", VIEW)
 
     async def teach(self, day: Day) -> None:
         """Ask for source and print, measure the rest. Raises `CannotTeach`, `DeviceError`, `CalibrationError`."""
@@ -115,13 +112,12 @@ class CameraStep(Step):
         await day.say("The board: a print of `brushloop camera board`. Its name stands along its lower edge.")
         await day.values("camera", *PRINT)
         squares: list[float] = [int(day.notebook.number(f"aside.squares_{side}")) for side in ("across", "along")]
-        try:
-            with day.together():
-                day.keep("camera", "board.squares", squares, FROM_PRINT)
+        with day.asked_again_if_refused(*PRINTED), day.together():
+            day.keep("camera", "board.squares", squares, FROM_PRINT)
+            try:
                 board_of(day.notebook)
-        except ValueError as error:
-            day.save(day.notebook.without(*PRINTED))
-            raise CannotTeach(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
+            except ValueError as error:
+                raise CannotTeach(f"no such board: {error}".splitlines()[0] + ".", "Read the print again.") from None
 
     async def _source(self, day: Day) -> None:
         devices = sorted((p.name[5:] for p in Path("/dev").glob("video*") if p.name[5:].isdecimal()), key=int)
@@ -190,61 +186,27 @@ class CameraStep(Step):
 
     async def _lens(self, day: Day, camera: OpenCvCamera) -> None:
         """Fit the lens to photographs of the held board; nothing where the person skips the first ones."""
-        spec, folder = board_of(day.notebook), self._folder(day)
+        spec, folder = board_of(day.notebook), day.rig_path.with_name(f"{day.rig_path.stem}.lens")
+        folder.mkdir(exist_ok=True)
+        taken = [folder / str(name) for name in day.notebook.table(VIEW).values()]
         views = [
-            await asyncio.to_thread(find_board, read_gray(folder / name), spec, name)
-            for name in taken(day.notebook, folder)
+            await asyncio.to_thread(find_board, read_gray(path), spec, path.name) for path in taken if path.is_file()
         ]
         for index in range(MOST_VIEWS):
-            path = folder / f"{index:02d}.png"
-            if path.name in taken(day.notebook, folder):
+            if f"{VIEW}{index:02d}" in day.notebook.values:
                 continue
             if len(views) >= GOOD_VIEWS and not still_missing(views):
                 break
-            where = HOLD[index] if index < len(HOLD) else "where it is still missing"
-            if not await self._held(day, camera, path, where, views) and not views:
+            if not await self._held(day, camera, folder, index, views) and not views:
                 await day.say("Without a lens file, straight lines must look straight in the picture.", tone="warning")
                 return
             if views and (todo := still_missing(views)):
                 await day.say(*todo)
         await day.working("computing the lens")
-        digests = {name: digest(folder / name) for name in taken(day.notebook, folder)}
+        digests = {view.name: hashlib.sha256((folder / view.name).read_bytes()).hexdigest() for view in views}
         file = await asyncio.to_thread(fit_lens, views, describe(spec), digests, {})
         for warning in (*file.warnings, *file.guidance):
             await day.say(warning, tone="warning")
-        await self._keep_lens(day, file)
-
-    def _folder(self, day: Day) -> Path:
-        """Where the photographs of the lens are, so that a resumed session does not take them again."""
-        if "aside.lens_folder" not in day.notebook.values:
-            names = (f"{day.rig_path.stem}.lens-{number}" for number in itertools.count(1))
-            name = next(name for name in names if not (day.rig_path.parent / name).exists())
-            day.keep("camera", "aside.lens_folder", name, "photographs of the board held in hand")
-        folder = day.rig_path.parent / str(day.notebook.get("aside.lens_folder"))
-        folder.mkdir(exist_ok=True)
-        return folder
-
-    async def _held(self, day: Day, camera: OpenCvCamera, path: Path, where: str, views: list[BoardView]) -> bool:
-        """Take one photograph of the held board; False where the person skips it."""
-        how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
-        held_board = Target("hold-board", int(path.stem))
-        if await day.ask(Question("bring", how, target=held_board, may_skip=True)) is not Brought.DONE:
-            return False
-        await day.working("looking for the board in the picture")
-        picture = await still(camera, day.clock)
-        try:
-            view = await asyncio.to_thread(find_board, picture, board_of(day.notebook), path.name)
-        except CalibrationError as error:
-            if "mirrored" in error.what:
-                raise CannotTeach(f"{error.what}.", MIRRORED) from None
-            await day.say(f"not used: {error.what}", picture=picture, tone="warning")
-            return True
-        await asyncio.to_thread(cv2.imwrite, str(path), picture)
-        day.keep("camera", VIEW + path.stem, digest(path), "photograph of the board held in hand")
-        views.append(view)
-        return True
-
-    async def _keep_lens(self, day: Day, file: LensFile) -> None:
         path, reach = file.save(day.rig_path.parent), file.focal_reach_px
         how = f"fitted to {len(file.residuals_px)} photographs of the board held in {file.ways} ways"
         known = f"residual {file.rms_px:.2f} px"
@@ -252,20 +214,29 @@ class CameraStep(Step):
         day.keep("camera", "camera.lens_file", str(path.relative_to(day.rig_path.parent)), how, known=known)
         await day.say(f"Lens: residual {file.rms_px:.2f} px over {len(file.residuals_px)} photographs.")
 
-    def summary(self, notebook: Notebook) -> str:
-        """Source and rate."""
-        return f"{notebook.get('camera.source')}, {notebook.number('aside.frame_rate_hz'):.0f} frames/s"
-
-
-def taken(notebook: Notebook, folder: Path) -> list[str]:
-    """Names of the photographs of the held board that are still as they were taken, and were not taken back."""
-    named = {f"{number}.png": seen for number, seen in notebook.table(VIEW).items()}
-    return sorted(name for name, seen in named.items() if (folder / name).is_file() and digest(folder / name) == seen)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    async def _held(self, day: Day, camera: OpenCvCamera, folder: Path, index: int, views: list[BoardView]) -> bool:
+        """Take one photograph of the held board, so that a resumed session does not; False if the person skips it."""
+        where = HOLD[index] if index < len(HOLD) else "where it is still missing"
+        how = f"Cover the sheet, and hold the board before the camera, {where}, all of it sharp; keep still."
+        async with shown_live(day, camera):
+            if not await day.brought(how, Target("hold-board", index), may_skip=True):
+                return False
+        await day.working("looking for the board in the picture")
+        picture = await still(camera, day.clock)
+        coded = cv2.imencode(".png", picture)[1].tobytes()
+        # Named after its content: a photograph that is taken once more does not replace one that going back restores.
+        name = f"{hashlib.sha256(coded).hexdigest()[:16]}.png"
+        try:
+            view = await asyncio.to_thread(find_board, picture, board_of(day.notebook), name)
+        except CalibrationError as error:
+            if "mirrored" in error.what:
+                raise CannotTeach(f"{error.what}.", MIRRORED) from None
+            await day.say(f"not used: {error.what}", picture=picture, tone="warning")
+            return True
+        (folder / name).write_bytes(coded)
+        day.keep("camera", f"{VIEW}{index:02d}", name, "photograph of the board held in hand")
+        views.append(view)
+        return True
 
 
 def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:
@@ -310,6 +281,28 @@ async def taught_camera(notebook: Notebook, clock: Clock) -> AsyncGenerator[Open
 async def still(camera: OpenCvCamera, clock: Clock) -> Gray:
     """A gray picture that was taken after now, however late the camera is."""
     return gray((await camera.fresh(Stamp(clock.now_ns()))).image)
+
+
+@contextlib.asynccontextmanager
+async def shown_live(day: Day, camera: OpenCvCamera) -> AsyncGenerator[None]:
+    """Show what the camera sees until the block ends."""
+
+    async def look() -> None:
+        after = Stamp(0)
+        with contextlib.suppress(DeviceError):
+            while True:
+                frame = await camera.fresh(after)
+                after = Stamp(frame.exposed_after_ns + 1)
+                day.guide.see(gray(frame.image))
+                await asyncio.sleep(LIVE_S)
+
+    task = asyncio.create_task(look(), name="live picture")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        day.guide.see(None)
 
 
 async def frame_rate_hz(camera: OpenCvCamera) -> float:

@@ -1,4 +1,4 @@
-"""What every step works with: the person, the notebook, and what it may do."""
+"""What every step of the first day works with: the person, who is asked and shown things, the notebook, and motion."""
 
 from __future__ import annotations
 
@@ -7,18 +7,94 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from brushloop.collect.errors import CannotTeach, StepError
-from brushloop.collect.operator import Choice
+from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.rig.check import Check
-from brushloop.collect.teach.guide import Answer, Guide, Picture, Question, Shown, Tone
 from brushloop.collect.teach.store import Notebook, StepName, Taught, TaughtFile, Value, taught
 from brushloop.drivers.host import Clock
+from brushloop.sessions.disk import number
 
+Picture = NDArray[np.uint8]
+"""(h, w) gray or (h, w, 3) BGR."""
+TargetKind = Literal[
+    "pin",
+    "upright",
+    "board-corner",
+    "sheet-corner",
+    "well",
+    "well-rim",
+    "wash-pot",
+    "wash-rim",
+    "park",
+    "hold-board",
+    "push-sensor",
+    "clear-view",
+]
 ARM = Choice("a", "let it move: I look at the cell, my hand is at the emergency stop")
 STAY = Choice("x", "leave it where it is")
 YES, NO = Choice("y", "yes"), Choice("n", "no")
+THERE, SKIP = Choice("enter", "it is there"), Choice("k", "skip it")
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A physical thing that a person brings the tip to, or does something with."""
+
+    kind: TargetKind
+    index: int = 0
+    """Which one, from 0: direction of the pin, turn of the wrist of an upright brush, pose of a held board."""
+    corner: str = ""
+    """Which corner: `lower left`, `lower right`, `upper right` or `upper left`, as the print names it."""
+
+
+Tone = Literal["finding", "warning", "trouble", "progress"]
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Something for the person to read and look at."""
+
+    lines: tuple[str, ...]
+    picture: Picture | None = None
+    tone: Tone = "finding"
+    """After a warning the step can go on; trouble ends it, and its last line says what to do. Progress describes the
+    current work and need not be kept."""
+
+
+class LeftOff(Exception):
+    """The person ended the session in the middle; everything taught so far is kept."""
+
+
+class WentBack(Exception):
+    """The person wants to go back one question: what was answered before this one is taken back, and asked again."""
+
+
+class Guide(Protocol):
+    """A person at the rig."""
+
+    async def begin(self, step: str) -> None:
+        """Show which step is taught now."""
+        ...
+
+    async def show(self, what: Shown) -> None:
+        """Show a finding."""
+        ...
+
+    def see(self, picture: Picture | None) -> None:
+        """Show what the camera sees now; None once it is not looked at any more."""
+        ...
+
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        """Wait for an answer that the prompt allows. Raises `WentBack` and `LeftOff`.
+
+        Where the person brings something to a `target`, the answer is whether it is there.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +116,35 @@ class Asked:
     """Compares the number with what is known already."""
     whole: bool = False
     """Whether it is a whole number."""
+    read: Callable[[str], str] = str
+    """Reads a text; raises ValueError, worded for the person, where it cannot be used."""
+
+    def prompt(self, notebook: Notebook) -> Prompt:
+        """The question, with what its empty line stands for."""
+        default = self.default if isinstance(self.default, str) else self.default(notebook)
+        if self.choices:
+            return choice_of(self.question, self.choices, default)
+        allowed = f"{self.low:g} to {self.high:g} {self.unit}" if self.high > self.low else ""
+        return Prompt(self.question, default=default, read=lambda line: self.value(line, notebook), allowed=allowed)
+
+    def value(self, line: str, notebook: Notebook) -> Value:
+        """What a line stands for. Raises ValueError, worded for the person, where it cannot be the value."""
+        if self.high <= self.low:
+            return self.read(line)
+        try:
+            value = number(line.replace(",", "."))
+        except ValueError:
+            raise ValueError(f"{line!r} is not a number") from None
+        if not self.low <= value <= self.high:
+            raise ValueError(f"{value:g} is outside {self.low:g} to {self.high:g} {self.unit}")
+        if self.check is not None and (check := self.check(notebook, value)).verdict == "contradicts":
+            raise ValueError(f"{value:g} {self.unit} cannot be ({check.allowed}). {check.remedy}")
+        return int(value) if self.whole else value
+
+
+def choice_of(question: str, choices: tuple[Choice, ...], default: str = "") -> Prompt:
+    """A question with answers on keys; Enter stands for the default, or for nothing if there is none."""
+    return Prompt(question, choices, default, answers={"enter": default} if default else {})
 
 
 class Day:
@@ -93,12 +198,12 @@ class Day:
         self.save(self.notebook)
 
     @contextlib.contextmanager
-    def touched_again_if_refused(self, *kinds: str) -> Generator[None]:
-        """Forget the touches of these kinds because they contradict each other; they are asked for again."""
+    def asked_again_if_refused(self, *names: str) -> Generator[None]:
+        """Forget values and touches of these names where they contradict each other; they are asked for again."""
         try:
             yield
         except (CannotTeach, StepError):
-            self.save(self.notebook.without(*kinds))
+            self.save(self.notebook.without(*names))
             raise
 
     # The person
@@ -111,14 +216,14 @@ class Day:
         """Show what is being done until the next finding or question."""
         await self.say(what, tone="progress")
 
-    async def ask(self, question: Question) -> Answer:
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
         """Ask, and let going back lead here.
 
         A step asks nothing that is in the notebook, so the notebook of now leads it to this question again; answers
         that were not kept are one with those before them.
         """
         notebook = self.notebook
-        answer = await self.guide.ask(question)
+        answer = await self.guide.ask(prompt, target)
         if not self._answered or self._answered[-1] is not notebook:
             self._answered.append(notebook)
         return answer
@@ -127,45 +232,34 @@ class Day:
         """Let going back lead to the notebook of now."""
         self._answered.append(self.notebook)
 
-    def back(self) -> bool:
-        """Restore the notebook of the last answered question, so that it is asked again; False if there is none."""
-        if not self._answered:
-            return False
-        self.save(self._answered.pop())
-        return True
+    def back(self) -> None:
+        """Restore the notebook of the last answered question, if there is one, so that it is asked again."""
+        if self._answered:
+            self.save(self._answered.pop())
 
     async def choose(self, question: str, choices: tuple[Choice, ...], default: str = "") -> str:
         """The key of one of the choices; `default` is taken for an empty answer, which is none if it is empty."""
-        return str(await self.ask(Question("choose", question, choices, default)))
+        return str(await self.ask(choice_of(question, choices, default)))
 
     async def yes(self, question: str) -> bool:
         """Ask for yes or no; Enter is neither."""
         return await self.choose(question, (YES, NO)) == YES.key
 
-    async def text(self, question: str, default: str = "") -> str:
-        """A line of text; `default` is taken for an empty answer."""
-        return str(await self.ask(Question("text", question, default=default))).strip()
+    async def brought(self, how: str, target: Target, *, may_skip: bool = False) -> bool:
+        """Ask the person to bring something somewhere; False if it is skipped, where it `may_skip`."""
+        answers = {THERE.key: True, SKIP.key: False} if may_skip else {THERE.key: True}
+        choices = (THERE, SKIP) if may_skip else (THERE,)
+        return bool(await self.ask(Prompt(how, choices, answers=answers), target))
 
     async def values(self, step: StepName, *values: Asked) -> None:
-        """Ask for each of these values that is not known yet, check it, and keep it. Raises `CannotTeach`."""
+        """Ask for each of these values that is not known yet, and keep it."""
         for asked in values:
             if asked.field in self.notebook.values:
                 continue
-            default = asked.default if isinstance(asked.default, str) else asked.default(self.notebook)
-            kind = "choose" if asked.choices else "number" if asked.high > asked.low else "text"
-            question = Question(
-                kind, asked.question, asked.choices, default, unit=asked.unit, low=asked.low, high=asked.high
-            )
-            answer = await self.ask(question)
-            how = asked.how
-            if isinstance(answer, float):
-                if asked.check is not None and (check := asked.check(self.notebook, answer)).verdict == "contradicts":
-                    raise CannotTeach(
-                        f"{asked.question}: {answer:g} {asked.unit} cannot be ({check.allowed}).", check.remedy
-                    )
-                how = "suggested, and agreed" if default and answer == float(default) else how
-            value = int(answer) if isinstance(answer, float) and asked.whole else answer
-            assert isinstance(value, int | float | str)
+            prompt = asked.prompt(self.notebook)
+            value = await self.ask(prompt)
+            agreed = isinstance(value, float) and prompt.default and value == float(prompt.default)
+            how = "suggested, and agreed" if agreed else asked.how
             self.keep(step, asked.field, value, how, asked.unit, sigma=asked.sigma)
 
     async def may_move(self, what: str) -> None:
@@ -195,7 +289,3 @@ class Step(ABC):
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """Values that follow from the notebook alone; computed again whenever a value they depend on changes."""
         return {}
-
-    @abstractmethod
-    def summary(self, notebook: Notebook) -> str:
-        """What was taught, in a few words."""

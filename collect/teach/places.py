@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -16,11 +17,9 @@ from brushloop.collect.planning.limit_check import ask_reach
 from brushloop.collect.rig.config import TRAVEL_CLEARANCE_MM, PaperConfig, RigConfig
 from brushloop.collect.rig.paper import to_base, to_paper
 from brushloop.collect.rig.show import draw_rig
-from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
-from brushloop.collect.teach.camera import side_by_side, still, taught_camera
-from brushloop.collect.teach.day import Asked, Day, Step
-from brushloop.collect.teach.guide import Target, TargetKind
-from brushloop.collect.teach.jog import hull, touch
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of, touch
+from brushloop.collect.teach.camera import shown_live, side_by_side, still, taught_camera
+from brushloop.collect.teach.day import Asked, Day, Step, Target, TargetKind
 from brushloop.collect.teach.sheet_fit import Point, corners_of
 from brushloop.collect.teach.store import Notebook, Taught, Value, rig_of, taught
 from brushloop.drivers.devices import Pose
@@ -44,6 +43,7 @@ MARGIN_MM = 25.0
 BELOW_MM = 2.0
 """Room below the deepest press and the dip, for a sheet that is found a little lower."""
 BOX = tuple(f"robot.limits.{axis}_mm" for axis in "xyz")
+AGREED = "aside.agreed_box"
 SPEEDS = (
     Asked("robot.limits.tilt_deg", "Widest lean of the brush", "deg", 1.0, 30.0, default="15"),
     Asked("robot.limits.speed_mm_s", "Highest speed of the tip in any motion", "mm/s", 1.0, 500.0, default="150"),
@@ -70,7 +70,7 @@ class PlacesStep(Step):
             await touch(day, reader, Target("well-rim"), "Bring the tip to the rim of the ink well.", "well-rim 0")
             how = "Bring the tip into the middle of the well, as deep as a dip should go: a few mm above its bottom."
             await touch(day, reader, Target("well"), how, "well 0")
-            with day.touched_again_if_refused("well-rim", "well"):
+            with day.asked_again_if_refused("well-rim", "well"):
                 found = check_pot(day.notebook, "well-rim 0", "well 0", "well")
             await day.say(found)
             await self._wipe(day, reader)
@@ -96,7 +96,7 @@ class PlacesStep(Step):
             how = "Bring the tip to the rim on the side where the drop shall be wiped off: the one away from the sheet."
             wipe = await touch(day, reader, Target("well-rim", 1), how, "well-rim 1", may_skip=True) is not None
         if wipe:
-            with day.touched_again_if_refused("well-rim 1"):
+            with day.asked_again_if_refused("well-rim 1"):
                 check_wipe(day.notebook)
         day.keep("places", "aside.wipe", wipe, "answered")
 
@@ -109,7 +109,7 @@ class PlacesStep(Step):
             await touch(day, reader, Target("wash-rim"), "Bring the tip to the rim of the pot of water.", "wash-rim 0")
             how = "Bring the tip into the middle of the pot of water, as deep as a wash should go."
             await touch(day, reader, Target("wash-pot"), how, "wash-pot 0")
-            with day.touched_again_if_refused("wash-rim", "wash-pot"):
+            with day.asked_again_if_refused("wash-rim", "wash-pot"):
                 check_pot(day.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
         day.keep("places", "aside.wash", wash, "answered")
 
@@ -118,9 +118,10 @@ class PlacesStep(Step):
         if VIEW[target.kind] not in day.notebook.values:
             with day.together():
                 day.save(day.notebook.without(target.kind))
-                await touch(day, reader, target, how, f"{target.kind} 0")
-                await day.working("waiting for a picture without the arm")
                 async with taught_camera(day.notebook, day.clock) as camera:
+                    async with shown_live(day, camera):
+                        await touch(day, reader, target, how, f"{target.kind} 0")
+                    await day.working("waiting for a picture without the arm")
                     picture = thumbnail(await still(camera, day.clock))
                 day.keep("places", VIEW[target.kind], text_of(picture), "a small picture, as PNG in base64")
 
@@ -150,8 +151,6 @@ class PlacesStep(Step):
         """Places in the sheet's frame, and the travel height."""
         paper, places = paper_of(notebook), tips(notebook)
         x, y, dip_z_mm = places["well 0"]
-        rim_x, rim_y, _ = places["well-rim 0"]
-        rim_z_mm = max(z for name, (_, _, z) in places.items() if name.startswith("well-rim "))
         highest_rim_mm = max(z for name, (_, _, z) in places.items() if name.split(" ")[0] in ("well-rim", "wash-rim"))
         safe_mm = max(max(sheet_heights(notebook)) + TRAVEL_MM, highest_rim_mm + RIM_CLEAR_MM)
         park_x, park_y, park_z = places["park 0"]
@@ -165,8 +164,6 @@ class PlacesStep(Step):
         values = {
             "ink.well_mm": at(list(to_paper(paper, x, y))),
             "ink.dip_z_mm": at(dip_z_mm),
-            "aside.well_radius_mm": at(math.dist((x, y), (rim_x, rim_y))),
-            "aside.rim_z_mm": at(rim_z_mm),
             "motion.safe_z_mm": at(safe_mm, travel, "a stated clearance"),
             "motion.park_mm": at([park_x, park_y, max(park_z, safe_mm)], by_hand + lifted),
         }
@@ -180,12 +177,6 @@ class PlacesStep(Step):
             values["ink.wash.pot_mm"] = at(list(to_paper(paper, wash_x, wash_y)))
             values["ink.wash.dip_z_mm"] = at(wash_z)
         return values
-
-    def summary(self, notebook: Notebook) -> str:
-        """Well and park."""
-        x, y = notebook.numbers("ink.well_mm")
-        px, py, pz = notebook.numbers("motion.park_mm")
-        return f"well ({x:.0f}, {y:.0f}) mm on the sheet's axes, park ({px:.0f}, {py:.0f}, {pz:.0f}) mm"
 
 
 def tips(notebook: Notebook) -> dict[str, Point]:
@@ -272,7 +263,7 @@ class LimitsStep(Step):
     title = "Limits"
     minutes = 3
     needs = ("tip", "sheet", "places", "brush")
-    observes = ("aside.agreed_", *(asked.field for asked in SPEEDS))
+    observes = (AGREED, *(asked.field for asked in SPEEDS))
 
     async def teach(self, day: Day) -> None:
         """Show the box, have each limit confirmed, and ask the controller whether the arm reaches every corner."""
@@ -284,16 +275,16 @@ class LimitsStep(Step):
             f"{picture} shows box, sheet, board, well and park from above.",
             picture=await asyncio.to_thread(read_gray, picture),
         )
-        for axis, field in zip("xyz", BOX, strict=True):
-            box = self.derived(day.notebook)[field]
-            if day.notebook.get(f"aside.agreed_{axis}") == str(box.value):
-                continue
-            if not await day.yes(f"The box along base {axis}: {box.value} {box.unit} ({box.how}; {field}). Agreed?"):
+        box = "; ".join(
+            f"{field} {value.value} {value.unit}: {value.how}" for field, value in _box(day.notebook).items()
+        )
+        if day.notebook.get(AGREED) != box:
+            if not await day.yes(f"The box of the tip in the base frame. {box}. Agreed?"):
                 raise CannotTeach(
-                    f"{field} was not agreed.",
+                    "the box was not agreed.",
                     "Teach the place again that makes the box too large: `brushloop rig teach`.",
                 )
-            day.keep("limits", f"aside.agreed_{axis}", str(box.value), "agreed")
+            day.keep("limits", AGREED, box, "agreed")
         await day.values("limits", *SPEEDS)
         rig = rig_of(day.notebook.with_values(self.derived(day.notebook)), day.rig_path)
         try:
@@ -307,21 +298,32 @@ class LimitsStep(Step):
 
     def derived(self, notebook: Notebook) -> dict[str, Taught]:
         """The box around what was taught, and the defaults that were not taught otherwise."""
-        beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
-        floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
-        ranges = zip(BOX, hull(_within(notebook), MARGIN_MM), (beside, beside, floor), strict=True)
-        box = {field: taught("limits", list(range_mm), how, "mm") for field, range_mm, how in ranges}
         cautious = {
             asked.field: taught("limits", float(str(asked.default)), "cautious default", asked.unit)
             for asked in SPEEDS
             if asked.field not in notebook.values
         }
-        return box | cautious
+        return _box(notebook) | cautious
 
-    def summary(self, notebook: Notebook) -> str:
-        """The box."""
-        ranges = (notebook.numbers(field) for field in BOX)
-        return " x ".join(f"{low:.0f}..{high:.0f}" for low, high in ranges) + " mm"
+
+def _box(notebook: Notebook) -> dict[str, Taught]:
+    """The smallest box around everything that was taught."""
+    beside = f"the smallest around sheet, well, wipe, pot and park position, and {MARGIN_MM:g} mm beside and above"
+    floor = f"{BELOW_MM:g} mm below the deepest press and the dip; {MARGIN_MM:g} mm above travel and park"
+    ranges = zip(BOX, hull(_within(notebook), MARGIN_MM), (beside, beside, floor), strict=True)
+    return {field: taught("limits", list(range_mm), how, "mm") for field, range_mm, how in ranges}
+
+
+def hull(
+    points: Sequence[Point], margin_mm: float
+) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+    """Ranges of x, y and z around these points, widened by the margin in x and y, and upward in z; rounded outward."""
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    return (
+        (math.floor(low[0] - margin_mm), math.ceil(high[0] + margin_mm)),
+        (math.floor(low[1] - margin_mm), math.ceil(high[1] + margin_mm)),
+        (math.floor(10.0 * low[2]) / 10.0, math.ceil(high[2] + margin_mm)),
+    )
 
 
 def _within(notebook: Notebook) -> list[Point]:

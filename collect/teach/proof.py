@@ -17,8 +17,7 @@ from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.doctor import examine
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.guide import Question
-from brushloop.collect.teach.store import Notebook, rig_of, rig_text
+from brushloop.collect.teach.store import rig_of
 from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
@@ -74,12 +73,10 @@ class ProofStep(Step):
 
         Raises `ConfigError` before anything is connected if a pose would lie outside the limits.
         """
-        rig_path, protocol_path = folder / "rig.toml", folder / "protocol.toml"
-        rig_path.write_text(_with_lens_at(day), encoding="utf-8")
+        protocol_path = folder / "protocol.toml"
         protocol_path.write_text(protocol, encoding="utf-8")
-        opening = Opening.load(
-            folder / "sessions", rig_path, protocol_path, armed=True, dry_run_mm=ABOVE_MM if dry else None
-        )
+        above_mm = ABOVE_MM if dry else None
+        opening = Opening.load(folder / "sessions", day.rig_path, protocol_path, armed=True, dry_run_mm=above_mm)
         opening = replace(opening, rig=slowly(opening.rig))
         check_protocol(day.rig_path, protocol_path, opening.rig, opening.protocol)
         make = DryRunEngine if dry else Engine
@@ -114,8 +111,7 @@ class ProofStep(Step):
                 doing = now.step
                 await day.working(f"run: {doing}")
             if (asked := now.prompt) is not None:
-                question = Question("choose", asked.question, asked.choices, asked.default)
-                engine.answer(asked.number, str(await day.guide.ask(question)))
+                engine.answer(asked.number, str(await day.guide.ask(asked)))
             await asyncio.sleep(POLL_S)
 
     async def _keep(self, day: Day, proven: Proven) -> None:
@@ -146,13 +142,6 @@ class ProofStep(Step):
                 tone="warning",
             )
         await day.say("Lay a fresh sheet before the first session: this one has the marks of the proof.", "READY")
-
-    def summary(self, notebook: Notebook) -> str:
-        """Height and delay."""
-        return (
-            f"touch height {notebook.number('paper.touch_z_mm'):.2f} mm, camera delay "
-            f"{notebook.number('camera.latency_ms'):.0f} ms"
-        )
 
 
 def slowly(rig: RigConfig) -> RigConfig:
@@ -227,12 +216,3 @@ def folder_beside(rig_path: Path) -> Path:
             folder.mkdir()
             return folder
     raise AssertionError("unreachable")
-
-
-def _with_lens_at(day: Day) -> str:
-    """`rig.toml` for another folder: it names the lens file by its whole path."""
-    field, notebook = "camera.lens_file", day.notebook
-    if (lens := notebook.values.get(field)) is not None:
-        path = str((day.rig_path.parent / str(lens.value)).absolute())
-        notebook = notebook.with_values({field: lens.model_copy(update={"value": path})})
-    return rig_text(notebook, day.rig_path)

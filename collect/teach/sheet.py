@@ -12,11 +12,9 @@ from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import read_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of, touch
 from brushloop.collect.teach.camera import board_of, still, taught_camera
-from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.guide import Target, TargetKind
-from brushloop.collect.teach.jog import touch
+from brushloop.collect.teach.day import Day, Step, Target, TargetKind
 from brushloop.collect.teach.sheet_fit import (
     CORNERS,
     OFF_MM,
@@ -72,14 +70,14 @@ class SheetStep(Step):
                         target = Target(kind, number, corner)
                         await touch(day, reader, target, how, f"{kind} {number} {corner}", may_skip=True)
                     if kind == BOARD:
-                        with day.touched_again_if_refused(BOARD):
+                        with day.asked_again_if_refused(BOARD):
                             check_board(all_corners(day.notebook, BOARD), board_of(day.notebook))
-                with day.touched_again_if_refused(SHEET):
+                with day.asked_again_if_refused(SHEET):
                     fit = fitted(day.notebook)
                 await day.say(*in_words(fit))
                 if fit.origin_sigma_mm <= GOOD_MM:
                     break
-            with day.touched_again_if_refused(BOARD, SHEET):
+            with day.asked_again_if_refused(BOARD, SHEET):
                 if (sigma_mm := fitted(day.notebook).origin_sigma_mm) > WORST_MM:
                     raise CannotTeach(
                         f"the corner of the sheet is known to {sigma_mm:.2f} mm only.",
@@ -95,7 +93,7 @@ class SheetStep(Step):
             found = "not checked against the camera: the arm was in its way"
         else:
             await day.working("looking for the sheet's edges on the board")
-            with day.touched_again_if_refused(BOARD, SHEET, VIEW):
+            with day.asked_again_if_refused(BOARD, SHEET, VIEW):
                 found = await _compared(day)
         await day.say(f"The sheet: {found}.", tone="warning" if found.startswith("not") else "finding")
         day.keep("sheet", SEEN, found, "the edges of the sheet on the board, in one picture")
@@ -123,11 +121,6 @@ class SheetStep(Step):
                 "sheet", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=depth_mm, known=known
             ),
         }
-
-    def summary(self, notebook: Notebook) -> str:
-        """Origin and turn."""
-        x, y = notebook.numbers("paper.origin_mm")
-        return f"origin ({x:.1f}, {y:.1f}) mm, turned by {notebook.number('paper.yaw_deg'):.2f} deg"
 
 
 async def _compared(day: Day) -> str:

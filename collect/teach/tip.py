@@ -17,10 +17,8 @@ from scipy.spatial.transform import Rotation
 from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.rig.check import brush_square
-from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of
-from brushloop.collect.teach.day import Day, Step
-from brushloop.collect.teach.guide import Target
-from brushloop.collect.teach.jog import touch
+from brushloop.collect.teach.arm import ArmReader, taught_arm, tip_of, touch
+from brushloop.collect.teach.day import Day, Step, Target
 from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
@@ -248,7 +246,7 @@ class TipStep(Step):
             await touch(day, reader, Target("pin", index), how, f"pin {index}", may_skip=True)
         if await self._known(day):
             return
-        with day.touched_again_if_refused("pin"):
+        with day.asked_again_if_refused("pin"):
             fit = find_tip(list(day.notebook.touched("pin").values()))
             if fit.error_mm > WORST_MM:
                 raise CannotTeach(
@@ -288,7 +286,7 @@ class TipStep(Step):
         while not await self._direction_known(day):
             free = (n for n in range(MOST_UPRIGHTS) if f"upright {n}" not in day.notebook.touches)
             if (index := next(free, None)) is None:
-                with day.touched_again_if_refused("upright"):
+                with day.asked_again_if_refused("upright"):
                     raise CannotTeach(
                         f"after {MOST_UPRIGHTS} holds the direction of the brush is not known to {WORST_DEG:g} deg.",
                         "Hold the brush along a set square, not by eye; or skip the holds: it is then not measured.",
@@ -347,11 +345,6 @@ class TipStep(Step):
             known = f"leans by {axis.lean_deg:.2f} deg against the flange"
             turn = taught("tip", list(axis.rotation_deg), how, "deg", sigma=axis.sigma_deg, known=known)
         return {"robot.tcp_offset_mm": offset, "robot.tcp_rotation_deg": turn}
-
-    def summary(self, notebook: Notebook) -> str:
-        """The length."""
-        x, y, z = notebook.numbers("robot.tcp_offset_mm")
-        return f"({x:.2f}, {y:.2f}, {z:.2f}) mm from the flange"
 
 
 def measured_axis(notebook: Notebook) -> AxisFit | None:

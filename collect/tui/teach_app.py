@@ -1,7 +1,13 @@
-"""The app of the first day: shows findings, a picture, the pose and the question, and stops the arm by key."""
+"""The app of the first day: shows findings, a picture and the question, and stops the arm by key.
+
+The steps run and ask in a thread of their own, so that nothing they compute keeps a stop waiting on the screen.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import threading
 import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -15,14 +21,13 @@ from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Footer, Input
 
-from brushloop.collect.errors import CollectAborted, describe
+from brushloop.collect.errors import CollectAborted
 from brushloop.collect.headless import REFRESH_S, stop_signals
-from brushloop.collect.operator import Prompt
+from brushloop.collect.operator import Asker, Prompt
 from brushloop.collect.rig.optics import gray
-from brushloop.collect.teach.guide import LeftOff, Shown, StepState, WentBack
+from brushloop.collect.teach.day import LeftOff, Picture, Shown, Target, WentBack
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.question_screens import YES, AskScreen, question_content, yes_or_no
-from brushloop.collect.tui.teach_guide import ScreenGuide, Teaching
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
@@ -33,17 +38,130 @@ from brushloop.collect.tui.widgets import (
     Line,
     one_line,
     plain,
-    tip_text,
     trouble,
 )
-from brushloop.drivers.devices import Pose
 
-Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
 AT_WORK = yes_or_no("A step is running: stop it and leave?", "stop and leave", "go on")
-STOPPED = "Stopped. Look at the arm before you go on."
-DONE = "This is done."
+STOPPED = "stopped: look at the arm. The same command resumes from there"
+DONE = "This is done. q leaves."
 TYPING_STOP = "ctrl-c: software stop; red button: emergency stop; ctrl-q: leave, all is kept"
 TONES = {"finding": ("", ""), "warning": ("! ", "bold $text-warning"), "trouble": ("✗ ", "bold $text-error")}
+MOST_FINDINGS = 200
+"""Findings that can be scrolled back to."""
+
+
+class ScreenGuide:
+    """`Guide` for a screen, which reads its fields from another thread."""
+
+    def __init__(self) -> None:
+        self.asker = Asker(watched=True)
+        self.step = ""
+        self.findings: tuple[Shown, ...] = ()
+        self.picture: Picture | None = None
+        """The newest picture of a finding."""
+        self.live: Picture | None = None
+        """What the camera sees now, while somebody guides something by it."""
+        self.target: Target | None = None
+        """What is to be brought somewhere now."""
+        self.doing: tuple[str, float] = ("", time.monotonic())
+        """What is at work while nothing is asked, empty where no step has said so, and since when."""
+
+    async def begin(self, step: str) -> None:
+        """Show which step is taught now."""
+        self.step = step
+
+    async def show(self, what: Shown) -> None:
+        """Add a finding, and show its picture if it has one; progress is shown until there is something newer."""
+        if what.tone == "progress":
+            self.doing = " ".join(what.lines), time.monotonic()
+            return
+        self.findings = (*self.findings, what)[-MOST_FINDINGS:]
+        self.picture = self.picture if what.picture is None else what.picture
+
+    def see(self, picture: Picture | None) -> None:
+        """Show what the camera sees now."""
+        self.live = picture
+
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        """Wait for the answer."""
+        self.target = target
+        try:
+            return await self.asker.ask(prompt)
+        finally:
+            self.target, self.doing = None, ("", time.monotonic())
+
+
+Work = Callable[[ScreenGuide], Coroutine[Any, Any, Path | None]]
+
+
+class StopUnsure(Exception):
+    """The arm was asked to stop and was not seen at rest."""
+
+    exit_code = 4
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what} Use the emergency stop, the red button, if it moves.")
+
+
+class Teaching:
+    """The steps in a thread of their own."""
+
+    def __init__(self, work: Work) -> None:
+        self.guide = ScreenGuide()
+        self.error: BaseException | None = None
+        """What ended it."""
+        self.written: Path | None = None
+        """What the steps returned: the `rig.toml` that they wrote, if they did."""
+        self._work = work
+        self._stop_sent = False
+        self._started = threading.Event()
+        self._task: asyncio.Task[Path | None] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = threading.Thread(target=self._run, name="first day", daemon=True)
+
+    def start(self) -> None:
+        """Begin; returns once a stop can be carried out."""
+        self._thread.start()
+        self._started.wait()
+
+    @property
+    def finished(self) -> bool:
+        """Whether it is over."""
+        return self._started.is_set() and not self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Cancel what is under way: a driver stops its arm before it lets a cancelled move end. From any thread."""
+        if self._loop is not None and self._task is not None:
+            self._stop_sent = True
+            with contextlib.suppress(RuntimeError):  # the loop has just ended
+                self._loop.call_soon_threadsafe(self._task.cancel)
+
+    def join(self) -> Path | None:
+        """Wait for the end; return the `rig.toml` that was written, or raise what ended the steps."""
+        self._thread.join()
+        if self.error is not None:
+            raise self.error
+        return self.written
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._main())
+        except asyncio.CancelledError as stopped:
+            # The notes say whether the arm was seen at rest.
+            notes = getattr(stopped, "__notes__", [])
+            self.error = StopUnsure(" ".join(notes)) if notes else CollectAborted(STOPPED)
+        except CollectAborted as error:
+            # A run within the steps has its own word for the stop that it was sent.
+            self.error = CollectAborted(STOPPED) if self._stop_sent else error
+        except BaseException as error:
+            self.error = error
+        finally:
+            self._started.set()
+
+    async def _main(self) -> None:
+        self._loop, self._task = asyncio.get_running_loop(), asyncio.ensure_future(self._work(self.guide))
+        self._started.set()
+        self.written = await self._task
 
 
 class TeachScreen(Screen[None], inherit_bindings=False):
@@ -52,10 +170,6 @@ class TeachScreen(Screen[None], inherit_bindings=False):
     HELP = f"""
 Everything taught is kept; the same command resumes. Escape takes the answer or touch before the question back.
 Page up and down turn the pages of what was found.
-
-Jog: arrows move along base x and y, page up and down along z, 1 to 4 choose the size of a step. Every step is checked
-against the box that is known so far: 25 mm around all touched points and where your hand left the arm, and 5 mm below.
-The arm moves at 20 mm/s.
 
 {SOFTWARE_STOP} While you type, s is a letter and ctrl-c the stop.
 """
@@ -68,7 +182,6 @@ The arm moves at 20 mm/s.
     TeachScreen.-narrow #picture { display: none; }
     TeachScreen.-narrow.-picture #picture { display: block; width: 1fr; }
     TeachScreen.-narrow.-picture #found { display: none; }
-    TeachScreen #live { height: auto; padding: 0 1; background: $boost; text-wrap: nowrap; }
     TeachScreen #question-box { height: auto; max-height: 13; padding: 0 1; border: heavy $warning; display: none; }
     TeachScreen.-asking #question-box { display: block; }
     TeachScreen #note { height: 1; padding: 0 1; background: $panel; text-wrap: nowrap; }
@@ -78,7 +191,6 @@ The arm moves at 20 mm/s.
     BINDINGS: ClassVar[list[BindingType]] = [
         STOP,
         Binding("escape", "back", "Back"),
-        Binding("g", "app.go_on", "Go on from the last question"),
         Binding("q", "app.leave", "Leave, all is kept"),
         Binding("tab", "picture", "Picture", priority=True),
         HELP_KEY,
@@ -87,7 +199,7 @@ The arm moves at 20 mm/s.
     def __init__(self, guide: ScreenGuide, name: str, pictures: Pictures) -> None:
         super().__init__()
         self._title, self._found = Line("title"), Line("found-text")
-        self._live, self._asked, self._note = Line("live"), Line("question-text"), Line("note")
+        self._asked, self._note = Line("question-text"), Line("note")
         self._picture = pictures.make("picture")
         self._found_pane = VerticalScroll(id="found", can_focus=False)
         self._guide = guide
@@ -96,7 +208,7 @@ The arm moves at 20 mm/s.
         """The question on the screen; None while something is at work."""
         self._findings: tuple[Shown, ...] | None = None
         self._input = Input(id="answer", select_on_focus=False)
-        self._over = ""
+        self._over = False
         self._stop_sent = False
 
     def compose(self) -> ComposeResult:
@@ -106,7 +218,6 @@ The arm moves at 20 mm/s.
             with self._found_pane:
                 yield self._found
             yield self._picture
-        yield self._live
         with VerticalScroll(id="question-box", can_focus=False):
             yield self._asked
             yield self._input
@@ -131,21 +242,16 @@ The arm moves at 20 mm/s.
         """Whether there is a question to go back from."""
         return self.prompt is not None if action == "back" else super().check_action(action, parameters)
 
-    def follow(self, guide: ScreenGuide) -> None:
-        """Show another run of the steps."""
-        self._guide = guide
-
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed."""
         self._note.show(Content.styled(" STOP SENT ", "bold reverse"))
         self._stop_sent = True
 
-    def show(self, over: str = "") -> None:
-        """Draw what differs. `over` says how it ended, once it has."""
+    def show(self, *, over: bool) -> None:
+        """Draw what differs; `over`: the steps are done."""
         now, prompt = self._guide, self._guide.asker.prompt
-        self._title.show(f"First day   {one_line(self._name)}{_where(now.steps)}")
-        self._live.show("no pose: the arm is not read now" if now.tip is None else _tip_text(now.tip, now.tip_known))
-        picture = now.live if now.looking and now.live is not None else now.picture
+        self._title.show(f"First day   {one_line(self._name)}   {plain(now.step)}")
+        picture = now.picture if now.live is None else now.live
         self._picture.show(None if picture is None else gray(picture))
         new_findings, new_prompt = now.findings is not self._findings, prompt is not self.prompt
         if new_findings:
@@ -153,20 +259,20 @@ The arm moves at 20 mm/s.
             self._found.show(Content("\n").join(_finding(shown) for shown in now.findings))
         if new_prompt or over != self._over:
             self._over = over
-            self._ask(prompt, over)
+            self._ask(prompt)
         if new_findings or new_prompt:
             # Only after the layout is it known where the end is: the question takes its room from the findings.
             self.call_after_refresh(self._found_pane.scroll_end, animate=False)
         if prompt is None and not over and not self._stop_sent:
             self._note.show(_busy_text(*now.doing, self.size.width - 2))
 
-    def _ask(self, prompt: Prompt | None, over: str) -> None:
+    def _ask(self, prompt: Prompt | None) -> None:
         """Show a question, or that something is at work, or that it is over."""
         self.prompt, self._stop_sent = prompt, False
-        self.set_class(prompt is not None or bool(over), "-asking")
+        self.set_class(prompt is not None or self._over, "-asking")
         self.set_class(self.typing, "-typing")
-        self._asked.show(over if prompt is None else question_content(prompt))
-        self._note.show(TYPING_STOP if self.typing else "" if over else SHORT_STOP)
+        self._asked.show(DONE if prompt is None else question_content(prompt))
+        self._note.show(TYPING_STOP if self.typing else "" if self._over else SHORT_STOP)
         self._input.value = ""
         self._input.placeholder = f"Enter: {prompt.default}" if prompt is not None and prompt.default else ""
         self.set_focus(self._input if self.typing else None)
@@ -192,17 +298,9 @@ The arm moves at 20 mm/s.
             try:
                 answer = self.prompt.read(event.value.strip() or self.prompt.default)
             except ValueError as error:
-                self._note.show(trouble(error))
+                self._asked.show(Content("\n").join([question_content(self.prompt), trouble(error)]))
             else:
                 self._guide.asker.settle(self.prompt.number, answer)
-
-
-def _where(steps: tuple[StepState, ...]) -> str:
-    """Number, title and duration of the current step."""
-    for number, step in enumerate(steps, 1):
-        if step.state == "current":
-            return f"   step {number} of {len(steps)}: {plain(step.title)}, about {step.minutes} min"
-    return ""
 
 
 def _finding(shown: Shown) -> Content:
@@ -217,10 +315,6 @@ def _busy_text(doing: str, since_s: float, columns: int) -> str:
     return (what if len(what) <= room else f"{what[: room - 1]}…") + after
 
 
-def _tip_text(tip: Pose, known: bool) -> str:
-    return f"{'tip' if known else 'flange'}  {tip_text(tip.position_mm)}"
-
-
 class TeachApp(PlainApp):
     """Runs the steps, shows them, and carries the keys to them."""
 
@@ -228,11 +322,9 @@ class TeachApp(PlainApp):
 
     def __init__(self, work: Work, name: str, pictures: Pictures | None = None) -> None:
         super().__init__()
-        self._work = work
         self.teaching = Teaching(work)
         self.first_day = TeachScreen(self.teaching.guide, name, pictures or Pictures())
-        self._ending = False
-        self._signalled = False
+        self._leaving = False
 
     def on_mount(self) -> None:
         """Start the steps; then look ten times a second."""
@@ -252,8 +344,6 @@ class TeachApp(PlainApp):
                 return not self.teaching.finished and not self.first_day.typing
             case "leave" | "help":
                 return not self.first_day.typing
-            case "go_on":
-                return self.teaching.finished and self.teaching.stopped and self.teaching.error is None
             case _:
                 return super().check_action(action, parameters)
 
@@ -274,36 +364,25 @@ class TeachApp(PlainApp):
         if self.teaching.finished:
             self.exit()
         elif self.first_day.prompt is not None:
-            self._ending = True
+            self._leaving = True
             self.teaching.guide.asker.abandon(LeftOff)
         else:
-            self.push_screen(AskScreen(AT_WORK), lambda key: self._stop_and_leave() if key == YES else None)
+            self.push_screen(AskScreen(AT_WORK), lambda key: self.stop_and_leave() if key == YES else None)
 
-    def _stop_and_leave(self) -> None:
-        self._ending = True
-        self.action_stop()
-
-    def action_go_on(self) -> None:
-        """After a stop, start the steps again; what the notebook already holds is not asked again."""
-        self.teaching = Teaching(self._work, self.teaching.guide.findings)
-        self.first_day.follow(self.teaching.guide)
-        self.teaching.start()
-
-    def leave_soon(self) -> None:
-        """End the app, from any thread: a signal came."""
-        self._signalled = True
+    def stop_and_leave(self) -> None:
+        """Stop whatever is under way, and end the app once it has stopped. From any thread."""
+        self._leaving = True
+        self.teaching.stop()
 
     def _poll(self) -> None:
+        """Draw; a step that was stopped or failed ends the app, and is reported in the terminal."""
         if not self.is_running or not self.first_day.is_mounted:
             return
-        over = ""
-        if self.teaching.finished:
-            error = self.teaching.error
-            if self._signalled or isinstance(error, CollectAborted) or (self._ending and error is None):
-                self.exit()
-                return
-            over = describe(error) if error is not None else STOPPED if self.teaching.stopped else DONE
-        self.first_day.show(over)
+        over = self.teaching.finished
+        if over and (self._leaving or self.teaching.error is not None):
+            self.exit()
+        else:
+            self.first_day.show(over=over)
 
 
 def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Path | None:
@@ -312,18 +391,10 @@ def run_teaching(work: Work, name: str, pictures: Pictures | None = None) -> Pat
     However the screen ends, nobody watches the arm from here on: whatever moves it is stopped.
     """
     app = TeachApp(work, name, pictures)
-
-    def on_signal(_: int) -> None:
-        app.teaching.stop()
-        app.leave_soon()
-
-    with stop_signals(on_signal):
+    with stop_signals(lambda _: app.stop_and_leave()):
         try:
             app.run()
         finally:
             if not app.teaching.finished:
                 app.teaching.stop()
-    app.teaching.join()
-    if app.teaching.stopped:
-        raise CollectAborted("stopped; the same command resumes from there")
-    return app.teaching.written
+    return app.teaching.join()

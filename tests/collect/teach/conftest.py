@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Answer, LeftOff, Question, Shown, StepState
+from brushloop.collect.operator import Prompt
+from brushloop.collect.teach.day import Day, LeftOff, Picture, Shown, Target
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
@@ -22,14 +23,17 @@ class Person:
         self.asked: list[str] = []
         self.said: list[str] = []
 
-    async def overview(self, steps: tuple[StepState, ...]) -> None:
+    async def begin(self, step: str) -> None:
         pass
 
     async def show(self, what: Shown) -> None:
         self.said += what.lines
 
-    async def ask(self, question: Question) -> Answer:
-        self.asked.append(question.text)
+    def see(self, picture: Picture | None) -> None:
+        pass
+
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        self.asked.append(prompt.question)
         raise LeftOff
 
 
@@ -46,11 +50,10 @@ def day_of(
     folder: Path,
     port: int = 9,
     *,
-    armed: bool = False,
     tip_mm: tuple[float, float, float] = (0.0, 0.0, 180.0),
 ) -> Day:
     """A day on which the arm and its tip are known."""
-    day = Day(person, folder / "rig.toml", HostClock(), armed=armed)
+    day = Day(person, folder / "rig.toml", HostClock(), armed=False)
     for name, value in (("host", "127.0.0.1"), ("port", port), ("framing", "sof")):
         day.keep("arm", f"robot.{name}", value, "typed")
     day.keep("tip", "robot.tcp_offset_mm", list(tip_mm), "typed", "mm")

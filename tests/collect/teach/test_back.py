@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.teach.brush import BrushStep, ForceStep
+from brushloop.collect.operator import Prompt
+from brushloop.collect.teach.arm import ADDRESS
+from brushloop.collect.teach.brush import BRUSH, BUS, PORT, BrushStep, ForceStep
 from brushloop.collect.teach.camera import CameraStep
-from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Answer, LeftOff, Question, WentBack
+from brushloop.collect.teach.day import Asked, Day, LeftOff, Target, WentBack
 from brushloop.collect.teach.store import Notebook, TaughtFile, taught
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.errors import DeviceTimeout
@@ -18,9 +20,9 @@ from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.station import InkStationConfig
 from tests.collect.teach.conftest import Person, day_of
 
-BACK, HOW, GIVE, PORT = "<", "How do you want to go on?", "Give 0.5 ml", "Its serial line"
+BACK, HOW, GIVE, LINE = "<", "How do you want to go on?", "Give 0.5 ml", "Its serial line"
 R, L, DEEPEST, NAME = "R", "L", "Deepest press that this brush can take", "Name of the brush"
-WELL, INK, BUS = "What keeps the ink well filled?", "Name of the ink", "CAN bus of the force sensor"
+WELL, INK, CAN = "What keeps the ink well filled?", "Name of the ink", "CAN bus of the force sensor"
 
 
 class Typing(Person):
@@ -30,15 +32,14 @@ class Typing(Person):
         super().__init__()
         self.answers = list(answers)
 
-    async def ask(self, question: Question) -> Answer:
-        self.asked.append(question.text.split(":")[0].split(",")[0])
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        self.asked.append(prompt.question.split(":")[0].split(",")[0])
         if not self.answers:
             raise LeftOff
         if (answer := self.answers.pop(0)) == BACK:
             raise WentBack
-        answer = answer or question.default
-        assert question.kind != "choose" or answer in {choice.key for choice in question.choices}, question
-        return float(answer) if question.kind == "number" else answer
+        answer = answer or prompt.default
+        return prompt.answer_to(answer) if prompt.read is None else prompt.read(answer)
 
 
 async def led(person: Typing, folder: Path) -> Day:
@@ -52,11 +53,14 @@ async def led(person: Typing, folder: Path) -> Day:
 
 
 class Station:
-    """An ink station that counts its doses."""
+    """An ink station that counts its doses, once its cable is plugged in."""
 
     doses = 0
+    plugged = True
 
     async def connect(self) -> object:
+        if not Station.plugged:
+            raise DeviceTimeout("ink", "connect", "no reply")
         return type("Identity", (), {"model": "station", "firmware": "1"})
 
     async def level(self) -> None:
@@ -75,20 +79,14 @@ class Station:
         (("6", "48", BACK, "47", "20", "", BACK, "wolf"), [R, L, DEEPEST, L, DEEPEST, NAME, WELL, NAME, WELL]),
         (
             ("6", "48", "20", "", "n", "", *[BACK] * 6),
-            [R, L, DEEPEST, NAME, WELL, INK, BUS, INK, WELL, NAME, DEEPEST, L, R],
-        ),
-        (("6", "190", BACK, "47"), [R, L, HOW, L, DEEPEST]),
-        (
-            ("6", "48", "20", "", "n", "", "no:bus", "b", BACK, "no:bus", "b", "5"),
-            [R, L, DEEPEST, NAME, WELL, INK, BUS, HOW, R, BUS, HOW, R, L],
+            [R, L, DEEPEST, NAME, WELL, INK, CAN, INK, WELL, NAME, DEEPEST, L, R],
         ),
         (
             ("6", "48", "20", "", "i", "/dev/ttyUSB0", "y", "y", "n", BACK),
-            [R, L, DEEPEST, NAME, WELL, PORT, GIVE, GIVE, GIVE, INK, GIVE],
+            [R, L, DEEPEST, NAME, WELL, LINE, GIVE, GIVE, GIVE, INK, GIVE],
         ),
-        (("6", "48", "20", "", "i", ""), [R, L, DEEPEST, NAME, WELL, PORT, HOW]),
     ],
-    ids=["one question", "into the step before", "after a refusal", "a step begun afresh", "no dose again", "no line"],
+    ids=["one question", "into the step before", "no dose again"],
 )
 async def test_back_asks_the_question_before_and_no_other(
     answers: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -103,10 +101,51 @@ async def test_back_asks_the_question_before_and_no_other(
         assert not any(field.startswith("brush.") for field in day.notebook.values)
 
 
-async def test_a_value_that_cannot_be_is_refused_with_its_range(tmp_path: Path) -> None:
-    person = Typing("6", "190")
+@pytest.mark.parametrize(
+    ("after", "asked"),
+    [
+        (("a", "n"), [GIVE, INK]),
+        ((BACK, "/dev/ttyUSB1", "n"), [LINE, GIVE, INK]),
+        (("f", "5"), [R, L]),
+        (("f", BACK, "n"), [R, GIVE, INK]),
+    ],
+    ids=["again", "the question before", "the step afresh", "not afresh after all"],
+)
+async def test_a_step_that_was_refused_goes_on_where_the_person_wants(
+    after: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Plugging(Typing):
+        async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+            if prompt.question == HOW:
+                monkeypatch.setattr(Station, "plugged", True)
+            return await super().ask(prompt, target)
+
+    monkeypatch.setattr(InkStationConfig, "device", lambda *_: Station())
+    monkeypatch.setattr(Station, "plugged", False)
+    person = Plugging("6", "48", "20", "", "i", "/dev/ttyUSB0", *after)
     await led(person, tmp_path)
-    assert any("190 mm cannot be (5 to 180 mm)" in line for line in person.said)
+    assert person.asked == [R, L, DEEPEST, NAME, WELL, LINE, HOW, *asked]
+
+
+@pytest.mark.parametrize(
+    ("asked", "line", "said"),
+    [
+        (BRUSH[1], "190", r"190 mm cannot be \(5 to 180 mm\)"),
+        (BRUSH[1], "nan", "is not a number"),
+        (BRUSH[0], "0,1", r"0\.1 is outside 0\.5 to 50 mm"),
+        (PORT, "", "no serial line was named"),
+        (BUS, "no:bus", "'no:bus' is no bus"),
+        *(
+            (ADDRESS, f"192.0.2.7:{port}", "is not a number from 1 to 65535")
+            for port in ("x", "0", "65536", "9" * 5000)
+        ),
+    ],
+)
+def test_a_line_that_cannot_be_the_value_is_refused_where_it_is_typed(
+    asked: Asked, line: str, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        asked.value(line, day_of(Person(), tmp_path).notebook)
 
 
 async def test_a_step_that_is_taught_again_by_mistake_is_as_it_was_after_back(tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.rig.doctor import Finding
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.teach import camera, proof
-from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Brought, Target
+from brushloop.collect.teach.day import Day, Target
 from brushloop.collect.teach.proof import ProofStep, Proven, read_proof
 from brushloop.collect.teach.store import Notebook, TaughtFile
 from brushloop.collect.teach.wizard import Wizard
@@ -34,7 +33,7 @@ NAMED = {
     Trap.WRONG_BOARD_SIZE: r"% of its printed size.*Print it again at 100 %",
     Trap.PARK_IN_PICTURE: r"in one of the two pictures.*Park it farther",
     Trap.SHEET_OUT_OF_REACH: r"nearer to",
-    Trap.OLD_SOFTWARE: r"older software AUBOPE.*upgrade to ARCS",
+    Trap.OLD_SOFTWARE: r"runs AUBOPE.*ask the maker for the upgrade",
     Trap.CABLE_PULLED: r"Check power, cable and address",
 }
 """Traps that end a step: what is said. The others are said in passing, and the first day goes on."""
@@ -79,8 +78,8 @@ def hurried(person: InLab) -> InLab:
     """A person who leaves the lens out."""
     bring = person.bring
 
-    async def without_lens(target: Target) -> Brought:
-        return Brought.SKIP if target.kind == "hold-board" else await bring(target)
+    async def without_lens(target: Target) -> bool:
+        return target.kind != "hold-board" and await bring(target)
 
     person.bring = without_lens
     return person

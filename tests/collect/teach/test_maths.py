@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import CannotTeach
-from brushloop.collect.teach.jog import hull
+from brushloop.collect.teach.places import hull
 from brushloop.collect.teach.sheet_fit import CORNERS, Point, check_board, corners_of, fit_sheet
 from brushloop.collect.teach.tip import AxisFit, elsewhere, find_axis, find_tip
 from brushloop.drivers.devices import Pose

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from brushloop.collect.errors import CannotTeach
+from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Thumbnail
-from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Answer, Question
+from brushloop.collect.teach.day import Day, Target
 from brushloop.collect.teach.places import VIEW, PlacesStep, check_pot, check_wipe, text_of
 from brushloop.collect.teach.store import Notebook, taught, touch_of
 from brushloop.drivers.geometry import brush_pose
@@ -122,8 +123,8 @@ async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(server: ArcsServ
     defaults: list[str] = []
 
     class Declining(Person):
-        async def ask(self, question: Question) -> Answer:
-            defaults.append(question.default)
+        async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+            defaults.append(prompt.default)
             return "n"
 
     day = ready(server.port, tmp_path, AWAY_MM, picture(arm=False), picture(arm=False), Declining())

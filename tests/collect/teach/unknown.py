@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from brushloop.collect.errors import CollectAborted
-from brushloop.collect.operator import Choice
+from brushloop.collect.operator import Prompt
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import to_base
-from brushloop.collect.teach.day import Day
-from brushloop.collect.teach.guide import Answer, Brought, LeftOff, Question, Shown, StepState, Target
+from brushloop.collect.teach.day import Day, LeftOff, Picture, Shown, Target
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.lab import Seen, UnknownLab
@@ -43,75 +42,62 @@ class InLab:
     mends: bool = False
     """Whether the person sees to what the wizard names, and goes on."""
 
-    async def overview(self, steps: tuple[StepState, ...]) -> None:
-        self.lines.append(f"steps: {' '.join(f'{step.name}:{step.state}' for step in steps)}")
+    async def begin(self, step: str) -> None:
+        self.lines.append(step)
 
     async def show(self, what: Shown) -> None:
         self.lines += [f"{what.tone}: {line}" for line in what.lines]
 
-    async def ask(self, question: Question) -> Answer:
-        if question.target is not None:
-            return await self.bring(question.target)
-        self.asked.append(question.text)
-        match question.kind:
-            case "choose":
-                return await self._choose(question.text, question.choices, question.default)
-            case "number":
-                return self._number(question)
-            case _:
-                return self._text(question.text, question.default)
+    def see(self, picture: Picture | None) -> None:
+        pass
 
-    async def _choose(self, question: str, choices: tuple[Choice, ...], default: str) -> str:
-        keys = {choice.key for choice in choices}
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        if target is not None:
+            return await self.bring(target)
+        self.asked.append(prompt.question)
+        if prompt.read is not None:
+            return prompt.read(self._typed(prompt.question) or prompt.default)
+        return prompt.answer_to(await self._choose(prompt.question, prompt.default))
+
+    async def _choose(self, question: str, default: str) -> str:
         if question.startswith("How do you want to go on"):
-            if self.mends:
-                await self._in_lab(self.lab.mend())
-                self.mends = False
-                return "a"
-            return "q"
+            if not self.mends:
+                raise LeftOff
+            await self._in_lab(self.lab.mend())
+            self.mends = False
+            return "a"
         if question.startswith("What keeps the ink well filled"):
             return "n" if self.seen.ink is None else KIND[self.seen.ink[0]]
         if "The arm moves by itself" in question:
             return "a"
-        answer = default or ("y" if "Agreed?" in question else "n")
-        assert answer in keys, question
-        return answer
+        return default or ("y" if "Agreed?" in question else "n")
 
-    def _number(self, question: Question) -> float:
-        seen = self.seen
-        printed = {
-            "Squares along its longer": seen.squares[0],
-            "Squares along its shorter": seen.squares[1],
-            "Side of a square": seen.square_mm,
-            "Side of a marker": seen.marker_mm,
-            "R:": seen.radius_mm,
-            "L:": seen.length_mm,
-            "Deepest press": seen.max_depth_mm,
-            "Delivery per revolution": 0.1,
-        }
-        value = next((v for start, v in printed.items() if question.text.startswith(start)), question.default)
-        assert value, question
-        assert question.low <= float(value) <= question.high, question
-        return float(value)
-
-    def _text(self, question: str, default: str) -> str:
+    def _typed(self, question: str) -> str:
         seen = self.seen
         read = {
             "Address of the cabinet": seen.host,
             "Address of the camera": " ".join(seen.streams),
+            "Squares along its longer": str(seen.squares[0]),
+            "Squares along its shorter": str(seen.squares[1]),
+            "Side of a square": str(seen.square_mm),
+            "Side of a marker": str(seen.marker_mm),
             "Markers of the print": seen.dictionary,
+            "R:": str(seen.radius_mm),
+            "L:": str(seen.length_mm),
+            "Deepest press": str(seen.max_depth_mm),
+            "Delivery per revolution": "0.1",
             "Its serial line": "" if seen.ink is None else seen.ink[1],
             "CAN bus": f"{seen.can[0]}:{seen.can[1]}/{seen.can[2]}",
         }
-        return next((v for start, v in read.items() if question.startswith(start)), default)
+        return next((v for start, v in read.items() if question.startswith(start)), "")
 
-    async def bring(self, target: Target) -> Brought:
+    async def bring(self, target: Target) -> bool:
         if self.leave_after is not None and len(self.brought) >= self.leave_after:
             raise LeftOff
         self.brought.append(target)
         answer = await self._in_lab(self.lab.bring(target.kind, target.index, target.corner))
         self.lines.append(f"person: {answer['says']}")
-        return Brought.DONE if answer["reached"] else Brought.SKIP
+        return bool(answer["reached"])
 
     @property
     def seen(self) -> Seen:

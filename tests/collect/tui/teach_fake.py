@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -10,26 +12,16 @@ import numpy as np
 
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice
-from brushloop.collect.teach.guide import Brought, JogView, Question, Shown, StepState, Target
-from brushloop.collect.tui.teach_app import TeachApp
-from brushloop.collect.tui.teach_guide import ScreenGuide
-from brushloop.drivers.geometry import brush_pose
+from brushloop.collect.teach.arm import ADDRESS
+from brushloop.collect.teach.brush import BUS
+from brushloop.collect.teach.camera import PRINT
+from brushloop.collect.teach.day import Day, Shown, Target
+from brushloop.collect.tui.teach_app import ScreenGuide, TeachApp
+from brushloop.drivers.host import HostClock
 
-STEPS = (
-    StepState("arm", "Find the arm", 3, "taught", "192.0.2.7:30004"),
-    StepState("camera", "Find the camera", 12, "taught", "2048 x 1536, 8 Hz"),
-    StepState("tip", "Tip of the brush", 8, "current"),
-    *(StepState(name, name.capitalize(), 5, "open") for name in ("sheet", "places", "brush", "force", "limits")),
-    StepState("proof", "Proof", 6, "open"),
-)
 FOUND = Shown(("five directions: the tip is known to 0.11 mm", "residuals 0.10, 0.24, 0.08, 0.17, 0.21 mm"))
 WARNED = Shown(("direction 2 is like direction 1: lean the brush farther",), tone="warning")
 YES, NO = Choice("y", "yes, take it"), Choice("n", "no, touch it again")
-JOG = JogView(
-    (0.0, 0.1, -1.3),
-    (0.1, 0.5, 2.0, 5.0),
-    "not made: z = 97.900 mm is outside [98.200, 148.000] mm. Guide the arm by hand to go farther",
-)
 
 
 def board() -> np.ndarray:
@@ -46,37 +38,30 @@ class Asking:
         self.at_work = self.stopped_arm = False
 
     async def __call__(self, guide: ScreenGuide) -> None:
-        await guide.overview(STEPS)
+        await guide.begin("step 3 of 9: Tip of the brush, about 8 min")
         await guide.show(FOUND)
         await guide.show(WARNED)
-        guide.see_pose(brush_pose(412.25, -31.5, 121.75), True)
         for kind in self.kinds:
             self.answers.append(await self._ask(guide, kind))
         return None
 
     async def _ask(self, guide: ScreenGuide, kind: str) -> Any:
+        day = Day(guide, Path("rig.toml"), HostClock(), armed=False)
         match kind:
             case "choose":
-                return await guide.ask(Question("choose", "Take this tip?", (YES, NO), "y"))
+                return await day.choose("Take this tip?", (YES, NO), "y")
             case "no default":
-                return await guide.ask(Question("choose", "Is there a pot of water?", (YES, NO)))
+                return await day.yes("Is there a pot of water?")
             case "number":
-                return await guide.ask(
-                    Question("number", "Squares along its longer side", unit="squares", low=3, high=50)
-                )
+                return await day.ask(PRINT[0].prompt(day.notebook))
             case "text":
-                return await guide.ask(Question("text", "Address of the cabinet", default="192.0.2.7"))
+                return await day.ask(replace(ADDRESS, default="192.0.2.7").prompt(day.notebook))
             case "empty":
-                return await guide.ask(Question("text", "CAN bus of the force sensor; Enter: no sensor"))
+                return await day.ask(BUS.prompt(day.notebook))
             case "bring":
                 await guide.show(Shown(("the board as the camera sees it",), board()))
                 how = "Guide the tip to the pin by hand, the brush leaning toward the window, then press Enter."
-                return await guide.ask(Question("bring", how, target=Target("pin", 2), may_jog=True, may_skip=True))
-            case "jog":
-                lower = Question("jog", "Lower the tip onto the paper.", jog=JOG)
-                while not isinstance(answer := await guide.ask(lower), Brought):
-                    self.answers.append(answer)
-                return answer
+                return await day.brought(how, Target("pin", 2), may_skip=True)
             case _:
                 return await self._move(kind)
 

@@ -87,9 +87,8 @@ def test_review(
     assert snap_compare(app, terminal_size=SMALL, run_before=review)
 
 
-@pytest.mark.parametrize("kind", ["jog", "choose"])
-def test_first_day(snap_compare: Callable[..., bool], kind: str) -> None:
-    app = app_of(Asking(kind))
+def test_first_day(snap_compare: Callable[..., bool]) -> None:
+    app = app_of(Asking("bring"))
 
     async def asked(pilot: Pilot[None]) -> None:
         while app.first_day.prompt is None:

@@ -12,10 +12,10 @@ from contextlib import asynccontextmanager
 import pytest
 from textual.pilot import Pilot
 
-from brushloop.collect.teach.guide import Brought, JogStep, LeftOff, WentBack
+from brushloop.collect.errors import CollectAborted
+from brushloop.collect.teach.day import LeftOff, WentBack
 from brushloop.collect.tui.question_screens import AskScreen
-from brushloop.collect.tui.teach_app import TeachApp
-from brushloop.collect.tui.teach_guide import Teaching
+from brushloop.collect.tui.teach_app import TeachApp, Teaching
 from tests.collect.tui.screen_text import shown
 from tests.collect.tui.teach_fake import Asking, app_of
 from tests.waiting import PATIENCE_S
@@ -52,15 +52,13 @@ async def seen(app: TeachApp, pilot: Pilot[None], condition: Callable[[], bool])
     [
         ("choose", ["n"], "n"),
         ("choose", ["enter"], "y"),
-        ("no default", ["enter", "n"], "n"),
-        ("number", ["2", "6", "enter"], 26.0),
-        ("text", ["enter"], "192.0.2.7"),
+        ("no default", ["enter", "n"], False),
+        ("number", ["2", "6", "enter"], 26),
+        ("text", ["enter"], "192.0.2.7:30004"),
         ("empty", ["enter"], ""),
-        ("text", ["s", "q", "1", "enter"], "sq1"),
-        ("bring", ["enter"], Brought.DONE),
-        ("bring", ["k"], Brought.SKIP),
-        ("bring", ["j"], Brought.JOG),
-        ("jog", ["enter"], Brought.DONE),
+        ("text", ["s", "q", "1", "enter"], "sq1:30004"),
+        ("bring", ["enter"], True),
+        ("bring", ["k"], False),
     ],
 )
 async def test_a_question_is_answered_by_its_keys(kind: str, keys: list[str], answer: object) -> None:
@@ -69,20 +67,6 @@ async def test_a_question_is_answered_by_its_keys(kind: str, keys: list[str], an
         await pilot.press(*keys)
         await seen(app, pilot, lambda: bool(asking.answers))
     assert asking.answers == [answer]
-
-
-async def test_arrows_jog_by_the_chosen_step() -> None:
-    asking = Asking("jog")
-    async with running(asking) as (app, pilot):
-        await pilot.press("3")
-        await seen(app, pilot, lambda: "›3: 2 mm" in shown(app))
-        await pilot.press("left")
-        await seen(app, pilot, lambda: len(asking.answers) == 1 and app.first_day.prompt is not None)
-        await pilot.press("1")
-        await seen(app, pilot, lambda: "›1: 0.1 mm" in shown(app))
-        await pilot.press("pageup")
-        await seen(app, pilot, lambda: len(asking.answers) == 2 and app.first_day.prompt is not None)
-    assert asking.answers == [JogStep("x", -2.0), JogStep("z", 0.1)]
 
 
 async def test_a_number_out_of_range_is_refused_with_the_range() -> None:
@@ -104,17 +88,17 @@ async def test_escape_goes_back_and_q_leaves(keys: list[str], raised: type[Excep
 
 
 @pytest.mark.parametrize(("key", "work"), [("s", "move"), ("ctrl+c", "move"), ("s", "run")])
-async def test_a_stop_key_stops_what_is_at_work_and_g_goes_on(key: str, work: str) -> None:
+async def test_a_stop_key_stops_what_is_at_work_and_ends_the_screen(key: str, work: str) -> None:
     asking = Asking("choose", work)
     async with running(asking) as (app, pilot):
         await pilot.press("y")
         await seen(app, pilot, lambda: asking.at_work and app.first_day.prompt is None)
         assert re.search(r"at work, \d+ s; s: software stop", shown(app))
         await pilot.press(key)
-        await seen(app, pilot, lambda: asking.stopped_arm and "Stopped." in shown(app))
-        await pilot.press("g")
-        await seen(app, pilot, lambda: app.first_day.prompt is not None)
-        assert not app.teaching.finished
+        await until(lambda: not app.is_running)
+    assert asking.stopped_arm
+    with pytest.raises(CollectAborted, match=r"look at the arm\. The same command resumes"):
+        app.teaching.join()
 
 
 def test_a_second_stop_key_works_at_once() -> None:
@@ -130,10 +114,10 @@ def test_a_second_stop_key_works_at_once() -> None:
     teaching = Teaching(moves_twice)
     teaching.start()
     teaching.stop()
-    assert moving.wait(20.0)
+    assert moving.wait(PATIENCE_S)
     teaching.stop()
-    teaching.join()
-    assert teaching.stopped
+    with pytest.raises(CollectAborted):
+        teaching.join()
 
 
 async def test_leaving_while_something_is_at_work_asks_and_the_stop_key_works_over_it() -> None:
