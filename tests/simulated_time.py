@@ -8,6 +8,10 @@ from collections.abc import Callable
 
 STEP_S = 1e-6
 """Time that passes at least between two looks at what is ready, so that a wait for the next moment ends."""
+LATENCY_S = 2e-4
+"""The same where there are sockets: a call over a network takes a few of these."""
+SETTLE_SHARE = 0.05
+"""Share of a jump that is really waited for where there are sockets: a busy system may deliver a little later."""
 
 
 class _Jumping(selectors.SelectSelector):
@@ -19,12 +23,17 @@ class _Jumping(selectors.SelectSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready = super().select(None if timeout is None else 0.0)
-        self._waited(STEP_S if ready or timeout is None else max(timeout, STEP_S))
+        step_s = STEP_S
+        if len(self.get_map()) > 1:  # the first is the loop's own
+            step_s = LATENCY_S
+            if not ready and timeout:
+                ready = super().select(SETTLE_SHARE * timeout)
+        self._waited(step_s if ready or timeout is None else max(timeout, step_s))
         return ready
 
 
 class SimulatedTimeLoop(asyncio.SelectorEventLoop):
-    """For tests without threads and sockets: neither is waited for."""
+    """For tests without threads and other processes, which are not waited for."""
 
     def __init__(self) -> None:
         self._now_s = 1000.0

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import math
-import time
 from collections import deque
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
@@ -200,13 +199,10 @@ class Hung:
 class FaultBoard:
     """Faults in the order in which they were added; of several that match one request the first strikes it."""
 
-    def __init__(
-        self, world: World, missing: Sequence[Device] = (), real_s: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, world: World, missing: Sequence[Device] = ()) -> None:
         """`missing`: devices that the rig does not have."""
         self._world = world
         self._missing = missing
-        self._real_s = real_s
         self._idents = itertools.count(1)
         self._hanging: dict[int, Hung] = {}
         self.over: deque[Hung] = deque(maxlen=KEPT)
@@ -239,7 +235,7 @@ class FaultBoard:
     def hanging(self) -> tuple[Hung, ...]:
         """Faults that are waiting or active."""
         for hung in tuple(self._hanging.values()):
-            if self._real_s() >= hung.until_s:
+            if self._world.clock.real_s() >= hung.until_s:
                 self._end(hung)
         return tuple(self._hanging.values())
 
@@ -282,7 +278,7 @@ class FaultBoard:
     def _begin(self, hung: Hung) -> None:
         hung.begun = True
         if hung.fault.for_s is not None:
-            hung.until_s = self._real_s() + hung.fault.for_s
+            hung.until_s = self._world.clock.real_s() + hung.fault.for_s
 
     def _strike(self, hung: Hung) -> None:
         hung.struck += 1

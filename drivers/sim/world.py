@@ -159,17 +159,18 @@ def _pushes(spec: BrushSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 class SimClock:
-    """A clock of simulated time, which passes `rate` times as fast as real time."""
+    """A clock of simulated time, which passes `rate` times as fast as real time, as `real_s` tells it."""
 
-    def __init__(self, rate: float = 1.0) -> None:
+    def __init__(self, rate: float = 1.0, real_s: Callable[[], float] = time.monotonic) -> None:
         if not 0.0 < rate <= 1000.0:
             raise ValueError(f"rate = {rate} is outside (0, 1000]")
         self.rate = rate
-        self._start = time.monotonic()
+        self.real_s = real_s
+        self._start = real_s()
 
     def now_s(self) -> float:
         """Simulated seconds since this clock was created."""
-        return (time.monotonic() - self._start) * self.rate
+        return (self.real_s() - self._start) * self.rate
 
 
 INK_PER_PRESS = 0.12
@@ -214,9 +215,9 @@ class World:
     stretches of the path, and a contact leaves its mark when the brush lifts off.
     """
 
-    def __init__(self, config: SimConfig) -> None:
+    def __init__(self, config: SimConfig, clock: SimClock | None = None) -> None:
         self.config = config
-        self.clock = SimClock(config.rate)
+        self.clock = clock or SimClock(config.rate)
         self.brush = Brush(config.brush)
         self.paper = Paper(*config.table.sheet_mm)
         self.presses: list[Press] = []

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Callable
 
 import pytest
 
 from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
-from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import HOST
-from brushloop.drivers.sim.world import World
+from brushloop.drivers.sim.world import SimClock, World
+from tests.simulated_time import LoopClock
 
 RATE = 20.0
 
@@ -31,7 +32,8 @@ def limits() -> Limits:
 @pytest.fixture
 async def cabinet() -> AsyncIterator[ArcsServer]:
     """A controller with its power off, 20 times faster than life."""
-    server = ArcsServer(World(SimConfig(rate=RATE)))
+    clock = SimClock(RATE, asyncio.get_running_loop().time)
+    server = ArcsServer(World(SimConfig(rate=RATE), clock))
     await server.start(HOST, 0)
     yield server
     await server.stop()
@@ -42,8 +44,8 @@ def arm_at(limits: Limits) -> Callable[[int], AuboArcs]:
     """An arm that is not connected yet, by the port of its controller."""
 
     def make(port: int) -> AuboArcs:
-        options = ArcsOptions(HOST, port, tcp_offset_mm=(0.0, 0.0, 180.0))
-        return AuboArcs(options, limits, HostClock())
+        options = ArcsOptions(host=HOST, port=port, tcp_offset_mm=(0.0, 0.0, 180.0))
+        return AuboArcs(options, limits, LoopClock())
 
     return make
 

@@ -1,17 +1,12 @@
-"""Waiting for an arm that cannot be seen at rest is cut short: the loopback's arm rests within a tenth of a second."""
+"""Time is simulated here: no test waits, and none depends on how busy the machine is."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import Callable
 
-import pytest
-
-from brushloop.drivers.arcs import stopping
+from tests.simulated_time import SimulatedTimeLoop
 
 
-@pytest.fixture(autouse=True)
-def impatient() -> Iterator[None]:
-    # A patch of its own: `monkeypatch` would be undone after the arm is closed, and tests rely on its being before.
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stopping, "CONFIRM_S", 3.5)
-        yield
+def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    return {"simulated": SimulatedTimeLoop}

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import math
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
 
+from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -16,20 +19,25 @@ from brushloop.drivers.errors import (
     LimitExceeded,
     MotionFailed,
     MotionRefused,
+    PathDisturbed,
     RobotNotSafe,
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
+from brushloop.drivers.sim.rig import HOST
 from tests.drivers.failing import mute
-from tests.waiting import PATIENCE_S
 
-HOME = brush_pose(250.0, -230.0, 260.0)
-TOP, DEEP = brush_pose(250.0, -230.0, 300.0), brush_pose(250.0, -230.0, 200.0)
+X_MM, Y_MM = 250.0, -230.0
+HOME, TOP, DEEP = (brush_pose(X_MM, Y_MM, z_mm) for z_mm in (260.0, 300.0, 200.0))
 DWELL_S = 4.0
-PRESS = [QueuedLine(brush_pose(250.0, -230.0, 200.05), 40.0), QueuedLine(DEEP, 40.0, DWELL_S), QueuedLine(TOP, 40.0)]
+PRESS = [QueuedLine(brush_pose(X_MM, Y_MM, 200.05), 40.0), QueuedLine(DEEP, 40.0, DWELL_S), QueuedLine(TOP, 40.0)]
 ACC = 800.0
-LINE, STOP_MOVE, START_MOVE = (f"rob1.MotionControl.{name}" for name in ("moveLine", "stopMove", "startMove"))
+ASIDE = brush_pose(X_MM + 40.0, Y_MM + 10.0, 205.0)
+"""In the paper, and 41 mm beside the press."""
+LINE, SIZE, STOP_MOVE, START_MOVE = (
+    f"rob1.MotionControl.{name}" for name in ("moveLine", "getQueueSize", "stopMove", "startMove")
+)
 
 
 def z_mm(cabinet: ArcsServer) -> float:
@@ -37,8 +45,7 @@ def z_mm(cabinet: ArcsServer) -> float:
 
 
 def queued(cabinet: ArcsServer) -> int:
-    cabinet.cabinet.world.motion.advance(cabinet.cabinet.now_s())
-    return cabinet.cabinet.world.motion.size
+    return cabinet.cabinet.queue_size()
 
 
 def before_each(cabinet: ArcsServer, method: str, act: Callable[[int], object]) -> None:
@@ -52,6 +59,12 @@ def before_each(cabinet: ArcsServer, method: str, act: Callable[[int], object]) 
         return carry_out(params)
 
     cabinet._methods[method] = noted
+
+
+async def below(cabinet: ArcsServer, height_mm: float) -> None:
+    """Return once the tip is lower than this."""
+    while z_mm(cabinet) > height_mm:
+        await asyncio.sleep(0.002)
 
 
 async def nothing_is_left(cabinet: ArcsServer) -> bool:
@@ -85,16 +98,14 @@ async def test_a_host_that_is_gone_once_the_path_was_let_go_is_not_needed(arm: A
     lowest: list[float] = []
     cabinet.cabinet.world.motion._on_path = lambda a, b: lowest.append(min(a.z_mm, b.z_mm))
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    while z_mm(cabinet) > 250.0:
-        await asyncio.sleep(0.002)
+    await below(cabinet, 250.0)
     for controller in (arm._motion, arm._stop, arm._state):
         writer = controller.connection._writer
         assert writer is not None
         writer.transport.abort()
     mute(cabinet)
-    async with asyncio.timeout(10.0):
-        while queued(cabinet):
-            await asyncio.sleep(0.01)
+    while queued(cabinet):
+        await asyncio.sleep(0.01)
     assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
     assert min(lowest) == pytest.approx(DEEP.z_mm)
     task.cancel()
@@ -118,7 +129,7 @@ async def test_a_connection_that_is_lost_before_the_path_is_let_go_leaves_the_ar
     assert await nothing_is_left(cabinet)
 
 
-@pytest.mark.parametrize("method", [STOP_MOVE, LINE, "rob1.MotionControl.getQueueSize"])
+@pytest.mark.parametrize("method", [STOP_MOVE, LINE, SIZE])
 async def test_a_stop_before_the_path_is_let_go_drops_it(arm: AuboArcs, cabinet: ArcsServer, method: str):
     stops: list[asyncio.Task[None]] = []
     before_each(cabinet, method, lambda now: stops.append(asyncio.create_task(arm.stop())) if now == 1 else None)
@@ -133,8 +144,7 @@ async def test_a_stop_before_the_path_is_let_go_drops_it(arm: AuboArcs, cabinet:
 @pytest.mark.parametrize("below_mm", [250.0, 200.1])
 async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, cabinet: ArcsServer, below_mm: float):
     task = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
-    while z_mm(cabinet) > below_mm:
-        await asyncio.sleep(0.002)
+    await below(cabinet, below_mm)
     await arm.stop()
     with pytest.raises(MotionFailed):
         await task
@@ -142,76 +152,57 @@ async def test_a_stop_on_the_way_down_or_at_depth_drops_the_lift(arm: AuboArcs, 
     assert await nothing_is_left(cabinet)
 
 
-async def test_a_process_that_died_while_the_path_was_held_does_not_hold_up_the_next_one(
-    arm: AuboArcs, cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs]
-):
-    await arm.close()
-    cabinet.cabinet.hold()  # and no further line was sent
-    other = arm_at(cabinet.port)
-    await other.connect()
-    await other.enable()
-    await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
-    await other.close()
-    assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
-
-
-async def test_lines_that_a_dead_process_left_held_are_dropped_even_if_no_line_counts_as_running(
-    arm: AuboArcs, cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs]
+@pytest.mark.parametrize("counted", [True, False], ids=["a held line counts as running", "or not"])
+async def test_lines_that_a_dead_process_left_held_are_dropped_and_do_not_hold_up_the_next_one(
+    arm: AuboArcs, cabinet: ArcsServer, arm_at: Callable[[int], AuboArcs], counted: bool
 ):
     await arm.close()
     cabinet.cabinet.hold()
     cabinet.cabinet.world.motion.add(DEEP, 40.0, ACC, cabinet.cabinet.now_s())  # and it died before it let go
     running = cabinet._methods["rob1.MotionControl.getExecId"]
-    cabinet._methods["rob1.MotionControl.getExecId"] = lambda p: -1 if cabinet.cabinet.motion.held else running(p)
+    if not counted:
+        cabinet._methods["rob1.MotionControl.getExecId"] = lambda p: -1 if cabinet.cabinet.motion.held else running(p)
     other = arm_at(cabinet.port)
     await other.connect()
     await other.enable()
-    await asyncio.sleep(0.1)
     assert z_mm(cabinet) == HOME.z_mm
     assert await nothing_is_left(cabinet)
+    await other.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
     await other.close()
 
 
-async def test_a_controller_that_does_not_hold_its_path_is_not_pressed_with(arm: AuboArcs, cabinet: ArcsServer):
-    cabinet._methods[STOP_MOVE] = lambda _: 0
-    with pytest.raises(MotionFailed, match=r"does not hold its path|holds . of 3 lines"):
-        await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert await nothing_is_left(cabinet)
-
-
-async def test_a_controller_that_keeps_fewer_lines_than_it_was_sent_is_not_let_go(arm: AuboArcs, cabinet: ArcsServer):
+def drops_the_dwell(cabinet: ArcsServer, code: int) -> None:
+    """The controller answers the line that dwells with this code and does not queue it."""
     move_line = cabinet._methods[LINE]
-    cabinet._methods[LINE] = lambda p: 0 if p["duration"] else move_line(p)
-    with pytest.raises(MotionFailed, match="holds 2 of 3 lines"):
-        await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert z_mm(cabinet) == HOME.z_mm
+    cabinet._methods[LINE] = lambda p: code if p["duration"] else move_line(p)
 
 
-async def test_a_controller_that_refuses_a_line_is_not_let_go(arm: AuboArcs, cabinet: ArcsServer):
-    move_line = cabinet._methods[LINE]
-    cabinet._methods[LINE] = lambda p: 2 if p["duration"] else move_line(p)
-    with pytest.raises(MotionRefused, match="QUEUE_FULL"):
+@pytest.mark.parametrize(
+    ("tamper", "error", "words"),
+    [
+        (lambda c: c._methods.update({STOP_MOVE: lambda _: 0}), MotionFailed, "does not hold its path|holds . of 3"),
+        (lambda c: drops_the_dwell(c, 0), MotionFailed, "holds 2 of 3 lines"),
+        (lambda c: drops_the_dwell(c, 2), MotionRefused, "QUEUE_FULL"),
+    ],
+    ids=["does not hold", "keeps fewer lines", "refuses a line"],
+)
+async def test_a_controller_that_does_not_keep_all_lines_is_not_let_go(
+    arm: AuboArcs, cabinet: ArcsServer, tamper: Callable[[ArcsServer], None], error: type[Exception], words: str
+):
+    tamper(cabinet)
+    with pytest.raises(error, match=words):
         await arm.sequence(PRESS, acc_mm_s2=ACC)
-    assert z_mm(cabinet) == HOME.z_mm
+    assert z_mm(cabinet) > DEEP.z_mm
     assert await nothing_is_left(cabinet)
 
 
 async def test_what_cannot_be_carried_out_is_refused_before_anything_is_sent(arm: AuboArcs, cabinet: ArcsServer):
-    def refused(*targets: Pose) -> list[QueuedLine]:
-        return [QueuedLine(target, 40.0) for target in targets]
-
     before_each(cabinet, STOP_MOVE, lambda _: pytest.fail("sent"))
     with pytest.raises(LimitExceeded):
-        await arm.sequence(refused(DEEP, brush_pose(250.0, -230.0, 60.0), TOP), acc_mm_s2=ACC)
-    for lines in ([], refused(DEEP, HOME)):
+        await arm.sequence([*PRESS, QueuedLine(brush_pose(250.0, -230.0, 60.0), 40.0)], acc_mm_s2=ACC)
+    for lines in ([], [QueuedLine(DEEP, 40.0), QueuedLine(HOME, 40.0)]):
         with pytest.raises(ValueError, match="must not end where it begins"):
             await arm.sequence(lines, acc_mm_s2=ACC)
-
-
-async def below(cabinet: ArcsServer, depth_mm: float) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while z_mm(cabinet) > depth_mm:
-            await asyncio.sleep(0.002)
 
 
 @pytest.mark.parametrize("kind", ["malformed", "garbage", "mute", "wrong-id", "drop"])
@@ -240,10 +231,9 @@ async def test_a_release_whose_answer_cannot_be_read_is_carried_out(
 async def test_a_controller_that_never_answers_again_is_given_the_time_of_the_press(
     arm: AuboArcs, cabinet: ArcsServer
 ) -> None:
-    quick = [QueuedLine(line.target, 250.0, 0.2 if line.least_s else 0.0) for line in PRESS]
-    press = asyncio.create_task(arm.sequence(quick, acc_mm_s2=ACC))
+    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
     await below(cabinet, 255.0)
-    cabinet.faults.hang(Fault(device=Device.ROBOT, kind="deaf", count=ALWAYS))
+    mute(cabinet)
     with pytest.raises(DeviceTimeout):
         await press
     assert z_mm(cabinet) == pytest.approx(TOP.z_mm)
@@ -256,7 +246,7 @@ async def test_a_stop_is_carried_out_at_once_although_no_answer_can_be_read(arm:
     cabinet.faults.hang(Fault(device=Device.ROBOT, kind="malformed", on="getSafetyModeType", count=ALWAYS))
     await arm.stop()
     assert z_mm(cabinet) > DEEP.z_mm
-    assert cabinet.cabinet.world.motion.size == 0
+    assert queued(cabinet) == 0
     cabinet.faults.clear()
     with pytest.raises(MotionFailed):
         await press
@@ -269,3 +259,103 @@ async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboAr
     with pytest.raises(RobotNotSafe):
         await press
     assert DEEP.z_mm < z_mm(cabinet) < TOP.z_mm
+
+
+# ---------------------------------------------------------------- another client
+
+
+@pytest.fixture
+async def other(cabinet: ArcsServer) -> AsyncIterator[Controller]:
+    """A second client of the same cabinet."""
+    client = Controller(RpcConnection(HOST, cabinet.port))
+    client.robot = "rob1"
+    await client.connection.open()
+    yield client
+    await client.connection.close()
+
+
+@pytest.fixture
+def strays_mm(cabinet: ArcsServer) -> list[float]:
+    """How far from the axis of the press the tip moved in the paper."""
+    strays: list[float] = [0.0]
+    motion = cabinet.cabinet.world.motion
+    travelled = motion._on_path
+
+    def noted(start: Pose, end: Pose) -> None:
+        strays.extend(math.hypot(p.x_mm - X_MM, p.y_mm - Y_MM) for p in (start, end) if p.z_mm < 219.9)
+        travelled(start, end)
+
+    motion._on_path = noted
+    return strays
+
+
+def sends_aside(cabinet: ArcsServer) -> None:
+    """Another client's line reaches the controller now."""
+    assert cabinet.cabinet.world.motion.add(ASIDE, 200.0, ACC, cabinet.cabinet.now_s())
+
+
+@pytest.mark.parametrize(
+    ("method", "number"),
+    [(LINE, 1), (LINE, 3), (SIZE, 1)],
+    ids=["before our first line", "before the lift", "after all our lines"],
+)
+async def test_a_line_that_comes_while_the_path_is_held_is_never_carried_out(
+    arm: AuboArcs, cabinet: ArcsServer, method: str, number: int
+) -> None:
+    before_each(cabinet, method, lambda now: sends_aside(cabinet) if now == number else None)
+    here = cabinet.cabinet.world.tool()
+    with pytest.raises(PathDisturbed, match=r"holds 4 lines, 3 were sent.*nother client"):
+        await arm.sequence(PRESS, acc_mm_s2=ACC)
+    assert cabinet.cabinet.world.tool() == here
+    assert queued(cabinet) == 0
+    await arm.move(TOP, speed_mm_s=100.0, acc_mm_s2=ACC)
+
+
+async def test_a_line_that_comes_between_the_last_check_and_the_release_is_stopped(
+    arm: AuboArcs, cabinet: ArcsServer, strays_mm: list[float]
+) -> None:
+    before_each(cabinet, START_MOVE, lambda _: sends_aside(cabinet))
+    with pytest.raises(PathDisturbed, match="nother client"):
+        await arm.sequence(PRESS, acc_mm_s2=ACC)
+    assert max(strays_mm) < 0.5
+    assert queued(cabinet) == 0
+
+
+@pytest.mark.parametrize("at_mm", [250.0, 200.01])
+async def test_a_line_that_comes_during_the_press_is_not_begun(
+    arm: AuboArcs, cabinet: ArcsServer, other: Controller, strays_mm: list[float], at_mm: float
+) -> None:
+    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
+    await below(cabinet, at_mm)
+    await other.move_line(ASIDE, 200.0, ACC)
+    with pytest.raises(PathDisturbed, match=r"holds \d lines, at most \d of ours are left.*nother client"):
+        await press
+    assert max(strays_mm) < 0.5
+    assert queued(cabinet) == 0
+
+
+async def test_a_client_that_stops_the_press_and_sends_its_own_line_is_seen_by_the_way_that_the_tip_took(
+    arm: AuboArcs, cabinet: ArcsServer, other: Controller
+) -> None:
+    press = asyncio.create_task(arm.sequence(PRESS, acc_mm_s2=ACC))
+    await below(cabinet, 200.01)
+    await other.halt(2.0)
+    await other.move_line(ASIDE, 200.0, ACC)
+    with pytest.raises(PathDisturbed, match=r"from its path.*nother client"):
+        await press
+    assert queued(cabinet) == 0
+
+
+async def test_one_pose_beside_the_path_is_enough_even_if_the_arm_arrives(arm: AuboArcs) -> None:
+    """Between two questions of the driver the tip may have been elsewhere; telemetry saw it."""
+    telemetry = arm._telemetry
+    reaching = telemetry.reaching
+
+    async def reached(*target: Any) -> None:
+        assert telemetry._seen is not None
+        telemetry._seen.append(brush_pose(X_MM + 0.8, Y_MM, 201.0))
+        await reaching(*target)
+
+    telemetry.reaching = reached  # type: ignore[method-assign]
+    with pytest.raises(PathDisturbed, match=r"0\.80 mm"):
+        await arm.sequence(PRESS, acc_mm_s2=ACC)

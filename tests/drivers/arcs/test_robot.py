@@ -1,20 +1,27 @@
+"""The arm's driver: connecting, a move, and a stop from any state, never queued behind anything."""
+
 from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 
 from brushloop.drivers.arcs import robot as robot_module
+from brushloop.drivers.arcs import stopping
 from brushloop.drivers.arcs.controller import RobotMode, SafetyMode
 from brushloop.drivers.arcs.motion import planned_s
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.devices import Pose, Robot
+from brushloop.drivers.devices import Robot
 from brushloop.drivers.errors import (
     ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
     LimitExceeded,
+    MotionError,
     NotConnected,
+    ProtocolViolation,
     RobotNotSafe,
     RpcError,
     Stale,
@@ -22,9 +29,12 @@ from brushloop.drivers.errors import (
 )
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
-from tests.drivers.failing import mute
+from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
+from tests.drivers.failing import mute, mute_to
+from tests.waiting import until
 
 NEAR = brush_pose(260.0, -220.0, 250.0)
+FAR = brush_pose(250.0, -30.0, 260.0)  # 200 mm from home: two seconds of the fast clock
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
 SLOW = {"speed_mm_s": 5.0, "acc_mm_s2": 800.0}
 ArmAt = Callable[[int], AuboArcs]
@@ -40,7 +50,13 @@ async def test_connecting_reports_who_answers_and_where_the_tool_is(cabinet: Arc
     assert identity.model.startswith("aubo_i5")
     # no tool is set yet: it speaks of the flange
     assert arm.latest().pose.position_mm == pytest.approx((250.0, -230.0, 260.0 + 180.0))
+    with pytest.raises(NotConnected, match="not enabled"):
+        await arm.move(NEAR, **QUICK)
+    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
     await arm.close()
+    await arm.close()
+    with pytest.raises(NotConnected):
+        await arm.stop()
 
 
 async def test_a_cabinet_of_another_make_is_not_taken_for_the_loopback_rig(cabinet: ArcsServer, arm_at: ArmAt):
@@ -50,102 +66,38 @@ async def test_a_cabinet_of_another_make_is_not_taken_for_the_loopback_rig(cabin
     await arm.close()
 
 
-async def test_an_arm_that_was_not_enabled_is_not_moved(sleeping_arm: AuboArcs, cabinet: ArcsServer):
-    with pytest.raises(NotConnected, match="not enabled"):
-        await sleeping_arm.move(NEAR, **QUICK)
-    assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
-
-
-async def test_enabling_runs_the_arm_and_sets_the_tool_but_moves_nothing(sleeping_arm: AuboArcs, cabinet: ArcsServer):
-    before = cabinet.cabinet.world.tool()
-    await sleeping_arm.enable()
-    await sleeping_arm.enable()
-    assert cabinet.cabinet.power.mode == RobotMode.RUNNING
-    assert cabinet.cabinet.tcp_offset == [0.0, 0.0, 0.18, 0.0, 0.0, 0.0]
-    assert distance(before, cabinet.cabinet.world.tool())[0] == 0.0
-    assert distance(before, sleeping_arm.latest().pose)[0] < 1e-6, "with the tool set, it speaks of the tip"
-
-
 async def test_a_slow_turn_on_the_spot_is_given_the_time_it_takes(arm: AuboArcs):
     home = arm.latest().pose
-    x, y, z = home.position_mm
-    turn = brush_pose(x, y, z, heading_deg=90.0)
-    planned = planned_s(home, turn, 20.0, 800.0)
-    assert planned >= math.radians(90.0) / 0.020  # 20 mm/s is read as 0.02 rad/s
+    turn = brush_pose(*home.position_mm, heading_deg=90.0)
+    assert planned_s(home, turn, 20.0, 800.0) >= math.radians(90.0) / 0.020  # 20 mm/s is read as 0.02 rad/s
     await arm.move(turn, **QUICK)
 
 
-BEYOND: list[tuple[str, Pose, dict[str, float]]] = [
-    ("x", brush_pose(199.9, 0.0, 200.0), {}),
-    ("y", brush_pose(400.0, 260.1, 200.0), {}),
-    ("z", brush_pose(400.0, 0.0, 94.9), {}),
-    ("z", brush_pose(400.0, 0.0, math.nan), {}),
-    ("x", brush_pose(math.inf, 0.0, 200.0), {}),
-    ("tilt", brush_pose(400.0, 0.0, 200.0, tilt_deg=15.1), {}),
-    ("speed", NEAR, {"speed_mm_s": 250.1}),
-    ("speed", NEAR, {"speed_mm_s": 0.0}),
-    ("speed", NEAR, {"speed_mm_s": math.nan}),
-    ("acceleration", NEAR, {"acc_mm_s2": 1000.1}),
-    ("acceleration", NEAR, {"acc_mm_s2": math.nan}),
-]
-
-
-@pytest.mark.parametrize(("field", "target", "change"), BEYOND)
-async def test_a_target_beyond_the_limits_is_refused_before_anything_is_sent(
-    arm_at: ArmAt, field: str, target: Pose, change: dict[str, float]
-):
+async def test_a_target_beyond_the_limits_is_refused_before_anything_is_sent(arm_at: ArmAt):
     nowhere = arm_at(1)  # not connected: asking the controller anything would raise NotConnected
-    with pytest.raises(LimitExceeded) as caught:
-        await nowhere.move(target, **{**QUICK, **change})
-    assert caught.value.field == field
+    for target, change in ((brush_pose(199.9, 0.0, 200.0), {}), (NEAR, {"speed_mm_s": 250.1})):
+        with pytest.raises(LimitExceeded):
+            await nowhere.move(target, **{**QUICK, **change})
 
 
-async def test_a_protective_stop_names_condition_and_remedy_and_nothing_clears_it(arm: AuboArcs, cabinet: ArcsServer):
-    move = asyncio.create_task(arm.move(brush_pose(350.0, -150.0, 250.0), **SLOW))
-    await asyncio.sleep(0.2)
-    cabinet.cabinet.safety_stop()
-    with pytest.raises(RobotNotSafe, match="ProtectiveStop") as caught:
-        await move
-    assert caught.value.mode == "ProtectiveStop"
-    assert "brakes open" in caught.value.condition
-    assert "on the pendant" in caught.value.remedy
-    for attempt in (arm.move(NEAR, **QUICK), arm.enable()):
-        with pytest.raises(RobotNotSafe):
-            await attempt
-    assert cabinet.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP
-
-
-@pytest.mark.parametrize("mode", ["ArmOnFire", 5, ["Normal"], None])
+@pytest.mark.parametrize("mode", ["ArmOnFire", None])
 async def test_a_safety_mode_that_nobody_knows_forbids_motion(arm: AuboArcs, cabinet: ArcsServer, mode: object):
     cabinet._methods["rob1.RobotState.getSafetyModeType"] = lambda _: mode
     with pytest.raises(RobotNotSafe, match="Look at the pendant"):
         await arm.move(NEAR, **QUICK)
 
 
-async def test_a_connection_that_drops_in_mid_move_ends_the_move_and_stops_the_arm(arm: AuboArcs, cabinet: ArcsServer):
-    move = asyncio.create_task(arm.move(brush_pose(350.0, -150.0, 250.0), **SLOW))
-    await asyncio.sleep(0.2)
-    cabinet.drop_clients()
-    with pytest.raises(ConnectionLost):
-        await move
-    await asyncio.sleep(0.1)
-    assert cabinet.cabinet.world.motion.exec_id(cabinet.cabinet.now_s()) == -1
-
-
-async def test_latest_goes_stale_when_the_controller_falls_silent(arm: AuboArcs, cabinet: ArcsServer):
+async def test_latest_goes_stale_when_the_controller_falls_silent_and_is_fresh_again_by_itself(
+    arm: AuboArcs, cabinet: ArcsServer
+):
     mute(cabinet)
     await asyncio.sleep(0.6)
     with pytest.raises(Stale) as caught:
         arm.latest()
     assert caught.value.age_ms > 500.0
     cabinet.faults.clear()
-    async with asyncio.timeout(2.0):  # and is fresh again by itself
-        while True:
-            try:
-                arm.latest()
-                break
-            except Stale:
-                await asyncio.sleep(0.05)
+    await asyncio.sleep(1.5)
+    assert arm.latest()
 
 
 async def test_a_cabinet_of_the_older_generation_is_named_as_such(
@@ -155,11 +107,6 @@ async def test_a_cabinet_of_the_older_generation_is_named_as_such(
         monkeypatch.setattr(robot_module, "AUBOPE_PORT", older.sockets[0].getsockname()[1])
         with pytest.raises(WrongGeneration, match="AUBOPE"):
             await arm_at(unused_tcp_port).connect()
-
-
-async def test_where_nothing_listens_the_connection_is_lost(
-    arm_at: ArmAt, unused_tcp_port: int, monkeypatch: pytest.MonkeyPatch
-):
     monkeypatch.setattr(robot_module, "AUBOPE_PORT", unused_tcp_port)
     with pytest.raises(ConnectionLost):
         await arm_at(unused_tcp_port).connect()
@@ -169,21 +116,245 @@ async def test_a_connect_that_fails_half_way_leaves_nothing_open(cabinet: ArcsSe
     del cabinet._methods["rob1.RobotConfig.getRobotType"]
     with pytest.raises(RpcError, match="-32601"):
         await arm_at(cabinet.port).connect()
-    await asyncio.sleep(0.05)
-    assert cabinet.clients == 0
+    await until(lambda: cabinet.clients == 0, "the connections to be closed")
 
 
-async def test_a_method_that_the_controller_does_not_know_is_an_error_with_its_code(arm: AuboArcs, cabinet: ArcsServer):
-    del cabinet._methods["rob1.MotionControl.moveLine"]
-    with pytest.raises(RpcError) as caught:
-        await arm.move(NEAR, **QUICK)
-    assert caught.value.code == -32601
+# ---------------------------------------------------------------- one bad answer in a move
 
 
-async def test_closing_twice_is_fine_and_later_calls_say_that_it_is_closed(arm: AuboArcs):
-    await arm.close()
-    await arm.close()
-    with pytest.raises(NotConnected):
-        await arm.move(NEAR, **QUICK)
-    with pytest.raises(NotConnected):
-        await arm.stop()
+def to_go_mm(cabinet: ArcsServer) -> float:
+    return distance(cabinet.cabinet.world.tool(), FAR)[0]
+
+
+def at_rest(cabinet: ArcsServer) -> bool:
+    return cabinet.cabinet.motion.exec_id(cabinet.cabinet.now_s()) == -1
+
+
+ENDS: list[tuple[str, type[DeviceError], str]] = [
+    ("mute", DeviceTimeout, "no reply"),
+    ("late", DeviceTimeout, "no reply"),
+    ("wrong-id", DeviceTimeout, "no reply"),
+    ("malformed", ProtocolViolation, "reply is not JSON"),
+    ("garbage", ConnectionLost, "expected SOF"),
+    ("drop", ConnectionLost, "closed the connection"),
+]
+
+
+@pytest.mark.parametrize("on", ["moveLine", "getSafetyModeType"])
+@pytest.mark.parametrize(("kind", "error", "words"), ENDS)
+async def test_one_bad_reply_ends_the_move_with_its_name_and_the_arm_rests_on_its_way(
+    arm: AuboArcs, cabinet: ArcsServer, kind: str, error: type[DeviceError], words: str, on: str
+):
+    more = {"late_s": 1.5} if kind == "late" else {}
+    nth = 1 if on == "moveLine" else 5  # a move asks for the safety mode while it waits, and telemetry does not
+    cabinet.faults.hang(Fault.model_validate({"device": "robot", "kind": kind, "on": on, "nth": nth, **more}))
+    with pytest.raises(error, match=words) as caught:
+        await arm.move(FAR, **SLOW)
+    assert on in caught.value.op
+    assert not getattr(caught.value, "__notes__", []), "the arm was seen at rest"
+    assert at_rest(cabinet)
+    left_mm = to_go_mm(cabinet)
+    assert 50.0 < left_mm < 200.0
+    await asyncio.sleep(2.0)  # the late reply comes, and nothing comes of it
+    assert to_go_mm(cabinet) == left_mm
+
+
+async def test_a_line_that_never_arrives_is_a_timeout_and_nothing_has_moved(arm: AuboArcs, cabinet: ArcsServer):
+    cabinet.faults.hang(Fault(device=Device.ROBOT, kind="deaf", on="moveLine"))
+    with pytest.raises(DeviceTimeout, match="moveLine"):
+        await arm.move(FAR, **SLOW)
+    assert to_go_mm(cabinet) == pytest.approx(200.0)
+
+
+@pytest.mark.parametrize("kind", ["mute", "deaf"])
+async def test_a_controller_that_falls_silent_is_reported_as_an_arm_that_may_still_move(
+    arm: AuboArcs, cabinet: ArcsServer, kind: str
+):
+    """`mute` carries out the stop and cannot say so, `deaf` does not: from outside both look alike."""
+    fault = {"device": "robot", "kind": kind, "phase": "travelling", "nth": 5, "count": ALWAYS}
+    cabinet.faults.hang(Fault.model_validate(fault))
+    with pytest.raises(DeviceTimeout) as caught:
+        await arm.move(FAR, **SLOW)
+    [note] = caught.value.__notes__
+    assert "The arm may still be moving. Use the emergency stop." in note
+    if kind == "mute":
+        assert at_rest(cabinet)
+    closing = asyncio.create_task(arm.close())
+    for _ in range(2):
+        await asyncio.sleep(0.1)
+        closing.cancel()  # it goes on although it is cancelled
+    with pytest.raises(MotionError, match="may still be moving"):
+        await closing
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode", "condition", "power"),
+    [
+        ("protective-stop", SafetyMode.PROTECTIVE_STOP, "brakes open", RobotMode.RUNNING),
+        ("safeguard-stop", SafetyMode.SAFEGUARD_STOP, "brakes on", RobotMode.RUNNING),
+        ("emergency-stop", SafetyMode.ROBOT_EMERGENCY_STOP, "no power", RobotMode.POWER_OFF),
+    ],
+)
+async def test_a_safety_stop_in_mid_move_is_named_with_its_condition_and_stays_until_a_person_ends_it(
+    arm: AuboArcs, cabinet: ArcsServer, kind: str, mode: SafetyMode, condition: str, power: RobotMode
+):
+    box = cabinet.cabinet
+    cabinet.faults.hang(Fault.model_validate({"device": "robot", "kind": kind, "phase": "travelling"}))
+    watching = asyncio.create_task(cabinet.faults.watch(box.safety_stop))
+    with pytest.raises(RobotNotSafe) as caught:
+        await arm.move(FAR, **SLOW)
+    assert caught.value.mode == mode
+    assert condition in caught.value.condition
+    assert caught.value.remedy
+    assert at_rest(cabinet)
+    left_mm = to_go_mm(cabinet)
+    assert 100.0 < left_mm < 200.0
+    for attempt in (arm.move(NEAR, **QUICK), arm.enable()):
+        with pytest.raises(RobotNotSafe):
+            await attempt
+    assert (box.power.safety, box.power.mode) == (mode, power), "nothing clears it"
+
+    assert box.release() == mode
+    assert box.power.safety == SafetyMode.NORMAL
+    box.resume()  # whoever resumes finds no path: the driver's own stop has dropped it
+    await asyncio.sleep(0.1)
+    assert to_go_mm(cabinet) == left_mm
+    await arm.enable()
+    await arm.move(FAR, **QUICK)
+    watching.cancel()
+
+
+# ---------------------------------------------------------------- stop
+
+
+@pytest.fixture
+async def move(arm: AuboArcs) -> AsyncIterator[asyncio.Task[None]]:
+    """A slow move that is under way."""
+    task = asyncio.create_task(arm.move(FAR, **SLOW))
+    await asyncio.sleep(0.2)
+    yield task
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def comes_to_rest(cabinet: ArcsServer) -> bool:
+    """Within 0.1 s the arm rests, far from its target and not back at its start."""
+    await asyncio.sleep(0.1)
+    return at_rest(cabinet) and 100.0 < to_go_mm(cabinet) < 199.0
+
+
+async def test_a_stop_in_mid_move_stops_the_arm_well_short_and_the_move_fails(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
+):
+    await arm.stop()
+    await arm.stop()
+    assert await comes_to_rest(cabinet)
+    with pytest.raises(MotionError, match="from the target"):
+        await move
+    x, y, z = cabinet.cabinet.world.tool().position_mm
+    step = brush_pose(x, y + 1.5, z)
+    await arm.move(step, speed_mm_s=100.0, acc_mm_s2=800.0)
+    assert distance(cabinet.cabinet.world.tool(), step)[0] < 0.05
+
+
+async def test_a_stop_is_fine_in_a_protective_stop(arm: AuboArcs, cabinet: ArcsServer):
+    cabinet.cabinet.safety_stop()
+    await arm.stop()
+
+
+@pytest.mark.parametrize("silent", ["MotionControl.getExecId", "RobotState.getSafetyModeType"])
+async def test_a_stop_does_not_wait_behind_a_command_that_hangs(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], silent: str
+):
+    mute_to(cabinet, f"rob1.{silent}")
+    await asyncio.sleep(0.1)  # the move now waits for an answer that does not come
+    pressed = asyncio.create_task(arm.stop())
+    await asyncio.sleep(0.2)
+    assert await comes_to_rest(cabinet)
+    assert not move.done()
+    await pressed  # it returns once rest has been seen, whatever is muted
+
+
+async def test_a_stop_gets_through_after_its_connection_was_dropped(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None]
+):
+    cabinet.drop_clients()
+    await asyncio.sleep(0)
+    await arm.stop()
+    assert await comes_to_rest(cabinet)
+
+
+async def test_nothing_moves_while_there_is_no_way_to_stop_it(arm: AuboArcs, cabinet: ArcsServer):
+    await cabinet.stop()
+    with pytest.raises(ConnectionLost):
+        await arm.move(FAR, **SLOW)
+    assert to_go_mm(cabinet) == pytest.approx(200.0)
+
+
+async def test_a_stop_gets_through_while_its_own_connection_is_silently_dead(
+    arm: AuboArcs, cabinet: ArcsServer, move: asyncio.Task[None], monkeypatch: pytest.MonkeyPatch
+):
+    async def nothing(*_: object) -> None:
+        await asyncio.sleep(1.0)
+        raise DeviceTimeout("robot", "stopLine", "no reply in 1 s")
+
+    monkeypatch.setattr(arm._stop.connection, "call", nothing)
+    pressed = asyncio.create_task(arm.stop())
+    await asyncio.sleep(0.4)
+    assert await comes_to_rest(cabinet)
+    await pressed
+
+
+async def test_a_line_that_was_still_on_its_way_is_stopped_too(
+    arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
+):
+    send = arm._motion.connection.call
+
+    async def late(method: str, params: object = None) -> object:
+        if method.endswith("moveLine"):
+            asyncio.get_running_loop().call_later(0.25, lambda: asyncio.ensure_future(send(method, params)))
+            raise DeviceTimeout("robot", "moveLine", "no reply in 1 s")
+        return await send(method, params)
+
+    monkeypatch.setattr(stopping, "RESTS_NEEDED", 20)  # the line comes within the time that rest is asked for
+    monkeypatch.setattr(arm._motion.connection, "call", late)
+    with pytest.raises(DeviceTimeout):
+        await arm.move(FAR, **SLOW)
+    assert at_rest(cabinet)
+    assert to_go_mm(cabinet) > 100.0
+
+
+class SlowNetwork:
+    """A connection's writer behind a network that delivers everything 0.25 s later, in order."""
+
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._writer = writer
+
+    def write(self, data: bytes) -> None:
+        asyncio.get_running_loop().call_later(0.25, self._writer.write, data)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._writer, name)
+
+
+async def test_a_stop_waits_for_a_line_that_is_on_its_way(
+    arm: AuboArcs, cabinet: ArcsServer, monkeypatch: pytest.MonkeyPatch
+):
+    connection, sent = arm._motion.connection, asyncio.Event()
+    send = connection.call
+
+    async def delayed(method: str, params: object = None) -> object:
+        if method.endswith("moveLine"):
+            monkeypatch.setattr(connection, "_writer", SlowNetwork(connection._writer))
+            sent.set()
+        return await send(method, params)
+
+    monkeypatch.setattr(connection, "call", delayed)
+    move = asyncio.create_task(arm.move(FAR, **SLOW))
+    await sent.wait()
+    await arm.stop()  # overtakes the line
+    stopped_mm = to_go_mm(cabinet)
+    with pytest.raises(MotionError):
+        await move
+    assert to_go_mm(cabinet) == pytest.approx(stopped_mm)
+    assert stopped_mm > 100.0

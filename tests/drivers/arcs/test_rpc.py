@@ -1,18 +1,40 @@
-"""Transcripts: what the client must send, what the controller answers, what the caller gets."""
+"""Transcripts: what the client must send, what the controller answers, what the caller gets.
+
+Every archive of `brushloop doctor --report` in the folder `reports` is a test too: put a lab's there. The driver must
+read its controller as it did in the lab: the same words, and what it makes of them.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import re
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import pytest
 
+from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.arcs.survey import survey
 from brushloop.drivers.arcs.wire import RpcConnection, encode
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
-from tests.drivers.arcs.transcript import Answer, Controller, following, hang_up, nothing, reply, result, sends
+from brushloop.drivers.limits import Limits
+from tests.drivers.arcs.transcript import (
+    Answer,
+    AnsweringByName,
+    Archive,
+    Controller,
+    following,
+    hang_up,
+    nothing,
+    reply,
+    result,
+    sends,
+    serving,
+)
+from tests.simulated_time import LoopClock
 
-TIMEOUT_S = 0.5
+REPORTS = sorted((Path(__file__).parent / "reports").glob("*.zip"))
+NOWHERE = Limits((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 1.0, 1.0, 1.0)
 
 
 @pytest.fixture
@@ -23,7 +45,7 @@ async def controller() -> AsyncIterator[Controller]:
 
 @pytest.fixture
 async def client(controller: Controller) -> AsyncIterator[RpcConnection]:
-    connection = RpcConnection("127.0.0.1", controller.port, timeout_s=TIMEOUT_S)
+    connection = RpcConnection("127.0.0.1", controller.port)
     await connection.open()
     yield connection
     await connection.close()
@@ -91,7 +113,6 @@ async def test_an_error_object_is_raised_with_its_code_and_method(controller: Co
     "answer",
     [
         pytest.param(sends(lambda _: encode(b"hello")), id="no JSON"),
-        pytest.param(sends(lambda _: encode(b"\xff\xfe")), id="no UTF-8"),
         pytest.param(sends(lambda _: encode(b"[" * 100_000)), id="nested without end"),
         pytest.param(sends(lambda i: reply(i)), id="neither result nor error"),
         pytest.param(sends(lambda i: reply(i, error="bad")), id="an error that is no object"),
@@ -106,35 +127,24 @@ async def test_a_reply_that_makes_no_sense_is_a_violation_and_the_next_call_work
     assert await client.call("second") == 2
 
 
-async def test_the_first_of_two_replies_in_one_segment_counts(controller: Controller, client: RpcConnection):
-    controller.script = [("first", None, sends(lambda i: reply(i, result=1) + reply(i, result=99)))]
-    assert await client.call("first") == 1
-
-
-async def test_when_the_controller_hangs_up_the_call_and_all_later_ones_fail_at_once(
+async def test_when_the_controller_hangs_up_all_calls_fail_until_the_connection_is_opened_again(
     controller: Controller, client: RpcConnection
 ):
-    controller.script = [("first", None, hang_up)]
+    controller.script = [("first", None, hang_up), ("third", None, result(3))]
     with pytest.raises(ConnectionLost, match="first"):
         await client.call("first")
     with pytest.raises(ConnectionLost, match="second"):
         await client.call("second")
     assert client.lost
+    await client.close()
+    await client.open()
+    assert await client.call("third") == 3
 
 
 async def test_garbage_that_breaks_the_framing_ends_the_connection(controller: Controller, client: RpcConnection):
     controller.script = [("first", None, sends(lambda i: b"\x00garbage" + reply(i, result=1)))]
     with pytest.raises(ConnectionLost, match="expected SOF"):
         await client.call("first")
-
-
-async def test_a_lost_connection_can_be_opened_again(controller: Controller, client: RpcConnection):
-    controller.script = [("first", None, hang_up), ("second", None, result(2))]
-    with pytest.raises(ConnectionLost):
-        await client.call("first")
-    await client.close()
-    await client.open()
-    assert await client.call("second") == 2
 
 
 async def test_a_call_on_a_connection_that_was_never_opened_or_is_closed_says_so(
@@ -155,3 +165,36 @@ async def test_closing_wakes_the_caller_that_still_waits(controller: Controller,
     await client.close()
     with pytest.raises(NotConnected, match="closed while waiting"):
         await waiting
+
+
+# ---------------------------------------------------------------- reports of labs
+
+
+@pytest.fixture(params=REPORTS, ids=lambda path: path.stem)
+def archive(request: pytest.FixtureRequest) -> Archive:
+    return Archive.read(request.param)
+
+
+async def test_the_same_questions_get_the_same_answers(archive: Archive) -> None:
+    async with following(archive.script(), archive.framing) as controller:
+        exchanges = await survey("127.0.0.1", controller.port, archive.framing)
+    assert [(e.method, e.params) for e in exchanges] == [(line["method"], line["params"]) for line in archive.lines]
+    for exchange, line in zip(exchanges, archive.lines, strict=True):
+        assert exchange.answer.keys() == line["answer"].keys(), exchange.method
+        assert exchange.answer.get("result") == line["answer"].get("result"), exchange.method
+
+
+async def test_the_driver_finds_what_the_doctor_found(archive: Archive) -> None:
+    if not archive.robot["answers"]:
+        pytest.skip("the driver could not connect to this cabinet")
+    controller = AnsweringByName(archive)
+    async with serving(controller):
+        arm = AuboArcs(
+            ArcsOptions(host="127.0.0.1", port=controller.port, framing=archive.framing), NOWHERE, LoopClock()
+        )
+        identity = await arm.connect()
+        state = await arm.state(1)
+        await arm.close()
+    assert identity.model == archive.robot["identity"]
+    assert archive.robot["firmware"].startswith(identity.firmware)
+    assert f"{state.mode}, safety {state.safety}" in archive.robot["notes"]

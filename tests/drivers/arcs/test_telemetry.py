@@ -13,7 +13,6 @@ from typing import Any
 import cbor2
 import pytest
 
-from brushloop.drivers.arcs import telemetry
 from brushloop.drivers.arcs.robot import AuboArcs
 from brushloop.drivers.arcs.settings import ArcsOptions
 from brushloop.drivers.arcs.telemetry import (
@@ -23,17 +22,18 @@ from brushloop.drivers.arcs.telemetry import (
     encode_sample,
     encode_topic,
 )
-from brushloop.drivers.arcs.wire import FrameDecoder, encode, encode_short
+from brushloop.drivers.arcs.wire import FrameDecoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.host import HostClock
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
 from tests.drivers.failing import mute
+from tests.simulated_time import LoopClock
+from tests.waiting import until
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 POSE = ["R1_actual_TCP_pose"]
@@ -77,19 +77,20 @@ async def served() -> AsyncIterator[Callable[[Serve], Awaitable[int]]]:
         await server.stop()
 
 
-def says(*pieces: bytes, hold_s: float = 0.3) -> Serve:
+def says(*pieces: bytes, then: str = "silence") -> Serve:
     async def script(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         for piece in pieces:
             writer.write(piece)
             await writer.drain()
             await asyncio.sleep(0.01)
-        await asyncio.sleep(hold_s)
+        if then == "silence":
+            await asyncio.sleep(60.0)
 
     return script
 
 
 async def outcome(port: int) -> list[Any]:
-    stream = RtdeStream(HOST, port, timeout_s=0.15)
+    stream = RtdeStream(HOST, port)
     try:
         await stream.open(POSE, 50.0)
         return await stream.newest()
@@ -97,23 +98,17 @@ async def outcome(port: int) -> list[Any]:
         await stream.close()
 
 
-LONG_FRAME = b"SOF\x01\x7f\xff\xff\xff"
-
-
 @pytest.mark.parametrize(
     ("script", "error"),
     [
-        (says(hold_s=0.3), DeviceTimeout),
-        (says(GREETING[:30], hold_s=0.3), DeviceTimeout),
-        (says(hold_s=0.0), ConnectionLost),
-        (says(b"hello }\n\n"), ProtocolViolation),
+        (says(), DeviceTimeout),
+        (says(GREETING[:30]), DeviceTimeout),
+        (says(then="end"), ConnectionLost),
         (says(GREETING.replace(b"R1_actual_TCP_pose", b"R1_other")), ProtocolViolation),
         (says(*[b"x" * 65536] * 10), ProtocolViolation),
         (says(GREETING), DeviceTimeout),
-        (says(GREETING, hold_s=0.0), ConnectionLost),
-        (says(GREETING, b"garbage"), ProtocolViolation),
-        (says(GREETING, LONG_FRAME), ProtocolViolation),
-        (says(GREETING, encode_short(b"\xff")), ProtocolViolation),
+        (says(GREETING, then="end"), ConnectionLost),
+        (says(GREETING, b"SOF\x01\x7f\xff\xff\xff"), ProtocolViolation),
         (says(GREETING, encode_sample(0, [])), ProtocolViolation),
         (says(GREETING, encode_sample(7, [1])), DeviceTimeout),
     ],
@@ -151,8 +146,8 @@ async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> A
     arms: list[AuboArcs] = []
 
     def make(rtde_port: int | None) -> AuboArcs:
-        options = ArcsOptions(HOST, cabinet.port, (0.0, 0.0, 180.0), rtde_port=rtde_port)
-        arms.append(AuboArcs(options, limits, HostClock(), notices.append))
+        options = ArcsOptions(host=HOST, port=cabinet.port, tcp_offset_mm=(0.0, 0.0, 180.0), rtde_port=rtde_port)
+        arms.append(AuboArcs(options, limits, LoopClock(), notices.append))
         return arms[-1]
 
     yield make
@@ -176,7 +171,7 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
     assert identity.firmware == "interface 24000, telemetry by RTDE"
     await arm.enable()
     samples = await samples_of(arm, 0.5)
-    assert 20 <= len(samples) <= 60
+    assert 40 <= len(samples) <= 60
     assert all(a.stamp.seq + 1 == b.stamp.seq for a, b in itertools.pairwise(samples))
     assert all(a.stamp.host_ns <= b.stamp.host_ns for a, b in itertools.pairwise(samples))
     await arm.move(brush_pose(300.0, -200.0, 240.0), speed_mm_s=200.0, acc_mm_s2=800.0)
@@ -184,8 +179,7 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
     assert distance(arm.latest().pose, cabinet.cabinet.world.tool())[0] < 0.01
     assert not notices
     await arm.close()
-    await asyncio.sleep(0.02)
-    assert rtde.clients == 0
+    await until(lambda: rtde.clients == 0, "the subscription to end")
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.8])
@@ -204,24 +198,16 @@ async def test_the_lag_of_pushed_poses_is_measured_while_the_arm_moves(
     assert arm.pose_lag_ms() == pytest.approx(1e3 * late_s, abs=60.0)
 
 
-async def test_a_closed_port_is_reported_and_poses_are_polled(
-    make_arm: MakeArm, notices: list[str], unused_tcp_port: int
-):
-    arm = make_arm(unused_tcp_port)
-    assert (await arm.connect()).firmware == "interface 24000, telemetry by polling"
-    assert len(await samples_of(arm, 0.2)) >= 3
-    assert len(notices) == 1
-    assert "polled" in notices[0]
-
-
-async def test_a_port_that_is_silent_from_the_start_is_not_fatal(
-    rtde: RtdeServer, make_arm: MakeArm, notices: list[str]
+async def test_a_port_that_is_closed_or_silent_is_reported_and_poses_are_polled(
+    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], unused_tcp_port: int
 ):
     mute(rtde)
-    arm = make_arm(rtde.port)
-    assert (await arm.connect()).firmware.endswith("polling")
-    assert len(await samples_of(arm, 0.2)) >= 3
-    assert "no sample" in notices[0]
+    for port in (unused_tcp_port, rtde.port):
+        arm = make_arm(port)
+        assert (await arm.connect()).firmware == "interface 24000, telemetry by polling"
+        assert len(await samples_of(arm, 0.2)) >= 3
+    assert len(notices) == 2
+    assert "polled instead of pushed: no sample" in notices[1]
 
 
 async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
@@ -239,19 +225,18 @@ async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_a
 
 @pytest.mark.parametrize("fault", ["mute", "hang up"])
 async def test_a_stream_that_ends_later_is_reported_and_poses_go_on(
-    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], fault: str, monkeypatch: pytest.MonkeyPatch
+    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], fault: str
 ):
-    monkeypatch.setattr(telemetry, "MOST_SILENCES", 0)
     arm = make_arm(rtde.port)
     await arm.connect()
     if fault == "mute":
         mute(rtde)
     else:
         rtde.drop_clients()
-    await asyncio.sleep(0.8)
-    assert len(await samples_of(arm, 0.2)) >= 3
+    await asyncio.sleep(3.0)
+    assert len(await samples_of(arm, 0.2)) >= 10
     assert len(notices) == 1
-    arm.latest()
+    assert arm._telemetry.source == "polling"
 
 
 async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, make_arm: MakeArm, cabinet: ArcsServer):
@@ -265,11 +250,8 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
     cabinet.faults.clear()
 
 
-@pytest.mark.parametrize("pose", [[1.0, 2.0], "here", [None] * 6, [1e999] * 6, 5])
-async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(
-    rtde: RtdeServer, make_arm: MakeArm, notices: list[str], pose: object
-):
-    rtde._outputs["R1_actual_TCP_pose"] = (1021, lambda: pose)
+async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
+    rtde._outputs["R1_actual_TCP_pose"] = (1021, lambda: [None] * 6)
     arm = make_arm(rtde.port)
     assert (await arm.connect()).firmware.endswith("polling")
     assert len(notices) == 1
@@ -317,7 +299,7 @@ def lag_ms(
 
 
 @pytest.mark.parametrize("path", [press, circle])
-@pytest.mark.parametrize("lag_s", [0.0, 0.12, 0.8, 2.0])
+@pytest.mark.parametrize("lag_s", [0.0, 0.12, 2.0])
 def test_the_lag_is_measured_to_a_few_milliseconds(path: Path, lag_s: float):
     assert lag_ms(path, lag_s) == pytest.approx(1e3 * lag_s, abs=15.0)
 
@@ -326,12 +308,8 @@ def test_a_computer_that_was_busy_for_a_while_does_not_count_as_a_lag():
     assert lag_ms(press, 0.0, silent=(0.3, 0.8)) == pytest.approx(0.0, abs=15.0)
 
 
-@pytest.mark.parametrize("answer_s", [0.2])
-def test_from_answers_that_took_long_nothing_is_concluded(answer_s: float):
-    assert lag_ms(press, 0.0, answer_s=answer_s) is None
-
-
-def test_an_arm_at_rest_shows_no_lag():
+def test_from_answers_that_took_long_and_from_an_arm_at_rest_nothing_is_concluded():
+    assert lag_ms(press, 0.0, answer_s=0.2) is None
     assert lag_ms(lambda _: brush_pose(400.0, 0.0, 140.0), 0.8) is None
 
 

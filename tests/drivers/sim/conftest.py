@@ -27,6 +27,9 @@ class StoppedClock:
     def now_s(self) -> float:
         return self.s
 
+    def real_s(self) -> float:
+        return self.s
+
 
 class Bench:
     """A cabinet, its clock, and a caller. The tool is configured as it is."""
