@@ -67,14 +67,13 @@ RUNS = (
 
 TOGETHER = {
     "tests/calibrate/validate/": "comparing",
-    "tests/calibrate/compare/": "comparing",
+    "tests/calibrate/test_scores.py": "comparing",
     "tests/calibrate/test_invert.py": "comparing",
     "tests/calibrate/fit/": "comparing",
     "tests/calibrate/test_loop.py": "comparing",
     "tests/calibrate/writing/": "comparing",
     "tests/calibrate/drags/": "drags",
     "tests/calibrate/test_pages.py": "pages",
-    "tests/calibrate/test_apply.py": "pages",
     "tests/calibrate/board/test_lens_in_session.py": "lens",
     "tests/model/": "model",
 }

@@ -1,4 +1,4 @@
-"""`brushloop validate` from a session to its files: what is in them, what they say, and what cannot be edited away."""
+"""`brushloop validate` from a session to its files, and two reports compared: what they say, and what is refused."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from brushloop.calibrate.fit.captures import read_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.command import Request, validate
+from brushloop.calibrate.validate.diff import compare
 from brushloop.calibrate.validate.findings import trust
 from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.page import provenance
@@ -249,3 +250,60 @@ def test_the_page_fits_a_telephone_and_a_wide_screen_and_the_browser_has_nothing
     )
     assert errors == []
     assert all(taken <= width for (_, width), taken in sizes.items()), sizes
+
+
+TWO = ("--model", "line", "--model", "ellipse", "--no-held-out")
+
+
+@pytest.fixture(scope="module")
+def before(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("before")
+    run(session, "--out", out, *TWO)
+    return out
+
+
+def test_a_report_does_not_differ_from_itself(before: Path) -> None:
+    found = compare(before, before / "report.json")
+    assert found.by_stroke
+    assert len(found.changes) == 3 * 4 * 2
+    assert {change.verdict for change in found.changes} == {"no significant difference"}
+    assert all(change.test.mean == 0.0 and change.test.n == 10 for change in found.changes)
+
+
+def test_another_scale_of_the_field_is_reported_stroke_by_stroke(session: Path, before: Path, tmp_path: Path) -> None:
+    run(session, "--out", tmp_path, *TWO, "--mm-per-px", "0.5")
+    found = {change.series: change for change in compare(before, tmp_path).changes}
+    # A coarser field: more blank paper in every window of SSIM, in each of the five cells.
+    coarser = found[("line", "mm", "binary", "ssim")]
+    assert (coarser.test.n, coarser.test.groups) == (10, 5)
+    assert coarser.test.interval is not None
+    assert coarser.test.interval[0] > 0.0
+    assert coarser.test.p == pytest.approx(2 / 2**5)  # signs are flipped by cell: five alike are no proof yet
+    assert coarser.verdict == "no significant difference"
+    table = run("diff", before, tmp_path)
+    assert "the same stroke" in table
+    assert "n = 10 in 5 cells" in table
+
+
+def test_two_sessions_are_compared_cell_by_cell(make_session: object, before: Path, tmp_path: Path) -> None:
+    other = make_session(tmp_path, "other", seed=500, blank=False)  # pyright: ignore[reportCallIssue]
+    run(other, *TWO)
+    found = compare(before, other)  # the session's own folder
+    assert not found.by_stroke
+    assert all(change.test.n == 5 for change in found.changes)
+    assert {change.verdict for change in found.changes} == {"no significant difference"}
+
+
+def test_what_has_no_report_or_an_edited_table_is_refused(session: Path, before: Path, tmp_path: Path) -> None:
+    # A report of many sessions beside a session's folder is not that session's.
+    shutil.copytree(session, tmp_path / "never", ignore=shutil.ignore_patterns("validation"))
+    shutil.copytree(before, tmp_path / "validation")
+    for never in (tmp_path / "never", tmp_path / "never" / "presses.mcap"):
+        with pytest.raises(CalibrationError, match=f"{never}: was not validated: run `brushloop validate {never}`"):
+            compare(before, never)
+    with pytest.raises(CalibrationError, match=r"nowhere: does not exist: give a report\.json"):
+        compare(tmp_path / "nowhere", before)
+    edited = tmp_path / "validation" / "scores.csv"
+    edited.write_text(edited.read_text().replace("0.9", "0.8"))
+    with pytest.raises(CalibrationError, match="its SHA-256 differs"):
+        compare(before, tmp_path / "validation")
