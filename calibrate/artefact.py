@@ -33,7 +33,7 @@ def made_by() -> str:
 class Frozen(BaseModel):
     """Base class of what is read from files: frozen, without unknown fields."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class Artefact(Frozen):

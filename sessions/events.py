@@ -9,7 +9,7 @@ import re
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from brushloop.sessions.records import Check, Condition, Header
 from brushloop.sessions.records import Event as Value
@@ -321,7 +321,7 @@ class Remark(_Event):
 _OfSession = Open | Process | FreshSheet | Ended | Closed | Remark
 _OfStep = Begin | Done | Void | Repaired | Lost | Doubt
 Event = Annotated[_OfSession | _OfStep, Field(discriminator="event")]
-_EVENTS: TypeAdapter[Event] = TypeAdapter(Event)
+_EVENTS: TypeAdapter[Event] = TypeAdapter(Event, config=ConfigDict(defer_build=True))
 
 
 def parse_event(line: dict[str, Any]) -> Event:

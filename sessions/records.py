@@ -62,7 +62,7 @@ PxPerMm = Annotated[float, Field(ge=MIN_PX_PER_MM, le=MAX_PX_PER_MM)]
 class Event(BaseModel):
     """Base of our JSON messages: frozen, without unknown fields or NaN (JSON would write it as null)."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
 
 
 class Stroke(Event):

@@ -140,7 +140,7 @@ def check_recovered(path: Path) -> None:
 class Settings(BaseModel):
     """What the presses of a loop depend on; kept in its folder, because a resumed loop must use the same settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
     original: str
     """Session id."""

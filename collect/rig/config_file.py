@@ -35,7 +35,7 @@ EARLIER_NAMES = {"height_mm": "depth_mm", "heights_mm": "depths_mm"}
 class Config(BaseModel):
     """Base: frozen, extra keys refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 def place(name: str) -> str:

@@ -29,7 +29,7 @@ ANCHOR_SHARE = (0.76, 0.5)
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True, allow_inf_nan=False)
 
 
 class Placement(StrEnum):
