@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 LEFT_OUT = 3
 """Exit code of an export that left strokes out."""
-DRAG_MM_PER_PX = 0.4
-"""Scale of the images that drags are fitted to."""
 
 
 class PathOrCommand(TyperGroup):
@@ -59,7 +57,7 @@ def fit(
     session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
     mm_per_px: Annotated[
         float | None,
-        typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags {DRAG_MM_PER_PX:g}."),
+        typer.Option(min=0.1, max=1.0, help=f"Scale of the images; {MM_PER_PX:g}, with --drags 0.4."),
     ] = None,
     drags: Annotated[
         bool, typer.Option("--drags", help="Fit bristle lag to drags; writes dragfit/<hash>.json.")
@@ -86,21 +84,19 @@ def fit(
 
 def _fit_drags(session: Path, mm_per_px: float | None, prior: Path | None, strokes: int | None) -> None:
     from brushloop.calibrate.artefact import load_artefact, put_to_use
-    from brushloop.calibrate.drags.captures import read_drags
-    from brushloop.calibrate.drags.fit import FOLDER, DragArtefact, fit_drawn, refit_drawn
+    from brushloop.calibrate.drags import MM_PER_PX, read_drags
+    from brushloop.calibrate.drags.fit import FOLDER, DragArtefact, adapt_drags, fit_drags
     from brushloop.calibrate.drags.report import fit_lines
-    from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
 
     before = load_artefact(prior, DragArtefact) if prior is not None else None
-    scale = mm_per_px or (before.mm_per_px if before is not None else DRAG_MM_PER_PX)
     with shown() as progress:
-        drawn = read_drags(session, scale, progress).drawn()
+        drags = read_drags(session, mm_per_px or (before.mm_per_px if before is not None else MM_PER_PX), progress)
         if before is not None:
-            artefact = refit_drawn(drawn, before, str(prior), strokes or len(drawn.stroke_ids))
+            artefact = adapt_drags(drags, before, str(prior), strokes or len(drags.placed))
         else:
-            artefact = fit_drawn(drawn, progress)
-    say(*fit_lines(drawn, artefact), f"Fit: {put_to_use(artefact, Recording(session).path.parent, FOLDER)}")
+            artefact = fit_drags(drags, progress)
+    say(*fit_lines(drags, artefact), f"Fit: {put_to_use(artefact, drags.session.recording.path.parent, FOLDER)}")
 
 
 def export(

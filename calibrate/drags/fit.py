@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated, Self
+from dataclasses import replace
+from typing import Annotated, Any, Self
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import FittedValue, Frozen, SessionFit, made_by
-from brushloop.calibrate.drags.captures import COMMANDS, Drawn, commanded_path
+from brushloop.calibrate.drags import COMMANDS, Drags, commanded_path
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stats import farthest_first
 from brushloop.model.drag import DragModel, Drawings, Floats, Indices, Trails, derivatives, fit_to_ink, lagging
@@ -72,63 +72,49 @@ Masks = NDArray[np.bool_]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-@dataclass(frozen=True, slots=True)
-class DragFit:
-    """A drag model fitted to strokes, with what its intervals need."""
+def fit_values(
+    drawings: Drawings, start: DragModel | None = None, freedom: Mapping[str, float] = FREEDOM
+) -> dict[str, FittedValue]:
+    """Fit the parameters that `freedom` names, with the standard deviations of their prior around `start`.
 
-    model: DragModel
-    scaled: Floats
-    """(P,) changes of the free parameters from their start, in standard deviations of the prior."""
-    freedom: Mapping[str, float]
-    """Standard deviations of the prior of the free parameters, by name."""
-    squares: Floats
-    """(images, P, P) scaled J'J of each image."""
-    gradients: Floats
-    """(images, P)."""
-
-    def values(self) -> dict[str, FittedValue]:
-        """The free parameters, with intervals from a bootstrap over images; a draw is one Gauss-Newton step.
-
-        Those that the strokes do not determine have no interval; with one image, none has. With fewer than about 8
-        images the intervals are too short.
-        """
-        count, unit = len(self.squares), np.eye(len(self.scaled))
-        weights = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), DRAWS).astype(np.float64)
-        square = np.tensordot(weights, self.squares, 1) + unit
-        steps = np.linalg.solve(square, -(weights @ self.gradients + self.scaled)[..., None])[..., 0]
-        drawn = np.quantile(steps, [0.025, 0.975], axis=0)
-        variance = np.diag(np.asarray(np.linalg.inv(self.squares.sum(axis=0) + unit), np.float64))
-        values: dict[str, FittedValue] = {}
-        for at, (name, sd) in enumerate(self.freedom.items()):
-            value = float(getattr(self.model, name))
-            low, high = (value + sd * float(end) for end in drawn[:, at])
-            known = variance[at] < 1.0 - UNDETERMINED and low < high
-            values[name] = FittedValue(value=value, low=low if known else None, high=high if known else None)
-        return values
-
-
-def fit_drags(drawings: Drawings, start: DragModel | None = None, freedom: Mapping[str, float] = FREEDOM) -> DragFit:
-    """Fit the parameters that `freedom` names, with the standard deviations of their prior around `start`."""
+    The intervals come from a bootstrap over images, in which a draw is one Gauss-Newton step. Parameters that the
+    strokes do not determine have no interval; with one image, none has. With fewer than about 8 images the intervals
+    are too short.
+    """
     begin = (start or DragModel()).vector()
     at = [DragModel.names().index(name) for name in freedom]
     sd = np.array(list(freedom.values()))
 
-    def vector(scaled: Floats) -> Floats:
-        values = begin.copy()
-        values[at] += sd * scaled
-        return values
-
     def trails_at(scaled: Floats) -> Trails:
-        return lagging(drawings.paths, vector(scaled))
+        vector = begin.copy()
+        vector[at] += sd * scaled
+        return lagging(drawings.paths, vector)
 
     scaled = fit_to_ink(trails_at, np.zeros(len(at)), drawings, SPREAD_MM)
     trails, slopes = trails_at(scaled), derivatives(trails_at, scaled)
-    alone = (
+    count, unit = len(drawings.ink), np.eye(len(at))
+    of_images = [
         replace(trails, groups=trails.groups[k : k + 2]).equations(slopes, drawings.only(np.array([k])), SPREAD_MM)
-        for k in range(len(drawings.ink))
-    )
-    squares, gradients = zip(*((at.square, at.gradient) for at in alone), strict=True)
-    return DragFit(DragModel.of(vector(scaled)), scaled, freedom, np.array(squares), np.array(gradients))
+        for k in range(count)
+    ]
+    squares = np.array([each.square for each in of_images])
+    gradients = np.array([each.gradient for each in of_images])
+    weights = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), DRAWS).astype(np.float64)
+    steps = np.linalg.solve(np.tensordot(weights, squares, 1) + unit, -(weights @ gradients + scaled)[..., None])
+    ends = np.quantile(steps[..., 0], [0.025, 0.975], axis=0)
+    variance = np.diag(np.asarray(np.linalg.inv(squares.sum(axis=0) + unit), np.float64))
+    known = (variance < 1.0 - UNDETERMINED) & (ends[0] < ends[1])
+    values = begin[at] + sd * scaled
+    rows = zip(values.tolist(), *(values + sd * ends).tolist(), known.tolist(), strict=True)
+    return {
+        name: FittedValue(value=value, low=low if is_known else None, high=high if is_known else None)
+        for name, (value, low, high, is_known) in zip(freedom, rows, strict=True)
+    }
+
+
+def model_of(values: Mapping[str, FittedValue]) -> DragModel:
+    """The drag model of fitted parameters, all of them by name."""
+    return DragModel(**{name: fitted.value for name, fitted in values.items()})
 
 
 class Kept(Frozen):
@@ -151,19 +137,19 @@ class Kept(Frozen):
     """All images below each other, as a PNG in base64."""
 
     @staticmethod
-    def of(drawn: Drawn, images: Indices) -> Kept:
+    def of(drags: Drags, images: Indices) -> Kept:
         """These strokes, evenly chosen if there are too many. Raises `CalibrationError` for too fine images."""
-        used = images[:: -(-len(images) // MOST_STROKES)]
-        picture = 255 * (drawn.drawings.ink[used] > 0.5).astype(np.uint8).reshape(-1, len(drawn.drawings.x_mm))
+        used, drawings = images[:: -(-len(images) // MOST_STROKES)], drags.drawings
+        picture = 255 * (drawings.ink[used] > 0.5).astype(np.uint8).reshape(-1, len(drawings.x_mm))
         data = base64.b64encode(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_BILEVEL, 1])[1].tobytes()).decode()
         if len(data) > MOST_BYTES:
-            what = f"{drawn.mm_per_px:g} is too fine for the artefact of {len(used)} strokes"
+            what = f"{drags.mm_per_px:g} is too fine for the artefact of {len(used)} strokes"
             raise CalibrationError("--mm-per-px", what)
         return Kept(
-            commands=np.round(drawn.commands[used], 6).tolist(),
-            mm_per_px=round(drawn.mm_per_px, 9),
-            left_mm=round(float(drawn.drawings.x_mm[0]), 6),
-            top_mm=round(float(drawn.drawings.y_mm[0]), 6),
+            commands=np.round(drags.commands[used], 6).tolist(),
+            mm_per_px=round(drags.mm_per_px, 9),
+            left_mm=round(float(drawings.x_mm[0]), 6),
+            top_mm=round(float(drawings.y_mm[0]), 6),
             ink=data,
         )
 
@@ -205,16 +191,16 @@ class Kept(Frozen):
         return np.asarray(change[:, rows[:, None], columns], np.float64)
 
 
-def predicted(model: DragModel, kept: Kept | None, drawn: Drawn, images: Indices) -> dict[str, Masks]:
+def predicted(model: DragModel, kept: Kept | None, drags: Drags, images: Indices) -> dict[str, Masks]:
     """The ink that these strokes should show, by row of a report, (n, len(y_mm), len(x_mm)) each.
 
     `PREDICTED` is the best prediction, and `LAG`, where strokes correct it, that without them.
     """
-    drawings = drawn.drawings.only(images)
+    drawings = drags.drawings.only(images)
     away = lagging(drawings.paths, model.vector()).distances(drawings.x_mm, drawings.y_mm)
     if kept is None:
         return {PREDICTED: away > EDGE_MM}
-    missed = kept.missed_mm(model, drawn.commands[images], drawings.x_mm, drawings.y_mm)
+    missed = kept.missed_mm(model, drags.commands[images], drawings.x_mm, drawings.y_mm)
     return {PREDICTED: clipped(away) + missed > EDGE_MM, LAG: away > EDGE_MM}
 
 
@@ -257,41 +243,41 @@ class DragArtefact(SessionFit):
 
     def model(self) -> DragModel:
         """The fitted drag model."""
-        return DragModel(**{name: value.value for name, value in self.parameters.items()})
+        return model_of(self.parameters)
 
 
-def fit_drawn(drawn: Drawn, progress: Progress = unseen) -> DragArtefact:
+def fit_drags(drags: Drags, progress: Progress = unseen) -> DragArtefact:
     """Fit all strokes, leave out each fifth of their commands in turn, and make the artefact.
 
     Raises `CalibrationError` for fewer than three strokes without a defect.
     """
-    images = drawn.sound
+    images = drags.sound
     if len(images) < LEAST:
         what = f"{len(images)} dragged strokes without a defect, at least {LEAST} are needed"
-        raise CalibrationError(drawn.header.session_id, what)
-    update = {"held_out": _held_out(drawn, progress), "kept": Kept.of(drawn, images)}
-    return _artefact(drawn, images, fit_drags(_coarse(drawn, images)).values()).model_copy(update=update)
+        raise CalibrationError(drags.session.header.session_id, what)
+    held_out, kept = _held_out(drags, progress), Kept.of(drags, images)
+    return _artefact(drags, images, fit_values(_coarse(drags, images)), held_out=held_out, kept=kept)
 
 
-def refit_drawn(drawn: Drawn, prior: DragArtefact, where: str, strokes: int) -> DragArtefact:
+def adapt_drags(drags: Drags, prior: DragArtefact, where: str, strokes: int) -> DragArtefact:
     """Adapt a known brush to `strokes` strokes of a session, as different as possible (`session_change`).
 
     Raises `CalibrationError` if the session has fewer, or if its scale is not that of `prior`.
     """
-    count = len(drawn.sound)
+    count = len(drags.sound)
     if not 1 <= strokes <= count:
         raise CalibrationError("--strokes", f"{strokes}: allowed 1 to {count}, the usable strokes")
-    if abs(drawn.mm_per_px - prior.mm_per_px) > 1e-6:
-        raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drawn.mm_per_px:g}")
-    images = np.sort(drawn.sound[different(drawn.commands[drawn.sound], strokes)])
-    drawings = _coarse(drawn, images)
+    if abs(drags.mm_per_px - prior.mm_per_px) > 1e-6:
+        raise CalibrationError(where, f"mm_per_px is {prior.mm_per_px:g}, here {drags.mm_per_px:g}")
+    images = np.sort(drags.sound[different(drags.commands[drags.sound], strokes)])
+    drawings = _coarse(drags, images)
     # A prior that is narrower by the root of a weight counts as much as ink of that weight.
     weight = STROKE_MM2 * float(drawings.x_mm[1] - drawings.x_mm[0]) ** 2
-    known = drawn.commands if prior.kept is None else np.array(prior.kept.commands)
+    known = drags.commands if prior.kept is None else np.array(prior.kept.commands)
     freedom = {name: sd * weight**0.5 for name, sd in session_change(known).items()}
-    values = fit_drags(drawings, prior.model(), freedom).values()
-    update = {"prior": prior.digest, "prior_session": f"{prior.session_id}, {prior.source}", "refitted": tuple(values)}
-    return _artefact(drawn, images, prior.parameters | values).model_copy(update=update)
+    values, origin = fit_values(drawings, prior.model(), freedom), f"{prior.session_id}, {prior.source}"
+    about = {"prior": prior.digest, "prior_session": origin, "refitted": tuple(values)}
+    return _artefact(drags, images, prior.parameters | values, **about)
 
 
 def different(commands: Floats, count: int) -> Indices:
@@ -311,35 +297,36 @@ def session_change(commands: Floats) -> dict[str, float]:
     return {name: changes[name] for name in DragModel.names() if name in changes}
 
 
-def _coarse(drawn: Drawn, images: Indices) -> Drawings:
+def _coarse(drags: Drags, images: Indices) -> Drawings:
     """These strokes with pixels of about `FIT_MM`."""
-    return drawn.drawings.only(images).every(max(1, round(FIT_MM / drawn.mm_per_px)))
+    return drags.drawings.only(images).every(max(1, round(FIT_MM / drags.mm_per_px)))
 
 
-def _artefact(drawn: Drawn, images: Indices, values: dict[str, FittedValue]) -> DragArtefact:
+def _artefact(drags: Drags, images: Indices, values: dict[str, FittedValue], **more: Any) -> DragArtefact:
     return DragArtefact(
-        session_id=drawn.header.session_id,
-        source=drawn.header.source,
-        recording_sha256=drawn.recording_sha256,
+        session_id=drags.session.header.session_id,
+        source=drags.session.header.source,
+        recording_sha256=drags.session.sha256,
         calibration="",
         software=made_by(),
-        mm_per_px=round(drawn.mm_per_px, 9),
+        mm_per_px=round(drags.mm_per_px, 9),
         parameters=values,
-        fitted_strokes=tuple(drawn.stroke_ids[int(k)] for k in images),
+        fitted_strokes=tuple(drags.placed[int(k)].stroke.stroke_id for k in images),
+        **more,
     )
 
 
-def _held_out(drawn: Drawn, progress: Progress) -> dict[str, tuple[float, float]]:
+def _held_out(drags: Drags, progress: Progress) -> dict[str, tuple[float, float]]:
     """Scores on commands that were left out; empty for fewer than `FOLDS` of them."""
-    conditions = drawn.conditions
+    conditions = drags.conditions
     order = np.random.default_rng(0).permutation(conditions.max() + 1)
     scores: dict[str, list[Floats]] = {}
     for k in counted(range(FOLDS if len(order) >= FOLDS else 0), "fifths left out in turn", FOLDS, progress):
-        is_left = np.isin(conditions, order[k::FOLDS])
-        left, others = np.flatnonzero(is_left), np.setdiff1d(drawn.sound, np.flatnonzero(is_left))
-        model = fit_drags(_coarse(drawn, others)).model
-        truth = drawn.drawings.ink[left] > 0.5
-        for name, seen in predicted(model, Kept.of(drawn, others), drawn, left).items():
+        left = np.flatnonzero(np.isin(conditions, order[k::FOLDS]))
+        others = np.setdiff1d(drags.sound, left)
+        model = model_of(fit_values(_coarse(drags, others)))
+        truth = drags.drawings.ink[left] > 0.5
+        for name, seen in predicted(model, Kept.of(drags, others), drags, left).items():
             scores.setdefault(name, []).append(binary_scores(seen, truth))
     means = {name: 100.0 * np.concatenate(each).mean(axis=0) for name, each in scores.items()}
     return {name: (float(csim), float(iou)) for name, (csim, iou) in means.items()}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from brushloop.calibrate.artefact import load_artefact, made_by
-from brushloop.calibrate.drags.captures import MM_PER_PX, Drags, Drawn, read_drags
+from brushloop.calibrate.drags import Drags, read_drags
 from brushloop.calibrate.drags.fit import PREDICTED, DragArtefact, predicted
 from brushloop.calibrate.report import (
     ORANGE,
@@ -52,17 +52,23 @@ LIMITS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Predictions:
-    """Every usable stroke of a session beside its predictions, and the fit that predicted it."""
+class DragValidation:
+    """What was measured in a recording of drags, and what a fit predicts of those that can be predicted."""
 
-    artefact: DragArtefact
-    drawn: Drawn
+    drags: Drags
+    fit: DragArtefact | None
+    """What predicts them; without a fit, everything below is empty."""
     scores: dict[str, Floats]
     """(n, 2) CSIM and IoU by row of the report; NaN where a stroke has none."""
     seen: NDArray[np.bool_]
     """(n, rows, columns) predicted ink."""
     fitted: NDArray[np.bool_]
     """(n,) whether the fit was fitted to the stroke."""
+
+    @property
+    def header(self) -> Header:
+        """Where the strokes come from."""
+        return self.drags.session.header
 
     @property
     def scored(self) -> NDArray[np.int64]:
@@ -81,29 +87,25 @@ class Predictions:
                 rows[name]["strokes"] = len(each)
         return rows
 
-    def worst(self) -> list[int]:
-        """Positions of the strokes with the lowest CSIM among those scored, the worst first."""
-        return sorted(self.scored.tolist(), key=lambda k: self.scores[PREDICTED][k, 0])[:MAX_WORST]
-
-    def to_json(self) -> str:
+    def to_json(self, fit: DragArtefact) -> str:
         """All scores as JSON, with where ink and fit come from."""
-        header, fit, drawn = self.drawn.header, self.artefact, self.drawn
+        header, drags = self.header, self.drags
         contents = {
             "session_id": header.session_id,
             "source": str(header.source),
-            "recording_sha256": drawn.recording_sha256,
+            "recording_sha256": drags.session.sha256,
             "fit": fit.digest,
             "fit_session": fit.session_id,
             "fit_source": fit.source,
             "prior": fit.prior,
             "mm_per_px": fit.mm_per_px,
-            "depth_at_the_ends": drawn.ends,
+            "depth_at_the_ends": drags.ends,
             "in_sample": bool(self.fitted.all()),
             "over_all": self.means(),
-            "left_out": [{"stroke_id": name, "why": why} for name, why in drawn.left_out],
+            "left_out": [{"stroke_id": name, "why": why} for name, why in drags.left_out],
             "strokes": [
                 {
-                    "stroke_id": name,
+                    "stroke_id": drag.stroke.stroke_id,
                     "in_sample": bool(self.fitted[k]),
                     "scores": {
                         row: {"csim": round(float(scores[k, 0]), 6), "iou": round(float(scores[k, 1]), 6)}
@@ -111,22 +113,29 @@ class Predictions:
                         if np.isfinite(scores[k, 0])
                     },
                 }
-                for k, name in enumerate(drawn.stroke_ids)
+                for k, drag in enumerate(drags.placed)
             ],
         }
         return json.dumps(contents, indent=1, ensure_ascii=False) + "\n"
 
 
-def predict_drags(drags: Drags, artefact: DragArtefact) -> Predictions:
-    """Predict every usable stroke of a session that was read at the scale of the fit. Raises `CalibrationError`."""
-    drawn = drags.drawn()
-    truth = drawn.drawings.ink > 0.5
-    own = artefact.recording_sha256 == drawn.recording_sha256
-    fitted = np.array([own and name in artefact.fitted_strokes for name in drawn.stroke_ids])
-    rows = predicted(artefact.model(), artefact.kept, drawn, np.arange(len(truth)))
+def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen) -> DragValidation:
+    """Measure every stroke of a session, and predict those that a fit of drags can predict.
+
+    Raises `CalibrationError`, also for a file that is no fit of drags.
+    """
+    if fit is None:
+        nothing = np.zeros(0, np.bool_)
+        return DragValidation(read_drags(session, progress=progress), None, {}, nothing, nothing)
+    artefact = load_artefact(fit, DragArtefact)
+    drags = read_drags(session, artefact.mm_per_px, progress)
+    truth = drags.drawings.ink > 0.5
+    known = artefact.fitted_strokes if artefact.recording_sha256 == drags.session.sha256 else ()
+    fitted = np.array([drag.stroke.stroke_id in known for drag in drags.placed])
+    rows = predicted(artefact.model(), artefact.kept, drags, np.arange(len(truth)))
     scores = {name: binary_scores(seen, truth) for name, seen in rows.items()}
-    scores[CEILING] = _ceiling(drawn.conditions, truth)
-    return Predictions(artefact, drawn, scores, rows[PREDICTED], fitted)
+    scores[CEILING] = _ceiling(drags.conditions, truth)
+    return DragValidation(drags, artefact, scores, rows[PREDICTED], fitted)
 
 
 def _ceiling(conditions: NDArray[np.int64], truth: NDArray[np.bool_]) -> Floats:
@@ -139,89 +148,71 @@ def _ceiling(conditions: NDArray[np.int64], truth: NDArray[np.bool_]) -> Floats:
     return 0.01 * np.apply_along_axis(ceiling_values, 0, 100.0 * pairs, conditions)
 
 
-@dataclass(frozen=True, slots=True)
-class DragValidation:
-    """What was measured in a recording of drags, and what a fit predicts of it."""
-
-    drags: Drags
-    predictions: Predictions | None = None
-
-    @property
-    def header(self) -> Header:
-        """Where the strokes come from."""
-        return self.drags.header
-
-
-def validate_drags(session: Path, fit: Path | None, progress: Progress = unseen) -> DragValidation:
-    """Measure every stroke of a session, and predict those that a fit of drags can predict.
-
-    Raises `CalibrationError`, also for a file that is no fit of drags.
-    """
-    artefact = load_artefact(fit, DragArtefact) if fit is not None else None
-    drags = read_drags(session, artefact.mm_per_px if artefact is not None else MM_PER_PX, progress)
-    return DragValidation(drags, predict_drags(drags, artefact) if artefact is not None else None)
-
-
 def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
-    """Write `report.html` and `measured.csv` into `folder`; returns the report's path. Raises OSError."""
-    drags, predictions = validation.drags, validation.predictions
+    """Write `report.html` and `measured.csv` into `folder`, and with a fit `report.json`; returns the page's path.
+
+    Raises OSError.
+    """
+    drags, header = validation.drags, validation.header
     step = max(1, -(-len(drags.strokes) // MAX_THUMBNAILS))
-    facts = recording_facts(drags.header, drags.recording.name, drags.recording_sha256, None)
+    facts = recording_facts(header, drags.session.recording.path.name, drags.session.sha256, None)
     page = render(
         "drags.html.j2",
-        header=drags.header,
-        note=source_note(drags.header.source, drags.header.brush),
-        refused=drags.refused,
+        header=header,
+        note=source_note(header.source, header.brush),
         provenance=[*facts, ("validated with", made_by()), ("command", command)],
-        strokes=len(drags.strokes),
+        drags=drags,
         limits=LIMITS,
         sentences=list(fit_sentences(drags)),
         plot=_plot(drags) if drags.strokes else "",
-        thumbnails=[(drag.stroke_id, image_uri(drag.thumbnail)) for drag in drags.strokes[::step]],
-        cut=[drag.stroke_id for drag in drags.strokes if drag.cut],
-        flagged=[(drag.stroke_id, "; ".join(drag.flags)) for drag in drags.strokes if drag.flags],
-        means=predictions.means() if predictions else {},
-        predicted_by=list(prediction_sentences(predictions)) if predictions else [],
-        worst=list(_worst(predictions)) if predictions else [],
+        thumbnails=[(drag.stroke.stroke_id, image_uri(drag.thumbnail)) for drag in drags.strokes[::step]],
+        means=validation.means(),
+        predicted_by=list(prediction_sentences(validation)),
+        worst=list(_worst(validation)),
     )
     files = {MEASURED: drags_csv(drags), "report.html": page}
-    if predictions is not None:
-        files["report.json"] = predictions.to_json()
+    if validation.fit is not None:
+        files["report.json"] = validation.to_json(validation.fit)
     write_files(folder, files)
     return folder / "report.html"
 
 
 def drags_csv(drags: Drags) -> str:
     """CSV of commanded and measured values, one row per stroke."""
-    names = sorted({name for drag in drags.strokes for name in drag.commanded})
-    sizes = ["measured_length_mm", "measured_width_mm", "measured_mid_width_mm", "measured_area_mm2"]
-    head = ["stroke_id", *(f"commanded_{name}" for name in names), *sizes, "cut", "flags", "source"]
-    rows: list[list[object]] = []
-    for drag in drags.strokes:
-        m = drag.measured
-        measured = [f"{v:.3f}" for v in (m.length_mm, m.width_mm, m.mid_width_mm, m.area_mm2)]
-        commanded = [drag.commanded.get(name, "") for name in names]
-        marked = [int(drag.cut), "; ".join(drag.flags), str(drags.header.source)]
-        rows.append([drag.stroke_id, *commanded, *measured, *marked])
-    return csv_text(head, rows)
+    commanded = [
+        drag.stroke.commanded
+        | {name: value for name in ("depth_mm", "tilt_deg") if (value := getattr(drag.stroke, name)) is not None}
+        for drag in drags.strokes
+    ]
+    names = sorted({name for values in commanded for name in values})
+    sizes = ("length_mm", "width_mm", "mid_width_mm", "area_mm2")
+    head = ["stroke_id", *(f"commanded_{name}" for name in names), *(f"measured_{size}" for size in sizes)]
+    source, rows = str(drags.session.header.source), list[list[object]]()
+    for drag, values in zip(drags.strokes, commanded, strict=True):
+        measured = [f"{getattr(drag.measured, size):.3f}" for size in sizes]
+        marked = [int(drag.cut), "; ".join(drag.flags), source]
+        rows.append([drag.stroke.stroke_id, *(values.get(name, "") for name in names), *measured, *marked])
+    return csv_text([*head, "cut", "flags", "source"], rows)
 
 
-def prediction_sentences(predictions: Predictions) -> Iterator[str]:
-    """Sentences on what predicted these strokes, and over which strokes the scores are."""
-    fit, header = predictions.artefact, predictions.drawn.header
+def prediction_sentences(validation: DragValidation) -> Iterator[str]:
+    """Sentences on what predicted these strokes, and over which strokes the scores are; none without a fit."""
+    fit, fitted = validation.fit, validation.fitted
+    if fit is None:
+        return
     adapted = f", adapted to {len(fit.fitted_strokes)} strokes of {fit.session_id}" if fit.prior else ""
     origin = fit.prior_session if fit.prior else f"{fit.session_id}, {fit.source}"
     yield (
-        f"{len(predictions.scored)} strokes ({header.source}) predicted by the fit {fit.digest} of {origin}{adapted}; "
-        f"ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm per pixel, no shift."
+        f"{len(validation.scored)} strokes ({validation.header.source}) predicted by the fit {fit.digest} of "
+        f"{origin}{adapted}; ink as 0 or 1 at the commanded place, {fit.mm_per_px:g} mm per pixel, no shift."
     )
-    if predictions.fitted.all():
+    if fitted.all():
         yield "In sample: the fit was fitted to every one of these strokes."
-    elif predictions.fitted.any():
-        yield f"The means leave out {predictions.fitted.sum()} strokes that the fit was fitted to."
-    if CEILING not in predictions.means():
+    elif fitted.any():
+        yield f"The means leave out {fitted.sum()} strokes that the fit was fitted to."
+    if CEILING not in validation.means():
         yield "No command was repeated, so the ceiling (the score of a perfect model) is not known."
-    yield ends_sentence(predictions.drawn.ends)
+    yield ends_sentence(validation.drags.ends)
 
 
 def ends_sentence(ends: str) -> str:
@@ -234,14 +225,15 @@ def ends_sentence(ends: str) -> str:
     )
 
 
-def _worst(predictions: Predictions) -> Iterator[tuple[str, float, float, str]]:
-    """Name, CSIM, IoU and overlay of the worst predicted strokes."""
-    for k in predictions.worst():
-        seen, ink = predictions.seen[k], predictions.drawn.drawings.ink[k]
+def _worst(validation: DragValidation) -> Iterator[tuple[str, float, float, str]]:
+    """Name, CSIM, IoU and overlay of the strokes with the lowest CSIM among those scored, the worst first."""
+    lowest = sorted(validation.scored.tolist(), key=lambda k: validation.scores[PREDICTED][k, 0])
+    for k in map(int, lowest[:MAX_WORST]):
+        seen, drag, ink = validation.seen[k], validation.drags.placed[k], validation.drags.drawings.ink[k]
         window = inked_window(seen, ink > 0.5, 0)
-        csim, iou = predictions.scores[PREDICTED][k].tolist()
-        uri = overlay_uri(ink[window].astype(np.float64), seen[window].astype(np.float64))
-        yield predictions.drawn.stroke_ids[k], csim, iou, uri
+        csim, iou = validation.scores[PREDICTED][k].tolist()
+        uri = overlay_uri(ink[window], seen[window].astype(np.float32))
+        yield drag.stroke.stroke_id, csim, iou, uri
 
 
 def fit_sentences(drags: Drags) -> Iterator[str]:
@@ -274,32 +266,33 @@ def _plot(drags: Drags) -> str:
         ends = np.array([points[:, 0].min(), points[:, 0].max()])
         marks.append(Marks(ends, line.slope * ends + line.intercept, ORANGE, line_px=1.5))
     across, up = Axis("commanded depth, mm"), Axis("measured width at the middle, mm")
-    return chart_uri([Panel(str(drags.header.source), across, up, marks)], (720, 400))
+    return chart_uri([Panel(str(drags.session.header.source), across, up, marks)], (720, 400))
 
 
 def summary(validation: DragValidation) -> Iterator[Table | str]:
     """What is printed about a session: lines and tables."""
-    drags, predictions = validation.drags, validation.predictions
-    yield f"{drags.header.session_id}: {source_note(drags.header.source)}"
+    drags, header = validation.drags, validation.header
+    yield f"{header.session_id}: {source_note(header.source)}"
     yield f"{len(drags.strokes)} strokes measured: {MEASURED} has length, width and area beside what was commanded"
     yield from fit_sentences(drags)
-    if predictions is not None:
-        yield from prediction_sentences(predictions)
-        table = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, percent ({drags.header.source})")
-        for name, row in predictions.means().items():
+    yield from prediction_sentences(validation)
+    if means := validation.means():
+        table = Table("", "n", "CSIM", "sd", "IoU", title=f"over all, percent ({header.source})")
+        for name, row in means.items():
             percent = (f"{100 * row[measure]:.2f}" for measure in ("csim", "csim_sd", "iou"))
             table.add_row(name, f"{row['strokes']:.0f}", *percent)
         yield table
-    yield from (f"not fitted: {drag.stroke_id}: {'; '.join(drag.flags)}" for drag in drags.strokes if drag.flags)
+    yield from (f"not fitted: {drag.stroke.stroke_id}: {'; '.join(drag.flags)}" for drag in drags.strokes if drag.flags)
     yield from (f"not used: {stroke_id}: {why}" for stroke_id, why in drags.refused)
 
 
-def fit_lines(drawn: Drawn, artefact: DragArtefact) -> Iterator[Any]:
+def fit_lines(drags: Drags, artefact: DragArtefact) -> Iterator[Any]:
     """What is printed about a fit: lines and tables."""
-    label = source_label(drawn.header.source, [drawn.header.brush])
-    yield f"{source_note(drawn.header.source, drawn.header.brush)}; {len(artefact.fitted_strokes)} dragged strokes"
-    yield from (f"left out: {name}: {why}" for name, why in drawn.left_out)
-    yield ends_sentence(drawn.ends)
+    header = drags.session.header
+    label = source_label(header.source, [header.brush])
+    yield f"{source_note(header.source, header.brush)}; {len(artefact.fitted_strokes)} dragged strokes"
+    yield from (f"left out: {name}: {why}" for name, why in drags.left_out)
+    yield ends_sentence(drags.ends)
     if artefact.prior:
         adapted = ", ".join(artefact.refitted)
         yield f"The brush of {artefact.prior_session} (fit {artefact.prior}), with these adapted: {adapted}."
