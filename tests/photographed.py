@@ -27,11 +27,13 @@ def photograph(path: Path, mark: Footprint, size_px: tuple[int, int], touch_px: 
     cv2.imwrite(str(path), page)
 
 
-def imported(photos: Path, lines: Sequence[str], out: Path, kind: Literal["press", "drag"]) -> Path:
+def imported(
+    photos: Path, lines: Sequence[str], out: Path, kind: Literal["press", "drag"], *, simulated: bool = False
+) -> Path:
     """The session of these photographs; `lines` are those of their table, its head first."""
     table = photos / "strokes.csv"
     table.write_text("\n".join(lines) + "\n")
-    import_photographs(photos, table, out, ImportOptions(kind=kind), "test", lambda: 1)
+    import_photographs(photos, table, out, ImportOptions(kind=kind, simulated=simulated), "test", lambda: 1)
     return out
 
 

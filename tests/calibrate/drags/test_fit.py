@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from bench import accuracy
 from bench.brushes import DATA
+from brushloop.calibrate.drags import Drag, Drags, commanded_path
 from brushloop.calibrate.drags import fit as drags
-from brushloop.calibrate.drags.captures import Drawn, commanded_path
-from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_drags, predicted
+from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_values, model_of, predicted
+from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.model.drag import DragModel, Drawings, ink, lagging
-from brushloop.sessions.records import Header, Source
+from brushloop.sessions.records import Header, Source, Stroke
 
 X_MM, Y_MM = np.arange(-10.0, 50.0, 1.0), np.arange(18.0, -18.0, -1.0)
 TRUTH = DragModel(half_mm=1.5, half_per_mm=0.4, leash_mm=3.0, leash_per_mm=0.5, drift_y_mm=0.5, settle_mm=2.0)
@@ -35,57 +37,58 @@ def drawings(paths: list[np.ndarray], model: DragModel = TRUTH) -> Drawings:
     return Drawings(paths, np.arange(len(paths) + 1), ink(away, drags.SPREAD_MM).astype(np.float32), X_MM, Y_MM)
 
 
-def repeated(conditions: int, repeats: int, rows_up: list[int] | None = None) -> Drawn:
+def repeated(conditions: int, repeats: int, rows_up: list[int] | None = None, flawed: tuple[int, ...] = ()) -> Drags:
     """An imported session in which each command was drawn several times; each image is moved up by a number of rows."""
-    length, bend, depth = np.linspace(20.0, 35.0, conditions), np.linspace(-9.0, 9.0, conditions), 5.0
-    rows = [[a, b, depth, depth, 0.0] for a, b in zip(length, bend, strict=True) for _ in range(repeats)]
-    drawn = drawings([commanded_path(*row[:4]) for row in rows])
-    seen = (drawn.ink > 0.5).astype(np.float32)
-    seen = np.array([np.roll(image, by, axis=0) for image, by in zip(seen, rows_up or [0] * len(rows), strict=True)])
+    length, bend = np.linspace(20.0, 35.0, conditions), np.linspace(-9.0, 9.0, conditions)
+    commands = [(a, b, 5.0, 5.0, 0.0) for a, b in zip(length, bend, strict=True) for _ in range(repeats)]
+    images = drawings([commanded_path(*command[:4]) for command in commands]).ink > 0.5
+    strokes = []
+    for k, (command, image, by) in enumerate(zip(commands, images, rows_up or [0] * len(commands), strict=True)):
+        stroke, flags = Stroke(stroke_id=str(k), kind="drag", still=k), ("torn",) if k in flawed else ()
+        ink = np.roll(image, by, axis=0).astype(np.float32)
+        strokes.append(Drag(stroke, command, Measured(1.0, 1.0, 1.0, 1.0, 1.0), False, flags, np.zeros((1, 1)), ink))
     header = Header(session_id="s", source=Source.IMPORT, software="test", protocol="")
-    names = [str(k) for k in range(len(rows))]
-    return Drawn(header, "", names, np.array(rows), replace(drawn, ink=seen), np.arange(len(rows)))
+    return Drags(SimpleNamespace(header=header, sha256=""), strokes, [], (X_MM, Y_MM), "")
 
 
 def test_lag_and_width_are_found_again() -> None:
-    fit = fit_drags(drawings(arcs(12, 1)))
+    values = fit_values(drawings(arcs(12, 1)))
+    model, half_mm = model_of(values), values["half_mm"]
     for depth in (4.0, 8.0):
-        assert fit.model.leash_mm + fit.model.leash_per_mm * depth == pytest.approx(3.0 + 0.5 * depth, rel=0.15)
-    assert np.abs(drawings(arcs(4, 2), fit.model).ink - drawings(arcs(4, 2)).ink).mean() < 0.01
-    values = fit.values()
-    low, high = values["half_mm"].low, values["half_mm"].high
-    assert low is not None
-    assert high is not None
-    assert low < fit.model.half_mm < high
+        assert model.leash_mm + model.leash_per_mm * depth == pytest.approx(3.0 + 0.5 * depth, rel=0.15)
+    assert np.abs(drawings(arcs(4, 2), model).ink - drawings(arcs(4, 2)).ink).mean() < 0.01
+    assert half_mm.low is not None
+    assert half_mm.high is not None
+    assert half_mm.low < half_mm.value < half_mm.high
     assert values["settle_mm"].low is None  # the depth is constant along each path
 
 
 def test_only_what_is_free_moves() -> None:
     elsewhere = drawings(arcs(3, 5), replace(TRUTH, drift_x_mm=0.8, drift_y_mm=-0.6))
-    fit = fit_drags(elsewhere, TRUTH, {"drift_x_mm": 1.0, "drift_y_mm": 1.0})
-    assert (fit.model.drift_x_mm, fit.model.drift_y_mm) == pytest.approx((0.8, -0.6), abs=0.1)
-    assert replace(fit.model, drift_x_mm=0.0, drift_y_mm=0.5) == TRUTH
+    values = fit_values(elsewhere, TRUTH, {"drift_x_mm": 1.0, "drift_y_mm": 1.0})
+    assert {name: value.value for name, value in values.items()} == pytest.approx(
+        {"drift_x_mm": 0.8, "drift_y_mm": -0.6}, abs=0.1
+    )
 
 
 def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
     """Strokes that lie the higher the more they bend: the correction knows those between the ones that it has seen."""
-    drawn = repeated(9, 1, [-2, -2, -1, -1, 0, 1, 1, 2, 2])
+    moved = repeated(9, 1, [-2, -2, -1, -1, 0, 1, 1, 2, 2])
     even, odd = np.arange(0, 9, 2), np.arange(1, 9, 2)
-    rows = predicted(TRUTH, Kept.of(drawn, even), drawn, odd)
-    corrected, alone = (np.count_nonzero(rows[name] != (drawn.drawings.ink[odd] > 0.5)) for name in (PREDICTED, LAG))
+    rows = predicted(TRUTH, Kept.of(moved, even), moved, odd)
+    corrected, alone = (np.count_nonzero(rows[name] != (moved.drawings.ink[odd] > 0.5)) for name in (PREDICTED, LAG))
     assert corrected < 0.7 * alone
 
 
 def test_repeats_of_a_command_and_strokes_with_a_defect_are_not_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, fitted = replace(repeated(6, 2), sound=np.arange(11)), list[set[int]]()
-    of = Kept.of
+    fitted, of = list[set[int]](), Kept.of
 
-    def watched(one: Drawn, images: np.ndarray) -> Kept:
+    def watched(session: Drags, images: np.ndarray) -> Kept:
         fitted.append(set(images.tolist()))
-        return of(one, images)
+        return of(session, images)
 
     monkeypatch.setattr(Kept, "of", watched)
-    artefact = drags.fit_drawn(drawn)
+    artefact = drags.fit_drags(repeated(6, 2, flawed=(11,)))
     assert len(fitted) == drags.FOLDS + 1
     assert "11" not in artefact.fitted_strokes
     assert all(11 not in images for images in fitted)

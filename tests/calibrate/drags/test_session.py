@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,13 +13,12 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.drags.captures import along_axis, commanded_path, defects, read_drags
+from brushloop.calibrate.drags import along_axis, commanded_path, defects, read_drags
 from brushloop.calibrate.drags.fit import FOLDER, LAG, PREDICTED, DragArtefact
-from brushloop.calibrate.drags.report import DragValidation, summary, write_drags
+from brushloop.calibrate.drags.report import summary, validate_drags, write_drags
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.stroke.preprocess import measure
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec, Waypoint
-from brushloop.sessions.records import Source
 from tests.photographed import imported, photograph
 
 STROKES = [
@@ -123,10 +121,9 @@ def test_an_edited_file_hostile_ink_and_presses_are_refused_with_one_line(
 
 
 def test_the_ink_lies_where_the_command_put_it(session: Path) -> None:
-    drawn = read_drags(session, 1.0).drawn()
-    drawings = drawn.drawings
-    straight = drawings.ink[drawn.stroke_ids.index("0")] > 0.5
-    x, y = drawings.x_mm[straight.any(axis=0)], drawings.y_mm[straight.any(axis=1)]
+    drags = read_drags(session, 1.0)
+    straight = next(drag.ink for drag in drags.placed if drag.stroke.stroke_id == "0") > 0.5
+    x, y = drags.grid[0][straight.any(axis=0)], drags.grid[1][straight.any(axis=1)]
     assert -12.0 < x.min() < 2.0
     assert 20.0 < x.max() < 36.0
     assert abs(float(y.mean())) < 2.0
@@ -159,16 +156,14 @@ def flawed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k, name in enumerate(("whole", "torn", "hollow", "glare", "cut")):
         cv2.imwrite(str(folder / f"{name}.png"), page(name))
         lines.append(f"{name}.png,40,{3 + k},10,{LEFT},{TOP}")
-    return imported(folder, lines, tmp_path_factory.mktemp("flawed-session") / "drags", "drag")
+    return imported(folder, lines, tmp_path_factory.mktemp("flawed-session") / "drags", "drag", simulated=True)
 
 
 def test_defects_are_listed_and_the_source_is_told_everywhere(flawed: Path, tmp_path: Path) -> None:
-    drags = read_drags(flawed)
-    drawn = drags.drawn()
-    assert [drawn.stroke_ids[k] for k in drawn.sound] == ["whole"]
-    assert [name for name, _ in drawn.left_out] == ["cut"]
-    header = drags.header.model_copy(update={"source": Source.IMPORT_SIMULATED})
-    validation = DragValidation(replace(drags, header=header))
+    validation = validate_drags(flawed, None)
+    drags = validation.drags
+    assert [drags.placed[k].stroke.stroke_id for k in drags.sound] == ["whole"]
+    assert [name for name, _ in drags.left_out] == ["cut"]
     html = write_drags(validation, tmp_path, "test").read_text()
     said = "\n".join(line for line in summary(validation) if isinstance(line, str))
     for words in ("torn: torn: 2 parts", "hollow: hollow: ink covers", "glare: glare:"):
