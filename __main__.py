@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 
 import brushloop.calibrate.cli
 import brushloop.calibrate.validate.cli
-import brushloop.calibrate.writing.cli
 import brushloop.collect.cli
 import brushloop.collect.cli_rig
 import brushloop.sessions.cli
@@ -122,11 +121,11 @@ write = typer.Typer(
     help="Write characters on the rig and compare them (`brushloop write 字 --config ...`), or only plan or compare.",
 )
 write.command("characters")(brushloop.collect.cli.write)
-write.command("plan")(brushloop.calibrate.writing.cli.plan)
-write.command("compare")(brushloop.calibrate.writing.cli.compare)
-write.command("learn")(brushloop.calibrate.writing.cli.learn)
-write.command("practice")(brushloop.calibrate.writing.cli.practice)
-write.command("fit")(brushloop.calibrate.writing.cli.fit)
+write.command("plan")(brushloop.calibrate.cli.write_plan)
+write.command("compare")(brushloop.calibrate.cli.write_compare)
+write.command("learn")(brushloop.calibrate.cli.write_learn)
+write.command("practice")(brushloop.calibrate.cli.write_practice)
+write.command("fit")(brushloop.calibrate.cli.write_fit)
 app.add_typer(write, name="write")
 app.add_typer(brushloop.calibrate.cli.train, name="train")
 

@@ -1,4 +1,4 @@
-"""`brushloop calibrate`, `camera`, `fit`, `invert`, `loop compare`, `sessions export` and `train`.
+"""`brushloop calibrate`, `camera`, `fit`, `invert`, `loop compare`, `sessions export`, `train`, and stages of `write`.
 
 Heavy imports wait until a command runs.
 """
@@ -160,6 +160,105 @@ def compare_loop(
     from brushloop.sessions.terminal import show_work
 
     show_work(run, CompareRequest(original, again, out, " ".join(["brushloop", *sys.argv[1:]]), fit, mm_per_px))
+
+
+def write_plan(
+    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")],
+    out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml and plan.png.")] = Path("write-plan"),
+    data: Annotated[Path | None, typer.Option(help="Folder of hanzi-writer files, such as 字.json.")] = None,
+    radius_mm: Annotated[float, typer.Option(min=0.5, max=50, help="Radius R of the brush.")] = 6.0,
+    length_mm: Annotated[float, typer.Option(min=5, max=200, help="Length L of the brush.")] = 48.0,
+    footprint: Annotated[
+        Path | None,
+        typer.Option(help="Result of `write fit`: the plan leads the brush by the footprint of its own drags."),
+    ] = None,
+    cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of the character's patch of paper.")] = 70.0,
+    depth_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest depth, mm.")] = (0.5, 20.0),
+    tilt_range: Annotated[tuple[float, float], typer.Option(help="Least and greatest tilt, deg; at most 30.")] = (
+        0.0,
+        10.0,
+    ),
+    speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,
+    wrist_deg_s: Annotated[float, typer.Option(min=1, max=720, help="Greatest speed of the wrist.")] = 180.0,
+    steps: Annotated[int, typer.Option(min=0, max=1000, help="Steps of refinement; 0 keeps the first plan.")] = 60,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written.")] = 1,
+) -> None:
+    """Plan characters: depth from the width of each stroke, heading along it, then refined until the image matches."""
+    from brushloop.calibrate.writing import PlannedBy
+    from brushloop.calibrate.writing.plan import PlanRequest
+    from brushloop.calibrate.writing.plan import plan as run
+    from brushloop.sessions.terminal import show_work
+
+    by = PlannedBy(
+        radius_mm=radius_mm,
+        length_mm=length_mm,
+        depth_range_mm=depth_range,
+        tilt_range_deg=tilt_range,
+        speed_mm_s=speed_mm_s,
+        wrist_deg_s=wrist_deg_s,
+    )
+    show_work(run, PlanRequest(what, out, by, data, footprint, cell_mm, steps, repeats))
+
+
+def write_compare(
+    session: Annotated[Path, typer.Argument(help="The session in which a plan was written.")],
+    plan: Annotated[Path, typer.Option(help="The plan's folder, or its plan.json.")],
+    reference: Annotated[
+        list[str] | None, typer.Option(help="字=picture.png: compare with this picture instead of the plan's font.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for written.html, .csv, .json and figure-13.png.")] = Path(
+        "written"
+    ),
+) -> None:
+    """Compare written characters with the simulated image and with the reference, in both polarities (Table 3)."""
+    import sys
+
+    from brushloop.calibrate.writing.compare import CompareRequest
+    from brushloop.calibrate.writing.compare import compare as run
+    from brushloop.sessions.terminal import show_work
+
+    command = " ".join(["brushloop", *sys.argv[1:]])
+    show_work(run, CompareRequest(session, plan, out, command, tuple(reference or ())))
+
+
+def write_learn(
+    session: Annotated[Path, typer.Argument(help="The session in which a plan was written.")],
+    plan: Annotated[Path, typer.Option(help="The plan's folder, or its plan.json.")],
+    out: Annotated[Path, typer.Option(help="Folder for the next plan.")],
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each is written next.")] = 1,
+) -> None:
+    """Make the next plan from what the ink of this one showed, phase by phase."""
+    from brushloop.calibrate.writing.learn import LearnRequest
+    from brushloop.calibrate.writing.learn import learn as run
+    from brushloop.sessions.terminal import show_work
+
+    show_work(run, LearnRequest(session, plan, out, repeats))
+
+
+def write_practice(
+    out: Annotated[Path, typer.Option(help="Folder for protocol-write.toml.")] = Path("practice"),
+    length_mm: Annotated[
+        float, typer.Option(min=5, max=200, help="Length L of the brush; strokes go no deeper than 0.3 of it.")
+    ] = 48.0,
+    cell_mm: Annotated[float, typer.Option(min=30, max=500, help="Side of each patch of paper.")] = 70.0,
+) -> None:
+    """Plan a practice sheet: strokes from which `write fit` learns how this brush is dragged."""
+    from brushloop.calibrate.writing import PlannedBy
+    from brushloop.calibrate.writing.learn import PracticeRequest
+    from brushloop.calibrate.writing.learn import practice as run
+    from brushloop.sessions.terminal import show_work
+
+    show_work(run, PracticeRequest(out, PlannedBy(length_mm=length_mm), cell_mm))
+
+
+def write_fit(
+    session: Annotated[Path, typer.Argument(help="A calibrated session of a practice sheet, or of any figures.")],
+) -> None:
+    """Fit the footprint of the dragged brush, for `write plan --footprint`."""
+    from brushloop.calibrate.writing.learn import fit as run
+    from brushloop.sessions.terminal import show_work
+
+    show_work(run, session)
 
 
 camera = typer.Typer(help="Print a board, and calibrate the lens by photographs of it.", no_args_is_help=True)

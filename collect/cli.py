@@ -245,7 +245,7 @@ def write(
     ] = 0,
     learn_count: Annotated[int, typer.Option(min=1, max=100, help="How often each is written in such a round.")] = 2,
     practice: Annotated[bool, typer.Option(help="First write a practice sheet, and fit the brush to it.")] = False,
-    data: Annotated[Path | None, typer.Option(help="hanzi-writer folder or makemeahanzi graphics.txt.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of hanzi-writer files.")] = None,
     reference: Annotated[list[str] | None, typer.Option(help="字=picture.png: compare with this picture.")] = None,
     cell_mm: Annotated[float, typer.Option(min=10, max=500, help="Side of the character's paper cell.")] = 70.0,
     speed_mm_s: Annotated[float, typer.Option(min=1, max=100, help="Speed of the tip.")] = 15.0,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -31,7 +31,7 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.files import read_gray
-from brushloop.calibrate.presses import prepare_cell
+from brushloop.calibrate.presses import Refused, prepare_cell
 from brushloop.calibrate.report import (
     Sealed,
     Written,
@@ -51,14 +51,7 @@ from brushloop.calibrate.report import (
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import Floats, Summary, pair_means, summarise
 from brushloop.calibrate.stroke.preprocess import Prepared
-from brushloop.calibrate.writing.record import (
-    FigureRecord,
-    PlanRecord,
-    Round,
-    check_drawn_from,
-    code_points,
-    load_plan,
-)
+from brushloop.calibrate.writing import Figure, Plan, Round, check_drawn_from, code_points, load_plan
 from brushloop.model.characters.plan import Phase, phase_map
 from brushloop.model.similarity import SSIM_SETTINGS
 from brushloop.sessions.disk import check_writable, csv_text
@@ -154,8 +147,7 @@ class WrittenRecord(Sealed):
     model: str
     cell_mm: float
     table_3: tuple[Table3Row, ...]
-    refused: tuple[tuple[str, str], ...]
-    """(stroke, why)."""
+    refused: tuple[Refused, ...]
     figure_13_sha256: str
     """Of Figure 13 in the same folder."""
     software: str
@@ -172,15 +164,31 @@ def read_written(path: Path) -> WrittenRecord:
     return load_sealed(path / FILE if path.is_dir() else path, WrittenRecord, MAX_BYTES)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WritingComparison:
     """Written characters, compared with their plan."""
 
     session: OpenSession
-    plan: PlanRecord
+    plan: Plan
     characters: list[Character]
-    refused: tuple[tuple[str, str], ...] = ()
-    """(stroke, why), never dropped in silence."""
+    refused: tuple[Refused, ...] = ()
+
+    @functools.cached_property
+    def table_3(self) -> tuple[Table3Row, ...]:
+        """The rows, by character, then in the order of `KEYS` and `PAIRS`; without those that compare nothing."""
+        rows: list[Table3Row] = []
+        for character, key, pair in itertools.product(self.characters, KEYS, PAIRS):
+            csim, ssim = (summarise(percent) for percent in 100.0 * character.scores[pair, key].T)
+            if csim is not None and ssim is not None:
+                how = dict(zip(("alignment", "tone", "polarity"), key, strict=True))
+                about_it = {"character": character.name, "reference": character.reference_name, "pair": pair}
+                rows.append(Table3Row.model_validate(about_it | how | {"csim": csim, "ssim": ssim}))
+        return tuple(rows)
+
+    @property
+    def writings(self) -> int:
+        """Number of writings of all characters."""
+        return sum(len(character.captured) for character in self.characters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,20 +215,18 @@ def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
             raise CalibrationError("--reference", f"{words!r}: expected CHARACTER=FILE, as 字=zi.png")
         references[name] = (Path(path).name, read_reference(Path(path)))
     written = compare_written(request.session, load_plan(request.plan), references, progress)
-    table = table_3(counted(written.characters, "characters compared", len(written.characters), progress))
-    report = write_written(written, table, request.out, request.command)
-    lines = summary(written, table)
-    return Written(report, (*lines, f"Picture: {request.out / PICTURE}", f"Report:  {report}"))
+    report = write_written(written, request.out, request.command)
+    return Written(report, (*summary(written), f"Picture: {request.out / PICTURE}", f"Report:  {report}"))
 
 
 def compare_written(
-    path: Path, plan: PlanRecord, references: dict[str, tuple[str, Image]], progress: Progress = unseen
+    path: Path, plan: Plan, references: dict[str, tuple[str, Image]], progress: Progress = unseen
 ) -> WritingComparison:
     """Read the writings of a session beside their plan. `references` (character -> name, image) replace the plan's.
 
     Raises `CalibrationError` if the two do not belong together or nothing can be compared.
     """
-    session, refused = open_session(path), list[tuple[str, str]]()
+    session, refused = open_session(path), list[Refused]()
     check_drawn_from(plan, session)
     if unknown := sorted(set(references) - {figure.name for figure in plan.figures}):
         raise CalibrationError("--reference", f"{unknown[0]!r} is not in the plan")
@@ -233,9 +239,9 @@ def compare_written(
     characters: list[Character] = []
     for figure in plan.figures:
         if captured := writings.get(figure.name):
-            name, image = references.get(figure.name) or (figure.source, figure.wanted())
+            name, image = references.get(figure.name) or (figure.source, figure.wanted)
             at_the_edge = tuple(stroke_id for stroke_id in captured if stroke_id in cut)
-            images = as_ink(image), as_ink(figure.simulated())
+            images = as_ink(image), as_ink(figure.simulated)
             characters.append(Character(figure.name, name, *images, captured, at_the_edge))
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
@@ -244,7 +250,7 @@ def compare_written(
 
 
 def read_writings(
-    session: OpenSession, refused: list[tuple[str, str]], progress: Progress
+    session: OpenSession, refused: list[Refused], progress: Progress
 ) -> Iterator[tuple[str, str, Prepared]]:
     """Yield stroke id, name of the figure and ink of every cell that the arm wrote on; the others go to `refused`.
 
@@ -302,9 +308,9 @@ def _small(image: Image) -> Image:
     return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
 
 
-def round_of(figure: FigureRecord, character: Character, side_mm: float) -> Round:
+def round_of(figure: Figure, character: Character, side_mm: float) -> Round:
     """What the writings of a figure show on average; phases for characters only."""
-    wanted, writings = figure.wanted(), character.captured.values()
+    wanted, writings = figure.wanted, character.captured.values()
     csim = float(np.mean([compare_ink(as_ink(wanted), ink, HEADLINE)[0] for ink in writings]))
     lost: dict[str, float] = {}
     if figure.medians:
@@ -316,29 +322,17 @@ def round_of(figure: FigureRecord, character: Character, side_mm: float) -> Roun
     return Round(csim_percent=round(100.0 * csim, 3), lost_percent=lost)
 
 
-def table_3(characters: Iterable[Character]) -> list[Table3Row]:
-    """The rows, by character, then in the order of `KEYS` and `PAIRS`; without those that compare nothing."""
-    rows: list[Table3Row] = []
-    for character, key, pair in itertools.product(characters, KEYS, PAIRS):
-        csim, ssim = (summarise(percent) for percent in 100.0 * character.scores[pair, key].T)
-        if csim is not None and ssim is not None:
-            how = dict(zip(("alignment", "tone", "polarity"), key, strict=True))
-            about_it = {"character": character.name, "reference": character.reference_name, "pair": pair}
-            rows.append(Table3Row.model_validate(about_it | how | {"csim": csim, "ssim": ssim}))
-    return rows
-
-
-def summary(written: WritingComparison, table: Sequence[Table3Row]) -> Iterator[str]:
+def summary(written: WritingComparison) -> Iterator[str]:
     """Lines for the terminal: the strict and the lenient comparison, ink = 1."""
-    source, count = written.session.header.source, sum(len(character.captured) for character in written.characters)
-    yield f"{count} characters written, {len(written.refused)} not compared ({source})"
-    for row in table:
+    source = written.session.header.source
+    yield f"{written.writings} characters written, {len(written.refused)} not compared ({source})"
+    for row in written.table_3:
         if row.polarity is Polarity.INK and row.tone is Tone.BINARY:
             csim, ssim = ("{:.2f} / {:.2f} / {:.2f}".format(*of.range_and_avg) for of in (row.csim, row.ssim))
             yield f"{row.character} {row.alignment}, {row.pair}: CSIM {csim}, SSIM {ssim}"
 
 
-def write_written(written: WritingComparison, table: Sequence[Table3Row], folder: Path, command: str) -> Path:
+def write_written(written: WritingComparison, folder: Path, command: str) -> Path:
     """Write the report's files into `folder`; returns the page's path. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     draw(written, folder / PICTURE)
@@ -357,7 +351,7 @@ def write_written(written: WritingComparison, table: Sequence[Table3Row], folder
         brush=header.brush,
         model=plan.model,
         cell_mm=plan.cell_mm,
-        table_3=tuple(table),
+        table_3=written.table_3,
         refused=written.refused,
         figure_13_sha256=hashlib.sha256(picture).hexdigest(),
         software=made_by(),
@@ -367,10 +361,10 @@ def write_written(written: WritingComparison, table: Sequence[Table3Row], folder
         "written.html.j2",
         **about(header),
         names=" ".join(record.characters),
-        writings=sum(len(character.captured) for character in written.characters),
+        writings=written.writings,
         model=plan.model,
         cell_mm=plan.cell_mm,
-        tables=_tables(table),
+        tables=_tables(written.table_3),
         paper_rows=PAPER_ROWS,
         characters=[_character(plan, character) for character in written.characters],
         refused=written.refused,
@@ -429,7 +423,7 @@ def _tables(table: Sequence[Table3Row]) -> list[dict[str, Any]]:
     return out
 
 
-def _character(plan: PlanRecord, character: Character) -> dict[str, Any]:
+def _character(plan: Plan, character: Character) -> dict[str, Any]:
     """A character as the page shows it."""
     reference, figure = character.reference[Tone.GRAY], plan.figure(character.name)
     rounds = [] if figure is None else [*figure.rounds, round_of(figure, character, plan.cell_mm)]

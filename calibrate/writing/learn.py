@@ -25,24 +25,23 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
-from brushloop.calibrate.compare.place import SIZE_PX, Image
+from brushloop.calibrate.compare.place import Image
 from brushloop.calibrate.drags.fit import captured_distance
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.report import Written
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.calibrate.writing.compare import WritingComparison, compare_written, read_writings, round_of
-from brushloop.calibrate.writing.record import (
-    FigureRecord,
+from brushloop.calibrate.writing import (
+    Figure,
+    Plan,
     PlannedBy,
-    PlanRecord,
     Round,
     as_points,
-    encoded,
     load_plan,
     recorded_figures,
     write_plan,
 )
+from brushloop.calibrate.writing.compare import WritingComparison, compare_written, read_writings, round_of
 from brushloop.model.characters.plan import (
     LATER_SPREADS_MM,
     Phase,
@@ -61,6 +60,8 @@ from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import Progress, unseen
 
 Floats = NDArray[np.float64]
+GAIN = 0.7
+"""Share of the miss that is corrected in one round."""
 MOST_MM = 1.5
 """Largest miss that is corrected in one round; more comes from ink that is unseen or of another stroke."""
 NEAR_MM = 4.0
@@ -173,21 +174,18 @@ def practice(request: PracticeRequest, _progress: Progress = unseen) -> Written:
     """Write the protocol of a practice sheet, each stroke on a patch of its own. Raises `CalibrationError`."""
     check_writable(request.out)
     strokes = practice_strokes(request.cell_mm, request.by.reach, request.by.length_mm)
-    blank = encoded(np.zeros((SIZE_PX, SIZE_PX), np.float32))
     figures = tuple(
-        FigureRecord(
+        Figure(
             name=f"{NAME}-{number + 1:02d}",
             source=f"practice strokes, seed {SEED}",
             commanded=as_points(strokes[number * PER_FIGURE : (number + 1) * PER_FIGURE]),
-            wanted_png=blank,
-            simulated_png=blank,
         )
         for number in range(FIGURES)
     )
-    record = PlanRecord(
+    plan = Plan(
         model="none: practice", planned_by=request.by, cell_mm=request.cell_mm, software=made_by(), figures=figures
     )
-    protocol = write_plan(record, 1, request.out)
+    protocol = write_plan(plan, 1, request.out)
     return Written(protocol, (str(protocol),))
 
 
@@ -226,8 +224,6 @@ class LearnRequest:
     plan: Path
     """The plan that was written: its folder, or its plan.json."""
     out: Path
-    gain: float = 0.7
-    """Share of the miss that is corrected."""
     repeats: int = 1
     settled_repeats: int | None = None
     """The same, used once every character is settled."""
@@ -236,7 +232,7 @@ class LearnRequest:
 def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     """Make the next plan from what the ink of this one showed. Raises `CalibrationError`."""
     check_writable(request.out)
-    following = learned(compare_written(request.session, load_plan(request.plan), {}, progress), request.gain)
+    following = learned(compare_written(request.session, load_plan(request.plan), {}, progress))
     settled = request.settled_repeats is not None and all(figure.settled for figure in following.figures)
     repeats = (request.settled_repeats if settled else None) or request.repeats
     protocol = write_plan(following, repeats, request.out)
@@ -248,23 +244,20 @@ def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
     return Written(protocol, (*said, str(protocol)))
 
 
-def learned(written: WritingComparison, gain: float = 0.7) -> PlanRecord:
+def learned(written: WritingComparison) -> Plan:
     """The next plan of the characters that were captured. Raises `CalibrationError`."""
-    plan = written.plan
-    writings = {character.name: character for character in written.characters}
-    for figure in plan.figures:
-        if figure.name not in writings:
-            raise CalibrationError(
-                str(written.session.recording.path), f"shows no {figure.name!r}: nothing is learned for it"
-            )
+    plan, writings = written.plan, {character.name: character for character in written.characters}
+    if absent := [figure.name for figure in plan.figures if figure.name not in writings]:
+        where = str(written.session.recording.path)
+        raise CalibrationError(where, f"shows no {absent[0]!r}: nothing is learned for it")
     ink = [writings[figure.name].mean_ink() for figure in plan.figures]
     known, drawings = plan.planned_by.footprint, drawings_of([each.strokes for each in plan.figures], ink, plan.cell_mm)
     footprint = fit_footprint(drawings, None if known is None else Footprint(known))
-    figures: list[FigureRecord] = []
+    figures: list[Figure] = []
     for figure, captured in zip(plan.figures, ink, strict=True):
         after = _after(figure, round_of(figure, writings[figure.name], plan.cell_mm))
         if not after.settled:
-            after = _corrected(after, captured, footprint, plan.planned_by.reach, plan.cell_mm, gain)
+            after = _corrected(after, captured, footprint, plan.planned_by.reach, plan.cell_mm)
         figures.append(after)
     by = plan.planned_by.model_copy(update={"footprint": footprint.values})
     return plan.model_copy(update={"planned_by": by, "figures": tuple(figures), "software": made_by()})
@@ -276,7 +269,7 @@ def drawings_of(strokes: Sequence[Sequence[Floats]], ink: Sequence[Image], side_
     return Drawings.of(paths, np.stack(ink), *grid(side_mm, len(ink[0])))
 
 
-def _after(figure: FigureRecord, last: Round) -> FigureRecord:
+def _after(figure: Figure, last: Round) -> Figure:
     """The figure with its round added, back at its best; settled if the round has not helped."""
     before = max((each.csim_percent for each in figure.rounds), default=float("-inf"))
     best = figure.commanded if last.csim_percent > before or not figure.best else figure.best
@@ -285,17 +278,15 @@ def _after(figure: FigureRecord, last: Round) -> FigureRecord:
     return figure.model_copy(update=update)
 
 
-def _corrected(
-    figure: FigureRecord, captured: Image, footprint: Footprint, reach: Reach, side_mm: float, gain: float
-) -> FigureRecord:
+def _corrected(figure: Figure, captured: Image, footprint: Footprint, reach: Reach, side_mm: float) -> Figure:
     strokes, size_px = figure.strokes, len(captured)
     footprints = fit_each(drawings_of([strokes], [captured], side_mm), footprint)
     miss = missed(captured, drawn(footprints, strokes, side_mm, size_px), side_mm)
-    miss *= gain * _trust(figure, side_mm, size_px)
-    wanted, near = figure.wanted(), LATER_SPREADS_MM
-    moved = lead(footprints, strokes, wanted, side_mm, reach, added_mm=miss, spreads_mm=near, held=HELD)
+    miss *= GAIN * _trust(figure, side_mm, size_px)
+    near = LATER_SPREADS_MM
+    moved = lead(footprints, strokes, figure.wanted, side_mm, reach, added_mm=miss, spreads_mm=near, held=HELD)
     simulated = covered(drawn(footprints, moved, side_mm, size_px) + miss, side_mm)
-    return figure.model_copy(update={"commanded": as_points(moved), "simulated_png": encoded(simulated)})
+    return figure.model_copy(update={"commanded": as_points(moved), "simulated": simulated})
 
 
 def missed(ink: Image, predicted_mm: Floats, side_mm: float) -> Floats:
@@ -310,7 +301,7 @@ def missed(ink: Image, predicted_mm: Floats, side_mm: float) -> Floats:
     return np.asarray(cv2.GaussianBlur(off, (0, 0), SMOOTH_PX), np.float64)
 
 
-def _trust(figure: FigureRecord, side_mm: float, size_px: int) -> Floats:
+def _trust(figure: Figure, side_mm: float, size_px: int) -> Floats:
     """A factor on the correction of each pixel: less in phases that the last round made worse."""
     if len(figure.rounds) < 2 or not figure.medians:
         return np.ones((size_px, size_px))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +12,11 @@ from brushloop.calibrate.artefact import load_artefact, made_by
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.report import BLUE, Written, picture_grid, save_picture
+from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_medians, as_points, code_points, write_plan
 from brushloop.calibrate.writing.learn import FootprintArtefact
-from brushloop.calibrate.writing.record import (
-    FigureRecord,
-    PlannedBy,
-    PlanRecord,
-    as_points,
-    code_points,
-    encoded,
-    write_plan,
-)
 from brushloop.model.ccdbsm import Brush, DomainError
-from brushloop.model.characters.glyph import parse_csv, parse_glyph, paths_of, reference, swept
-from brushloop.model.characters.plan import Floats, Image, Patch, Reach, StrokePath, covered, drawn, first_lead, lead
+from brushloop.model.characters.glyph import CHARACTERS, parse_csv, parse_glyph, paths_of, reference, swept
+from brushloop.model.characters.plan import Floats, Image, Patch, Reach, covered, drawn, first_lead, lead
 from brushloop.model.characters.presses import refine, trajectory, written
 from brushloop.model.drag import Footprint
 from brushloop.model.similarity import csim, ssim
@@ -40,10 +30,10 @@ STEP_MM = 2.0
 """Approximate distance of neighbouring points."""
 TILT_DEG = 5.0
 """The initial tilt; refinement may change it within reach."""
-MAX_FILE_BYTES = 64 * 1024 * 1024
-"""makemeahanzi's file has a size of 30 MB."""
 MAX_FIGURES = 20
 MOST_TILT_DEG = 30.0
+Planned = tuple[Figure, Image]
+"""A figure, and the model's image of its first plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,54 +45,13 @@ class PlanRequest:
     out: Path
     by: PlannedBy = field(default_factory=PlannedBy)
     data: Path | None = None
-    """Folder of hanzi-writer files, or makemeahanzi's graphics.txt."""
+    """Folder of hanzi-writer files, such as 字.json."""
     footprint: Path | None = None
     """Result of `write fit`: the plan leads the brush by it; replaces the stroke model and `steps`."""
     cell_mm: float = 70.0
     steps: int = 60
     """Steps of refinement; 0 keeps the first plan."""
     repeats: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """A figure to write: its name, its paths with half widths, and the image they should produce."""
-
-    name: str
-    source: str
-    paths: list[StrokePath]
-    image: Image
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedFigure:
-    """One figure: trajectories (N, 5) in order, and the model's image before and after refinement."""
-
-    wanted: Wanted
-    strokes: list[Floats]
-    first: Image
-    simulated: Image
-
-    def scores(self) -> str:
-        """CSIM and SSIM of the first plan, then of the refined one, against the wanted image."""
-        image, (before, after) = self.wanted.image, (self.first, self.simulated)
-        return (
-            f"CSIM {csim(image, before):.4f} -> {csim(image, after):.4f}, "
-            f"SSIM {ssim(image, before):.4f} -> {ssim(image, after):.4f}"
-        )
-
-    def record(self) -> FigureRecord:
-        """The figure as plan.json holds it."""
-        wanted = self.wanted
-        medians = (np.column_stack((path.points, path.half_width_mm)).round(4).tolist() for path in wanted.paths)
-        return FigureRecord(
-            name=wanted.name,
-            source=wanted.source,
-            commanded=as_points(self.strokes),
-            wanted_png=encoded(wanted.image),
-            simulated_png=encoded(self.simulated),
-            medians=tuple(tuple((x, y, half) for x, y, half in median) for median in medians),
-        )
 
 
 def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
@@ -123,132 +72,117 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
         model.profile(by.depth_range_mm[1], high)
     except (ValueError, DomainError) as error:
         raise CalibrationError("write plan", str(error)) from None
-    each = read_wanted(request.what, request.data, patch)
+    wanted = read_wanted(request.what, request.data, patch)
     if fitted is None:
         label, simulated = model.label, "CCD-BSM, marks laid over each other along the way"
-        figures = [pressed(wanted, model, reach, patch, tilt_deg, request.steps) for wanted in each]
+        planned = [pressed(figure, model, reach, patch, tilt_deg, request.steps) for figure in wanted]
     else:
         label, simulated = "fitted footprint", f"the footprint fitted to {fitted.session_id}, {fitted.source}"
-        figures = [led(wanted, fitted.footprint(), reach, patch, tilt_deg) for wanted in each]
+        planned = [led(figure, fitted.footprint(), reach, patch, tilt_deg) for figure in wanted]
     request.out.mkdir(parents=True, exist_ok=True)
-    draw(figures, patch.side_mm, request.out / PICTURE)
-    records = tuple(figure.record() for figure in figures)
-    record = PlanRecord(model=label, planned_by=by, cell_mm=patch.side_mm, software=made_by(), figures=records)
-    protocol = write_plan(record, request.repeats, request.out)
-    return Written(protocol, (*_said(figures, simulated), str(protocol), str(request.out / PICTURE)))
+    draw(planned, patch.side_mm, request.out / PICTURE)
+    figures = tuple(figure for figure, _ in planned)
+    whole = Plan(model=label, planned_by=by, cell_mm=patch.side_mm, software=made_by(), figures=figures)
+    protocol = write_plan(whole, request.repeats, request.out)
+    return Written(protocol, (*_said(planned, simulated), str(protocol), str(request.out / PICTURE)))
 
 
-def _said(figures: list[PlannedFigure], simulated: str) -> Iterator[str]:
+def _said(planned: Sequence[Planned], simulated: str) -> Iterator[str]:
     yield f"simulated by {simulated}: not ink"
-    for figure in figures:
-        points = sum(len(stroke) for stroke in figure.strokes)
-        yield f"{figure.wanted.name}: {len(figure.strokes)} strokes, {points} points, ink = 1: {figure.scores()}"
+    for figure, first in planned:
+        points = sum(len(stroke) for stroke in figure.commanded)
+        scores = f"first plan {_likeness(figure, first)}; refined {_likeness(figure, figure.simulated)}"
+        yield f"{figure.name}: {len(figure.commanded)} strokes, {points} points, ink = 1: {scores}"
 
 
-def pressed(
-    wanted: Wanted, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int
-) -> PlannedFigure:
+def _likeness(figure: Figure, image: Image) -> str:
+    return f"CSIM {csim(figure.wanted, image):.4f}, SSIM {ssim(figure.wanted, image):.4f}"
+
+
+def pressed(figure: Figure, model: StrokeModel, reach: Reach, patch: Patch, tilt_deg: float, steps: int) -> Planned:
     """Plan a figure as presses that are laid over each other along the way."""
     side_mm = patch.side_mm
-    first = [trajectory(path, model, reach, patch, tilt_deg) for path in wanted.paths]
-    refined = refine(model, first, wanted.image, side_mm, reach, steps)
+    first = [trajectory(path, model, reach, patch, tilt_deg) for path in figure.paths]
+    refined = refine(model, first, figure.wanted, side_mm, reach, steps)
     strokes = [reach.spaced(np.round(reach.within(stroke, side_mm), 3)) for stroke in refined]
-    return PlannedFigure(wanted, strokes, *(written(model, each, side_mm) for each in (first, strokes)))
+    return _planned(figure, strokes, *(written(model, each, side_mm) for each in (first, strokes)))
 
 
-def led(wanted: Wanted, footprint: Footprint, reach: Reach, patch: Patch, tilt_deg: float) -> PlannedFigure:
+def led(figure: Figure, footprint: Footprint, reach: Reach, patch: Patch, tilt_deg: float) -> Planned:
     """Plan a figure so that the ink of a dragged footprint follows it."""
-    side_mm, size_px = patch.side_mm, len(wanted.image)
-    first = first_lead(wanted.paths, footprint, reach, side_mm, tilt_deg)
+    side_mm, size_px = patch.side_mm, len(figure.wanted)
+    first = first_lead(figure.paths, footprint, reach, side_mm, tilt_deg)
     footprints = [footprint] * len(first)
-    strokes = lead(footprints, first, wanted.image, side_mm, reach)
+    strokes = lead(footprints, first, figure.wanted, side_mm, reach)
     images = (covered(drawn(footprints, each, side_mm, size_px), side_mm) for each in (first, strokes))
-    return PlannedFigure(wanted, strokes, *images)
+    return _planned(figure, strokes, *images)
 
 
-def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Wanted]:
+def _planned(figure: Figure, strokes: list[Floats], first: Image, simulated: Image) -> Planned:
+    return figure.model_copy(update={"commanded": as_points(strokes), "simulated": simulated}), first
+
+
+def read_wanted(what: str, data: Path | None, patch: Patch) -> list[Figure]:
     """Read the figures to write. Raises `CalibrationError` that names file and field."""
     if what.lower().endswith(".csv") and len(what) > len(".csv"):
-        each = [_drawn_by_hand(Path(what), patch)]
+        figures = [_drawn_by_hand(Path(what), patch)]
     elif not 1 <= len(what) <= MAX_FIGURES or not what.isprintable() or any(c.isspace() for c in what):
         raise CalibrationError("character", f"expected 1 to {MAX_FIGURES} characters, or a .csv trajectory")
     elif len(set(what)) != len(what):
         raise CalibrationError("character", "the same character twice: the protocol's `repeats` writes it again")
     else:
-        each = [_character(name, data, patch) for name in what]
-    for wanted in each:
-        if not wanted.image.any():
-            raise CalibrationError(wanted.name, "has no width anywhere: nothing would be written")
-    return each
+        figures = [_character(name, data, patch) for name in what]
+    for figure in figures:
+        if not figure.wanted.any():
+            raise CalibrationError(figure.name, "has no width anywhere: nothing would be written")
+    return figures
 
 
-def _drawn_by_hand(path: Path, patch: Patch) -> Wanted:
+def _drawn_by_hand(path: Path, patch: Patch) -> Figure:
     try:
         paths = parse_csv(_text(path), patch, STEP_MM)
     except ValueError as error:
         raise CalibrationError(str(path), str(error)) from None
     name = "".join(c if c.isalnum() or c in "-_" else "-" for c in path.stem)[:50].strip("-") or "figure"
-    return Wanted(name, path.name, paths, swept(paths, patch.side_mm))
+    return Figure(name=name, source=path.name, medians=as_medians(paths), wanted=swept(paths, patch.side_mm))
 
 
-def _character(name: str, data: Path | None, patch: Patch) -> Wanted:
-    if data is None:
-        where, text = _shipped(name)
-    elif data.is_dir():
-        where, text = str(data / f"{name}.json"), _text(data / f"{name}.json")
-    else:
-        where, text = str(data), _line_of(data, name)
+def _character(name: str, data: Path | None, patch: Patch) -> Figure:
+    """A character of a data set that has a file for each, or one of those that are shipped."""
+    folder = data or CHARACTERS
+    path = folder / f"{name}.json"
+    if data is None and not path.exists():
+        shipped = " ".join(sorted(file.stem for file in folder.glob("*.json")))
+        raise CalibrationError(f"character {name!r}", f"is not shipped ({shipped}): name the full data set with --data")
     try:
-        strokes = parse_glyph(text)
+        strokes = parse_glyph(_text(path))
     except ValueError as error:
-        raise CalibrationError(where, str(error)) from None
+        raise CalibrationError(str(path), str(error)) from None
     source = SHIPPED_SOURCE if data is None else data.name
-    return Wanted(name, source, paths_of(strokes, patch, STEP_MM), reference(strokes, patch))
-
-
-def _shipped(name: str) -> tuple[str, str]:
-    folder = files("brushloop.model.characters") / "data"
-    known = sorted(entry.name.removesuffix(".json") for entry in folder.iterdir() if entry.name.endswith(".json"))
-    if name not in known:
-        raise CalibrationError(
-            f"character {name!r}", f"is not shipped ({' '.join(known)}): name the full data set with --data"
-        )
-    return f"{name}.json", (folder / f"{name}.json").read_text("utf-8")
-
-
-def _line_of(data: Path, name: str) -> str:
-    """The line of a character in makemeahanzi's graphics.txt, a JSON object a line."""
-    for line in _text(data).splitlines():
-        try:
-            if name in line and json.loads(line)["character"] == name:
-                return line
-        except (ValueError, KeyError, TypeError, RecursionError):
-            raise CalibrationError(str(data), "is neither a folder nor a graphics.txt") from None
-    raise CalibrationError(str(data), f"holds no character {name!r}")
+    medians = as_medians(paths_of(strokes, patch, STEP_MM))
+    return Figure(name=name, source=source, medians=medians, wanted=reference(strokes, patch))
 
 
 def _text(path: Path) -> str:
     try:
-        return read_bounded(path, MAX_FILE_BYTES).decode("utf-8")
+        return read_bounded(path).decode("utf-8")
     except UnicodeDecodeError:
         raise CalibrationError(str(path), "is no UTF-8 text") from None
 
 
-def draw(figures: list[PlannedFigure], side_mm: float, path: Path) -> None:
+def draw(planned: Sequence[Planned], side_mm: float, path: Path) -> None:
     """Draw a row per figure: wanted, first plan, refined plan, and the tip's trajectory over the wanted ink."""
-    picture, rows = picture_grid(len(figures), 4, (12.0, 3.4 * len(figures)))
+    picture, rows = picture_grid(len(planned), 4, (12.0, 3.4 * len(planned)))
     extent = (0.0, side_mm, 0.0, side_mm)
-    for figure, axes in zip(figures, rows, strict=True):
-        image = figure.wanted.image
-        titles = (
-            f"wanted: {code_points(figure.wanted.name)}",
-            f"first plan, simulated: CSIM {csim(image, figure.first):.4f}, SSIM {ssim(image, figure.first):.4f}",
-            f"refined, simulated: CSIM {csim(image, figure.simulated):.4f}, SSIM {ssim(image, figure.simulated):.4f}",
-            "trajectory, with its depths",
+    for (figure, first), axes in zip(planned, rows, strict=True):
+        parts = (
+            (figure.wanted, f"wanted: {code_points(figure.name)}"),
+            (first, f"first plan, simulated: {_likeness(figure, first)}"),
+            (figure.simulated, f"refined, simulated: {_likeness(figure, figure.simulated)}"),
+            (0.25 * figure.wanted, "trajectory, with its depths"),
         )
-        images = (image, figure.first, figure.simulated, 0.25 * image)
-        for axis, shown, title in zip(axes, images, titles, strict=True):
-            axis.imshow(1 - shown, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest")
+        for axis, (image, title) in zip(axes, parts, strict=True):
+            axis.imshow(1 - image, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest")
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
         for stroke in figure.strokes:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from brushloop.calibrate.writing.record import PROTOCOL as WRITE
+from brushloop.calibrate.writing import PROTOCOL as WRITE
 from brushloop.collect.chains.commands import calibrated, collected, finished_session, fitted
 from brushloop.collect.chains.demo_rig import DemoRig
 from brushloop.collect.chains.loop import PAGE as LOOP_PAGE

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from brushloop.calibrate.artefact import current
-from brushloop.calibrate.writing.record import PROTOCOL, PlannedBy, load_plan
+from brushloop.calibrate.writing import PROTOCOL, PlannedBy, load_plan
 from brushloop.collect.chains.commands import Say, collected_session, finished_session
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
@@ -44,7 +44,7 @@ class WritingRequest:
     sheet: int | None = None
     """Number of the sheet that the operator has put in; valid for one collection, as the next needs a fresh sheet."""
     data: Path | None = None
-    """Folder of hanzi-writer files, or makemeahanzi's graphics.txt."""
+    """Folder of hanzi-writer files, such as 字.json."""
     cell_mm: float = 70.0
     speed_mm_s: float = 15.0
     references: tuple[str, ...] = ()

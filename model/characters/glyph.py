@@ -1,4 +1,4 @@
-"""What is written, and its image: a character of hanzi-writer or makemeahanzi, or a trajectory of the user's.
+"""What is written, and its image: a character of hanzi-writer, or a trajectory of the user's.
 
 A character has an outline and a median for each stroke, in font units: 1024 per side, x to the right, y upward from
 -124 at the bottom to 900 at the top. A trajectory is CSV with the columns `x_mm`, `y_mm`, `width_mm` (the width that
@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 from typing import Annotated
 
 import cv2
@@ -27,6 +28,8 @@ from brushloop.model.characters.plan import Floats, Image, Patch, StrokePath, gr
 from brushloop.model.outline import Outline
 from brushloop.model.raster import SIZE_PX, coverage
 
+CHARACTERS = Path(__file__).parent / "data"
+"""Folder of the characters that come with brushloop, a file for each, and of their licence."""
 MAX_GLYPH_CHARS = 256 * 1024
 MAX_SEGMENTS = 1024
 MAX_UNITS = 4096.0

@@ -13,7 +13,7 @@ from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
-from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WrittenRecord, table_3
+from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WritingComparison, WrittenRecord
 from brushloop.sessions.records import Source, Stroke
 
 LEVELS = {AGAIN: 0.94, ANOTHER: 0.95, SIMULATED: 0.9}
@@ -64,7 +64,7 @@ def table_of(character: str = "字", reference: str = "a font") -> tuple[Table3R
     written.__dict__["scores"] = {
         (pair, key): twice[: 1 if pair == PLANNED else 2] for key, pair in itertools.product(WRITTEN_KEYS, PAIRS)
     }
-    return tuple(table_3([written]))
+    return WritingComparison(None, None, [written]).table_3
 
 
 def written_record(source: Source = Source.LOOPBACK, **changes: Any) -> WrittenRecord:

@@ -23,8 +23,8 @@ from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
 from brushloop.calibrate.validate.page import pages_beside
-from brushloop.calibrate.writing.compare import Character, WritingComparison, table_3, write_written
-from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
+from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
+from brushloop.calibrate.writing.compare import Character, WritingComparison, write_written
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.sessions.records import Header, Source, Stroke
 from tests.browser import BROWSER, content_widths_px
@@ -106,12 +106,12 @@ def _written(folder: Path) -> str:
     cross[60:68, 30:100] = cross[30:100, 60:68] = 1.0
     ink = dict.fromkeys(Tone, cross)
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, 0.0], [5.0, 6.0, 7.0, 8.0, 9.0]])]
-    figure = FigureRecord(
+    figure = Figure(
         name="字",
         source="a font",
         commanded=as_points(strokes),
-        wanted_png=encoded(cross),
-        simulated_png=encoded(cross),
+        wanted=cross,
+        simulated=cross,
     )
     one = Character("字", "a font", ink, ink, {"zi-r01": ink, "zi-r02": ink})
     session = SimpleNamespace(
@@ -120,9 +120,9 @@ def _written(folder: Path) -> str:
         sha256="ab",
         calibration=CALIBRATION,
     )
-    plan = PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
+    plan = Plan(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
     made = WritingComparison(session, plan, [one])
-    return write_written(made, table_3([one]), folder / "written", "brushloop write").read_text(encoding="utf-8")
+    return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
 
 
 def _pressed(folder: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 
 from brushloop.calibrate.compare.place import Alignment, Polarity, Tone
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points, load_plan
 from brushloop.calibrate.writing.compare import (
     ANOTHER,
     HEADLINE,
@@ -18,14 +20,13 @@ from brushloop.calibrate.writing.compare import (
     REFERENCE,
     SIMULATED,
     Character,
+    WritingComparison,
     aligned,
     as_ink,
     compare_ink,
     read_reference,
     read_written,
-    table_3,
 )
-from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded, load_plan
 from tests.calibrate.records import written_record
 
 
@@ -56,7 +57,7 @@ def character(writings: int = 3) -> Character:
 
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:
-    rows = table_3([character()])
+    rows = WritingComparison(None, None, [character()]).table_3
     assert len(rows) == len(KEYS) * 4
     strict = {row.pair: row for row in rows if (row.alignment, row.tone, row.polarity) == HEADLINE}
     assert [strict[pair].csim.n for pair in (SIMULATED, REFERENCE, PLANNED, ANOTHER)] == [3, 3, 1, 3]
@@ -66,11 +67,11 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
     assert strict[REFERENCE].reference == "font of the test"
     # The middle one is nearest to the two others, and a writing alone has no other.
     assert character().scores[ANOTHER, HEADLINE][:, 0].argmax() == 1
-    assert ANOTHER not in {row.pair for row in table_3([character(1)])}
+    assert ANOTHER not in {row.pair for row in WritingComparison(None, None, [character(1)]).table_3}
 
     path = tmp_path / "written.json"
-    path.write_text(written_record(table_3=tuple(rows)).to_json())
-    assert list(read_written(tmp_path).table_3) == rows
+    path.write_text(written_record(table_3=rows).to_json())
+    assert read_written(tmp_path).table_3 == rows
     path.write_text(path.read_text().replace("loopback rig", "real capture"))
     with pytest.raises(CalibrationError, match=r"written\.json: was edited"):
         read_written(path)
@@ -81,21 +82,20 @@ def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: P
 
 def test_a_plan_keeps_its_images_and_its_points(tmp_path: Path) -> None:
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, -0.0001], [5.5, 6.25, 7.125, 8.0, 9.0]])]
-    images = {"wanted_png": encoded(cross()), "simulated_png": encoded(cross(width=10))}
-    figure = FigureRecord(name="x", source="font", commanded=as_points(strokes), **images)
-    plan = PlanRecord(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
-    (tmp_path / "plan.json").write_text(plan.model_dump_json())
+    figure = Figure(name="x", source="font", commanded=as_points(strokes), wanted=cross(), simulated=cross(width=10))
+    plan = Plan(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
+    text = plan.model_dump_json()
+    (tmp_path / "plan.json").write_text(text)
     loaded = load_plan(tmp_path)
-    assert loaded == plan
-    np.testing.assert_array_equal(loaded.figures[0].wanted(), cross())
+    assert loaded.model_dump_json() == text
+    np.testing.assert_array_equal(loaded.figures[0].wanted, cross())
     # What the protocol holds has three decimals.
-    assert figure.commanded == (((1, 2, 3, 4, 0), (5.5, 6.25, 7.125, 8, 9)),)
-    (tmp_path / "plan.json").write_text(plan.model_dump_json().replace(figure.wanted_png, "AAAA"))
-    with pytest.raises(CalibrationError, match="x: wanted_png is not a picture"):
-        load_plan(tmp_path).figures[0].wanted()
-    (tmp_path / "plan.json").write_text(plan.model_dump_json().replace("60.0", "NaN"))
-    with pytest.raises(CalibrationError, match=r"plan\.json: cell_mm"):
-        load_plan(tmp_path)
+    assert loaded.figures[0].commanded == (((1, 2, 3, 4, 0), (5.5, 6.25, 7.125, 8, 9)),)
+    picture = json.loads(text)["figures"][0]["wanted"]
+    for old, new, words in ((picture, "AAAA", "figures.0.wanted: .*not a picture"), ("60.0", "NaN", "cell_mm")):
+        (tmp_path / "plan.json").write_text(text.replace(old, new))
+        with pytest.raises(CalibrationError, match=rf"plan\.json: {words}"):
+            load_plan(tmp_path)
 
 
 def test_a_picture_of_ones_own_is_padded_to_a_square_and_must_be_dark_on_light(tmp_path: Path) -> None:

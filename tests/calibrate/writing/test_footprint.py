@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing import recorded_figures
 from brushloop.calibrate.writing.learn import (
     FIGURES,
     MARGIN,
@@ -18,7 +19,6 @@ from brushloop.calibrate.writing.learn import (
     practice,
     practice_strokes,
 )
-from brushloop.calibrate.writing.record import recorded_figures
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.characters.plan import Reach, grid, without_tilt

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing import Figure, Plan, PlannedBy, as_points
 from brushloop.calibrate.writing.compare import (
     Character,
     WritingComparison,
     as_ink,
     round_of,
-    table_3,
     write_written,
 )
 from brushloop.calibrate.writing.learn import MOST_MM, learned, missed
-from brushloop.calibrate.writing.record import FigureRecord, PlannedBy, PlanRecord, as_points, encoded
 from brushloop.model.characters.glyph import swept
 from brushloop.model.characters.plan import StrokePath, covered, drawn, first_lead, lead
 from brushloop.model.drag import NAMES, START, Footprint
@@ -39,27 +38,27 @@ TRUE = brush_of(half_mm_2=-0.1, leash_mm=1.2, across_mm=0.6)
 """The brush that writes: thinner, farther behind and farther to the left than the one that the plan knows."""
 
 
-def plan_of() -> PlanRecord:
+def plan_of() -> Plan:
     by = PlannedBy(footprint=PLANNED.values)
     strokes = first_lead([LINE], PLANNED, by.reach, SIDE_MM, 5.0)
     strokes = lead([PLANNED], strokes, WANTED, SIDE_MM, by.reach)
     median = tuple((x, y, 2.0) for x, y in LINE.points.tolist())
-    figure = FigureRecord(
+    figure = Figure(
         name="bar",
         source="test",
         commanded=as_points(strokes),
-        wanted_png=encoded(WANTED),
-        simulated_png=encoded(WANTED),
+        wanted=WANTED,
+        simulated=WANTED,
         medians=(median,),
     )
-    return PlanRecord(model="footprint", planned_by=by, cell_mm=SIDE_MM, software="test", figures=(figure,))
+    return Plan(model="footprint", planned_by=by, cell_mm=SIDE_MM, software="test", figures=(figure,))
 
 
-def came_out(plan: PlanRecord) -> np.ndarray:
+def came_out(plan: Plan) -> np.ndarray:
     return covered(drawn([TRUE], plan.figures[0].strokes, SIDE_MM, 128), SIDE_MM)
 
 
-def session(plan: PlanRecord, name: str = "bar", ink: np.ndarray | None = None) -> WritingComparison:
+def session(plan: Plan, name: str = "bar", ink: np.ndarray | None = None) -> WritingComparison:
     seen = came_out(plan) if ink is None else ink
     one = Character(name, "test", as_ink(WANTED), as_ink(seen), {f"{name}-r01": as_ink(seen)})
     header = Header(session_id="s", source=Source.LOOPBACK, software="test")
@@ -69,17 +68,17 @@ def session(plan: PlanRecord, name: str = "bar", ink: np.ndarray | None = None) 
 
 
 @pytest.fixture(scope="module")
-def plan() -> PlanRecord:
+def plan() -> Plan:
     return plan_of()
 
 
 @pytest.fixture(scope="module")
-def after(plan: PlanRecord) -> PlanRecord:
+def after(plan: Plan) -> Plan:
     return learned(session(plan))
 
 
-def test_a_round_brings_the_ink_to_where_it_was_wanted(plan: PlanRecord, after: PlanRecord) -> None:
-    def wrong(one: PlanRecord) -> int:
+def test_a_round_brings_the_ink_to_where_it_was_wanted(plan: Plan, after: Plan) -> None:
+    def wrong(one: Plan) -> int:
         return np.count_nonzero((came_out(one) > 0.5) != (WANTED > 0.5))
 
     assert wrong(after) < 0.5 * wrong(plan)
@@ -94,7 +93,7 @@ def test_a_round_brings_the_ink_to_where_it_was_wanted(plan: PlanRecord, after: 
     assert drift == pytest.approx(0.6, abs=0.3)
 
 
-def test_after_a_round_that_does_not_help_the_best_one_is_kept(plan: PlanRecord, after: PlanRecord) -> None:
+def test_after_a_round_that_does_not_help_the_best_one_is_kept(plan: Plan, after: Plan) -> None:
     last = learned(session(after, ink=np.roll(came_out(after), 8, axis=0)))
     [figure] = last.figures
     assert figure.settled
@@ -104,19 +103,18 @@ def test_after_a_round_that_does_not_help_the_best_one_is_kept(plan: PlanRecord,
     assert learned(session(last, ink=WANTED)).figures[0].settled
 
 
-def test_the_report_lists_rounds_and_what_each_phase_lost(after: PlanRecord, tmp_path: Path) -> None:
+def test_the_report_lists_rounds_and_what_each_phase_lost(after: Plan, tmp_path: Path) -> None:
     written = session(after)
-    table = table_3(written.characters)
-    page = write_written(written, table, tmp_path, "brushloop write compare").read_text(encoding="utf-8")
+    page = write_written(written, tmp_path, "brushloop write compare").read_text(encoding="utf-8")
     assert "bar: wrong pixels (missing or too much) by phase of the strokes" in page
     assert "<th>phase</th><th>round 1</th><th>these writings</th>" in page
     assert "<td>initiation, hidden tip</td>" in page
 
 
-def test_a_correction_stays_within_reach(plan: PlanRecord) -> None:
+def test_a_correction_stays_within_reach(plan: Plan) -> None:
     blob = np.zeros((128, 128), np.float32)
     blob[0:20, 0:20] = 1.0
-    made = learned(session(plan, ink=blob), gain=1.5)
+    made = learned(session(plan, ink=blob))
     [command], reach = made.figures[0].strokes, made.planned_by.reach
     assert command[:, 2].min() >= reach.depth_mm[0]
     assert command[:, 2].max() <= reach.depth_mm[1]
@@ -124,7 +122,7 @@ def test_a_correction_stays_within_reach(plan: PlanRecord) -> None:
     assert np.all(np.linalg.norm(np.diff(command[:, :3], axis=0), axis=1) >= 1.0)
 
 
-def test_a_character_that_was_not_captured_teaches_nothing(plan: PlanRecord) -> None:
+def test_a_character_that_was_not_captured_teaches_nothing(plan: Plan) -> None:
     with pytest.raises(CalibrationError, match="shows no 'bar'"):
         learned(session(plan, "other"))
 
@@ -143,7 +141,7 @@ def drawn_disc(half_mm: float) -> np.ndarray:
     return half_mm - np.hypot(np.clip(x, 12.0, 36.0) - x, y - 24.0)
 
 
-def test_what_is_lost_is_listed_by_phase(plan: PlanRecord) -> None:
+def test_what_is_lost_is_listed_by_phase(plan: Plan) -> None:
     [figure] = plan.figures
     cut = WANTED.copy()
     cut[:, :40] = 0.0  # the first 3 mm of the stroke and its rounding are missing

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.writing import PROTOCOL, PlannedBy
 from brushloop.calibrate.writing.plan import PICTURE, PlanRequest, plan, pressed, read_wanted
-from brushloop.calibrate.writing.record import PROTOCOL, PlannedBy
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.ccdbsm import Brush
@@ -58,19 +58,20 @@ def test_every_shipped_character_becomes_a_protocol_within_reach(tmp_path: Path)
 
 def test_refinement_raises_both_scores() -> None:
     [wanted] = read_wanted("永", None, PATCH)
-    figure = pressed(wanted, MODEL, Reach(), PATCH, 5.0, 20)
+    figure, first = pressed(wanted, MODEL, Reach(), PATCH, 5.0, 20)
     for measure, least in ((csim, 0.98), (ssim, 0.97)):
-        assert measure(wanted.image, figure.simulated) > max(measure(wanted.image, figure.first), least)
+        assert measure(figure.wanted, figure.simulated) > max(measure(figure.wanted, first), least)
 
 
-def test_a_whole_data_set_is_read_from_a_folder_or_a_file_of_lines(tmp_path: Path) -> None:
+def test_a_data_set_is_a_folder_with_a_file_for_each_character(tmp_path: Path) -> None:
     (tmp_path / "一.json").write_text(json.dumps(BAR), encoding="utf-8")
-    lines = [json.dumps({"character": name} | BAR, ensure_ascii=False) for name in "二一"]
-    (tmp_path / "graphics.txt").write_text("\n".join(lines), encoding="utf-8")
-    for data in (tmp_path, tmp_path / "graphics.txt"):
-        [wanted] = read_wanted("一", data, PATCH)
-        assert len(wanted.paths) == 1
-        assert wanted.image.max() == 1.0
+    [figure] = read_wanted("一", tmp_path, PATCH)
+    assert len(figure.paths) == 1
+    assert figure.wanted.max() == 1.0
+    for content, words in ((b"\xff\xfe", "is no UTF-8 text"), (b"{}", "strokes: Field required")):
+        (tmp_path / "一.json").write_bytes(content)
+        with pytest.raises(CalibrationError, match=rf"一\.json: {words}"):
+            read_wanted("一", tmp_path, PATCH)
 
 
 def test_a_trajectory_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> None:
@@ -88,7 +89,7 @@ def test_a_trajectory_is_planned_with_the_widths_it_asks_for(tmp_path: Path) -> 
     ("arguments", "words"),
     [
         (("一",), "is not shipped (子 字 永)"),
-        (("一", "--data", "nowhere"), "nowhere: no such file"),
+        (("一", "--data", "nowhere"), "nowhere/一.json: no such file"),
         (("字字",), "the same character twice"),
         (("no.csv",), "no.csv: no such file"),
         (("字", "--tilt-range", "0", "45"), "tilts end at 30 deg"),
@@ -105,19 +106,3 @@ def test_bad_input_is_one_line(
     assert words in str(ran.exception)
     assert "\n" not in str(ran.exception)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("graphics.txt", b"\xff\xfe", "is no UTF-8 text"),
-        ("graphics.txt", '{"character": "一"}'.encode(), "strokes: Field required"),
-        ("graphics.txt", '{"character": "一"'.encode(), "is neither a folder nor a graphics.txt"),
-        ("graphics.txt", b"nothing", "holds no character"),
-    ],
-)
-def test_bad_data_names_its_file(tmp_path: Path, name: str, content: bytes, words: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(CalibrationError, match=name) as caught:
-        read_wanted("一", tmp_path / name, PATCH)
-    assert words in str(caught.value)

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from brushloop.calibrate.report import Written
+from brushloop.calibrate.writing import FILE as PLAN
+from brushloop.calibrate.writing import PROTOCOL, Figure, Plan, PlannedBy
 from brushloop.calibrate.writing.compare import CompareRequest
 from brushloop.calibrate.writing.learn import LearnRequest, PracticeRequest
 from brushloop.calibrate.writing.plan import PlanRequest
-from brushloop.calibrate.writing.record import FILE as PLAN
-from brushloop.calibrate.writing.record import PROTOCOL, FigureRecord, PlannedBy, PlanRecord
 from brushloop.collect.chains import writing
 from brushloop.collect.chains.writing import FOOTPRINT, Writing, WritingRequest
 from brushloop.collect.errors import ConfigError
@@ -21,9 +21,9 @@ CELL = 'kind = "write"\ncell_mm = [48.0, 48.0]\nrepeats = {repeats}\n[[figures]]
 POINTS = "points = [[10.0, 24.0, 3.0, 0.0, 0.0], [20.0, 24.0, 3.0, 0.0, 0.0]]\n"
 
 
-def plan(settled: bool) -> PlanRecord:
-    figure = FigureRecord(name="子", source="", commanded=(), wanted_png="", simulated_png="", settled=settled)
-    return PlanRecord(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
+def plan(settled: bool) -> Plan:
+    figure = Figure(name="子", source="", settled=settled)
+    return Plan(model="", planned_by=PlannedBy(), cell_mm=48.0, software="", figures=(figure,))
 
 
 class Commands:
