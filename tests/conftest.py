@@ -52,7 +52,7 @@ DEVICES = (
     "tests/contract",
     "tests/drivers/arcs",
     "tests/drivers/test_force.py",
-    "tests/drivers/test_ink_",
+    "tests/drivers/test_ink.py",
     "tests/drivers/sim/test_device_faults.py",
 )
 """Tests that mostly wait for a device."""

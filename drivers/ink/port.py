@@ -228,9 +228,9 @@ class SerialPort:
         time.sleep(self._gap_s)
         if waiting := port.in_waiting:
             port.read(waiting)  # late replies and noise from before this request
+        deadline_s = time.monotonic() + timeout_s
         port.write(request)
         received = b""
-        deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s and len(received) <= MAX_REPLY_BYTES:
             if closing.is_set():
                 raise NotConnected(self._device, op, "closed while waiting")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from brushloop.drivers.force.simulator import ForceBoard
 from brushloop.drivers.ink.simulator import PtyLine
@@ -17,10 +19,51 @@ def fail_rounds(board: ForceBoard, *faults: str) -> None:
     board.next_fault = lambda: next(coming, None)
 
 
-def fail_requests(line: PtyLine, *faults: str) -> None:
-    """Apply these faults to the next requests on the line, one each."""
+class PatientClock:
+    """The time of the serial port: it stands still until a request is not answered as it should be."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self._now_s
+
+    def sleep(self, _seconds: float) -> None:
+        pass
+
+    def jump_soon(self) -> None:
+        """Let the time for the present request run out, once bytes that are on their way have arrived."""
+        asyncio.get_running_loop().call_later(0.1, self._jump)
+
+    def _jump(self) -> None:
+        self._now_s += 1000.0
+
+
+def heard(instrument: Any, clock: PatientClock) -> Any:
+    """The instrument; time runs out where it does not reply."""
+    answer = instrument.answer
+
+    def answered(request: bytes) -> bytes | None:
+        reply = answer(request)
+        if not reply:
+            clock.jump_soon()
+        return reply
+
+    instrument.answer = answered
+    return instrument
+
+
+def fail_requests(line: PtyLine, clock: PatientClock, *faults: str) -> None:
+    """Apply these faults to the next requests on the line, one each; time runs out for those that spoil the reply."""
     coming = iter(faults)
-    line.next_fault = lambda: next(coming, None)
+
+    def next_fault() -> str | None:
+        fault = next(coming, None)
+        if fault not in (None, "split", "unplug"):
+            clock.jump_soon()
+        return fault
+
+    line.next_fault = next_fault
 
 
 class Script:
@@ -52,10 +95,10 @@ class Script:
 
 
 @contextmanager
-def scripted(exchanges: Sequence[tuple[bytes, bytes]]) -> Iterator[str]:
+def scripted(exchanges: Sequence[tuple[bytes, bytes]], clock: PatientClock) -> Iterator[str]:
     """The port of an instrument that expects these requests and nothing else."""
     script = Script(exchanges)
-    with PtyLine(script) as line:
+    with PtyLine(heard(script, clock)) as line:
         yield line.path
     assert not script.surprises
     assert not script.left, f"never asked for: {script.left}"

@@ -1,0 +1,467 @@
+"""Ink devices on a simulated line: the station's dialogue, and a pump whose last command is always a stop."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from brushloop.drivers.devices import Ink
+from brushloop.drivers.errors import (
+    ConnectionLost,
+    DeviceError,
+    DeviceTimeout,
+    LimitExceeded,
+    NotConnected,
+    ProtocolViolation,
+)
+from brushloop.drivers.host import Clock, HostClock
+from brushloop.drivers.ink import port as port_module
+from brushloop.drivers.ink import pump as pump_module
+from brushloop.drivers.ink import station as station_module
+from brushloop.drivers.ink.port import DoseLost, InkRefused
+from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig, exception, write_register
+from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
+from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
+from tests.drivers.failing import PatientClock, fail_requests, heard, scripted
+from tests.waiting import until
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> PatientClock:
+    """No reply is too late while one is being made, and a silence is over at once."""
+    clock = PatientClock()
+    monkeypatch.setattr(port_module, "time", clock)
+    monkeypatch.setattr(station_module, "CONNECT_ATTEMPTS", 2)
+    return clock
+
+
+# ---------------------------------------------------------------- the station
+
+HELLO = (b"000 identify*6A60\n", b"000 ok ink-station 1 1.0.0 real*8310\n")
+DOSE = b"001 dose 0.500*7A5F\n"
+
+
+def station_at(path: str, clock: Clock | None = None) -> InkStation:
+    table = InkStationConfig(kind="ink-station", port=path, dose_ml=2.0, light=0.5)
+    return InkStation(table, clock or HostClock())
+
+
+@pytest.fixture
+def well() -> StationFirmware:
+    return StationFirmware()
+
+
+@pytest.fixture
+async def station_line(well: StationFirmware, clock: PatientClock) -> AsyncIterator[PtyLine]:
+    with PtyLine(heard(well, clock)) as line:
+        yield line
+
+
+@pytest.fixture
+async def station(station_line: PtyLine) -> AsyncIterator[InkStation]:
+    station = station_at(station_line.path)
+    await station.connect()
+    yield station
+    await station.close()
+
+
+async def test_a_session_reads_like_the_documented_one(clock: PatientClock):
+    exchanges = [
+        HELLO,
+        (seal(1, "light 0.500"), seal(1, "ok")),
+        (seal(2, "dose 1.250"), seal(2, "ok 1.250")),
+        (seal(3, "level"), seal(3, "ok 0.730")),
+        (seal(4, "dose 0.500"), seal(4, "err 4 reservoir is empty")),
+    ]
+    with scripted(exchanges, clock) as path:
+        station = station_at(path)
+        assert isinstance(station, Ink)
+        identity = await station.connect()
+        assert (identity.model, identity.firmware, identity.simulated) == ("ink-station", "1.0.0", False)
+        assert await station.light() == 0.5
+        await station.dose(1.25)
+        assert await station.level() == 0.73
+        with pytest.raises(InkRefused, match=r"reservoir is empty.*Nothing was done.*Refill") as refusal:
+            await station.dose(0.5)
+        assert refusal.value.code == 4
+        await station.close()
+
+
+async def test_a_lost_reply_is_asked_for_again_with_the_same_line_and_then_says_what_may_have_happened(
+    clock: PatientClock,
+):
+    again = seal(2, "dose 0.500")
+    exchanges = [HELLO, (DOSE, b""), (DOSE, b"001 ok 0.500*41C5\n"), (again, b""), (again, b"")]
+    with scripted(exchanges, clock) as path:
+        station = station_at(path)
+        await station.connect()
+        await station.dose(0.5)
+        with pytest.raises(DeviceTimeout, match=r"Between 0 and 0.500 ml may be in the well"):
+            await station.dose(0.5)
+        await station.close()
+
+
+@pytest.mark.parametrize(
+    ("reply", "error", "says"),
+    [
+        (b"001 ok 1.5*CD6C\n", ProtocolViolation, "above 1"),
+        (b"001 ok nan*1429\n", ProtocolViolation, "not a decimal"),
+        (b"001 ok*C626\n", ProtocolViolation, "expected one number"),
+        (b"001 err 6 jammed*4073\n", InkRefused, "Look at the pump"),
+    ],
+)
+async def test_a_level_that_makes_no_sense_is_refused(
+    clock: PatientClock, reply: bytes, error: type[DeviceError], says: str
+):
+    with scripted([HELLO, (b"001 level*243E\n", reply)], clock) as path:
+        station = station_at(path)
+        await station.connect()
+        with pytest.raises(error, match=says):
+            await station.level()
+        await station.close()
+
+
+async def test_a_dose_that_comes_out_smaller_is_an_error(clock: PatientClock):
+    with scripted([HELLO, (DOSE, b"001 ok 0.400*8194\n")], clock) as path:
+        station = station_at(path)
+        await station.connect()
+        with pytest.raises(DeviceError, match=r"gave 0.400 ml instead of 0.500 ml"):
+            await station.dose(0.5)
+        await station.close()
+
+
+async def test_a_board_that_starts_slowly_is_waited_for_and_another_device_is_refused(clock: PatientClock):
+    hello, answer = HELLO
+    with scripted([(hello, b""), (hello, answer)], clock) as path:
+        station = station_at(path)
+        await station.connect()
+        await station.close()
+    for other in (b"000 ok ink-station 2 9.0 real*24F2\n", b"000 ok gcode 1.1 real x*EE49\n"):
+        with scripted([(hello, other)], clock) as path:
+            station = station_at(path)
+            with pytest.raises(ProtocolViolation, match=r"expected ink-station with protocol 1.*Check that the path"):
+                await station.connect()
+            with pytest.raises(NotConnected):
+                await station.level()
+
+
+@pytest.mark.parametrize("fault", ["deaf", "mute", "garbage", "late", "split", "damaged", "mistaken", "echo"])
+async def test_one_fault_gives_the_dose_once_and_one_that_lasts_is_an_error(
+    fault: str, station_line: PtyLine, well: StationFirmware, station: InkStation, clock: PatientClock
+):
+    fail_requests(station_line, clock, fault)
+    await station.dose(1.0)
+    assert well.well.ml == 11.0
+    assert await station.level() == 0.55
+    if fault not in ("split", "late"):
+        fail_requests(station_line, clock, fault, fault)
+        with pytest.raises((DeviceTimeout, ProtocolViolation), match="may be in the well"):
+            await station.dose(1.0)
+        assert well.well.ml == (11.0 if fault == "deaf" else 12.0)
+        assert await station.level() == pytest.approx(well.well.ml / 20.0)
+
+
+async def test_a_pulled_cable_is_a_lost_connection_at_once_and_leads_to_no_other_station(
+    station_line: PtyLine, station: InkStation, clock: PatientClock
+):
+    fail_requests(station_line, clock, "unplug")
+    with pytest.raises(ConnectionLost, match=r"may be in the well.*Check cable") as lost:
+        await station.dose(1.0)
+    assert lost.value.op == "dose"
+    # the kernel gives the number of the closed terminal to the next one
+    with PtyLine(StationFirmware()), pytest.raises(ConnectionLost, match="cannot open"):
+        await station.connect()
+
+
+async def test_a_port_that_is_missing_or_held_by_somebody_else_is_not_opened(
+    tmp_path: Path, station_line: PtyLine, station: InkStation
+):
+    nowhere = station_at(str(tmp_path / "ttyUSB0"))
+    with pytest.raises(ConnectionLost, match=r"cannot open .*ttyUSB0"):
+        await nowhere.connect()
+    with pytest.raises(NotConnected):
+        await nowhere.light()
+    await nowhere.close()
+    with pytest.raises(ConnectionLost, match="lock"):
+        await station_at(station_line.path).connect()
+    await station.light()
+
+
+async def test_closing_ends_an_exchange_that_waits_and_a_cancelled_one_does_not_disturb_the_next(
+    station_line: PtyLine, station: InkStation
+):
+    faults = iter(["mute", "late"])  # the clock stands still: each would wait for ever
+    station_line.next_fault = lambda: next(faults, None)
+    asking = asyncio.create_task(station.light())
+    await until(lambda: station_line.instrument.light == 0.5, "the request to arrive")  # type: ignore[attr-defined]
+    await station.close()
+    with pytest.raises(NotConnected):
+        await asking
+    await station.connect()
+    asking = asyncio.create_task(station.light())
+    await asyncio.sleep(0)
+    asking.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asking
+    assert await station.level() == 0.5
+
+
+class StillClock:
+    ns = 0
+
+    def now_ns(self) -> int:
+        return self.ns
+
+
+async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(
+    station_line: PtyLine, well: StationFirmware, clock: PatientClock
+):
+    minute = StillClock()
+    station = station_at(station_line.path, minute)
+    await station.connect()
+    await station.dose(2.0)
+    minute.ns = 30 * 10**9
+    fail_requests(station_line, clock, "deaf", "deaf")
+    with pytest.raises(DeviceTimeout):
+        await station.dose(2.0)
+    with pytest.raises(LimitExceeded, match=r"dose per minute = 5\.500"):
+        await station.dose(1.5)
+    minute.ns = 60 * 10**9
+    await station.dose(1.5)
+    with pytest.raises(LimitExceeded):
+        await station.dose(2.0)
+    assert well.well.ml == 13.5
+    await station.close()
+
+
+async def test_a_well_is_filled_up_to_its_level_and_a_dose_that_does_not_arrive_is_told(
+    well: StationFirmware, station: InkStation, monkeypatch: pytest.MonkeyPatch
+):
+    well.well.ml = 0.4 * well.well.capacity_ml
+    filled = await station.replenish(dips=0)
+    assert filled.level is not None
+    assert filled.level >= 0.5
+    assert filled.dosed_ml == pytest.approx(well.well.ml - 0.4 * well.well.capacity_ml)
+    assert await station.replenish(dips=1) == filled, "it is full"
+    well.well.ml = 1.0
+    monkeypatch.setattr(well.well, "add", lambda _volume_ml: None)  # the tube has come off
+    with pytest.raises(DoseLost, match="Look at the tube"):
+        await station.replenish(dips=2)
+    well.well.ml = 19.0  # somebody poured
+    assert (await station.replenish(dips=3)).dosed_ml == filled.dosed_ml + 2.0, "the lost dose was given as well"
+
+
+async def test_a_station_refuses_what_it_cannot_do(well: StationFirmware, station: InkStation):
+    well.lid_open = False
+    with pytest.raises(InkRefused, match="Open the lid"):
+        await station.dose(1.0)
+    well.lid_open = True
+    well.well.ml = 19.5
+    with pytest.raises(InkRefused, match="overflow"):
+        await station.dose(1.0)
+    assert well.reservoir_ml == 100.0
+
+
+# ---------------------------------------------------------------- the pump
+
+ML_PER_REV = 0.12  # at 50 rpm: 0.1 ml/s
+PROBE = bytes.fromhex("01 06 00 04 00 00 37 F4")  # a stop with a wrong CRC
+STOP = bytes.fromhex("01 06 00 04 00 00 C8 0B")
+SPEED = bytes.fromhex("01 06 00 01 13 88 D5 5C")
+START = bytes.fromhex("01 06 00 04 00 01 09 CB")
+REFUSED = bytes.fromhex("01 86 02 C3 A1")
+CONNECTED = [(PROBE, b""), (STOP, STOP)]
+BYE = [(STOP, STOP)]
+SILENT = (STOP, b"")
+
+
+def pump_at(path: str, *, dose_ml: float = 2.0, every_dips: int = 5) -> ModbusPump:
+    table = ModbusPumpConfig(
+        kind="modbus-pump", port=path, ml_per_revolution=ML_PER_REV, dose_ml=dose_ml, every_dips=every_dips
+    )
+    return ModbusPump(table, HostClock())
+
+
+@pytest.fixture
+def rotor() -> PumpFirmware:
+    return PumpFirmware(ml_per_revolution=ML_PER_REV)
+
+
+@pytest.fixture
+async def pump_line(rotor: PumpFirmware, clock: PatientClock) -> AsyncIterator[PtyLine]:
+    with PtyLine(heard(rotor, clock)) as line:
+        yield line
+
+
+@pytest.fixture
+async def pump(pump_line: PtyLine, rotor: PumpFirmware) -> AsyncIterator[ModbusPump]:
+    pump = pump_at(pump_line.path)
+    await pump.connect()
+    yield pump
+    await pump.close()
+    assert not rotor.running
+
+
+async def test_a_dose_sets_the_speed_starts_and_stops(clock: PatientClock):
+    with scripted([*CONNECTED, (SPEED, SPEED), (START, START), (STOP, STOP), *BYE], clock) as path:
+        pump = pump_at(path)
+        assert isinstance(pump, Ink)
+        identity = await pump.connect()
+        assert (identity.model, identity.simulated) == ("Modbus RTU pump, unit 1", False)
+        began = time.monotonic()
+        await pump.dose(0.015)
+        assert time.monotonic() - began >= 0.15
+        assert (await pump.level(), await pump.light()) == (None, None)
+        for volume_ml in (0.009, 2.001, math.nan):
+            with pytest.raises(LimitExceeded, match="ml is outside"):
+                await pump.dose(volume_ml)
+        await pump.close()
+
+
+async def test_it_doses_before_every_nth_dip(pump_line: PtyLine):
+    pump = pump_at(pump_line.path, dose_ml=0.02, every_dips=3)
+    await pump.connect()
+    assert [(await pump.replenish(dips)).dosed_ml for dips in range(7)] == [0.0, 0.0, 0.02, 0.02, 0.02, 0.04, 0.04]
+    await pump.close()
+    assert pump._table.doses_ml(7) == pytest.approx(0.04)
+
+
+async def test_a_line_that_echoes_is_refused(clock: PatientClock):
+    with scripted([(PROBE, PROBE)], clock) as path:
+        pump = pump_at(path)
+        with pytest.raises(ProtocolViolation, match=r"echoes.*Switch off local echo"):
+            await pump.connect()
+        with pytest.raises(NotConnected):
+            await pump.dose(0.1)
+
+
+@pytest.mark.parametrize(
+    ("exchanges", "error", "says"),
+    [
+        ([(SPEED, REFUSED)], InkRefused, r"2 \(illegal register\). The pump was not started"),
+        ([(SPEED, SPEED), (START, b""), (STOP, STOP)], DeviceTimeout, r"start: .*The pump is stopped"),
+        ([(SPEED, SPEED), (START, START), SILENT, SILENT, SILENT], DeviceTimeout, "may still be running"),
+    ],
+    ids=["a speed that is refused", "a start without a reply", "a stop without a reply, sent three times"],
+)
+async def test_a_dose_that_fails_says_how_the_pump_is_left(
+    clock: PatientClock, exchanges: list[tuple[bytes, bytes]], error: type[DeviceError], says: str
+):
+    runs_on = exchanges[-1] == SILENT
+    with scripted([*CONNECTED, *exchanges, *([SILENT] * 3 if runs_on else BYE)], clock) as path:
+        pump = pump_at(path)
+        await pump.connect()
+        with pytest.raises(error, match=says):
+            await pump.dose(0.01)
+        if runs_on:  # closing tries again
+            with pytest.raises(DeviceTimeout, match="may still be running"):
+                await pump.close()
+        await pump.close()
+
+
+@pytest.mark.parametrize("times", [1, 3])
+async def test_a_cancelled_dose_stops_the_pump_however_often_it_is_cancelled(
+    rotor: PumpFirmware, pump_line: PtyLine, pump: ModbusPump, clock: PatientClock, times: int
+):
+    dosing = asyncio.create_task(pump.dose(2.0))
+    await until(lambda: rotor.running, "the pump to run")
+    fail_requests(pump_line, clock, "late")
+    for _ in range(times):
+        dosing.cancel()
+        await asyncio.sleep(0.02)
+    with pytest.raises(asyncio.CancelledError):
+        await dosing
+    assert not rotor.running
+    assert rotor.pumped_ml < 2.0
+
+
+async def test_a_cancelled_dose_whose_stop_fails_says_so(rotor: PumpFirmware, pump_line: PtyLine):
+    pump = pump_at(pump_line.path)
+    await pump.connect()
+    dosing = asyncio.create_task(pump.dose(2.0))
+    await until(lambda: rotor.running, "the pump to run")
+    pump_line.unplug()
+    dosing.cancel()
+    with pytest.raises(asyncio.CancelledError) as cancelled:
+        await dosing
+    assert "may still be running" in cancelled.value.__notes__[0]
+    with pytest.raises(ConnectionLost, match=r"may still be running.*Check cable"):
+        await pump.close()
+
+
+@pytest.mark.parametrize("fault", ["deaf", "garbage", "late", "mistaken"])
+@pytest.mark.parametrize("at", ["start", "stop"])
+async def test_a_fault_anywhere_leaves_the_pump_stopped(
+    fault: str, at: str, rotor: PumpFirmware, pump_line: PtyLine, pump: ModbusPump, clock: PatientClock
+):
+    fail_requests(pump_line, clock, *["split"] * {"start": 1, "stop": 2}[at], fault)
+    if at == "stop":
+        await pump.dose(0.01)  # the second stop is confirmed
+    else:
+        with pytest.raises(DeviceError):
+            await pump.dose(0.01)
+    assert not rotor.running
+
+
+@pytest.mark.parametrize("after_requests", [0, 1, 2])
+async def test_closing_in_mid_dose_leaves_the_pump_stopped(
+    rotor: PumpFirmware, pump_line: PtyLine, after_requests: int
+):
+    pump = pump_at(pump_line.path)
+    await pump.connect()
+    requests: list[None] = []
+    pump_line.next_fault = lambda: requests.append(None)
+    dosing = asyncio.create_task(pump.dose(0.02))
+    await until(lambda: len(requests) >= after_requests, "requests")
+    await pump.close()
+    with pytest.raises(NotConnected):
+        await dosing
+    assert not rotor.running
+
+
+async def test_a_late_reply_does_not_pass_for_the_next(
+    pump_line: PtyLine, rotor: PumpFirmware, pump: ModbusPump, clock: PatientClock
+):
+    fail_requests(pump_line, clock, "late")
+    with pytest.raises(DeviceTimeout, match="not started"):
+        await pump.dose(0.01)
+    await pump.dose(0.01)
+    assert rotor.starts == 1
+
+
+async def test_a_host_that_was_held_up_reports_the_excess(
+    rotor: PumpFirmware, pump: ModbusPump, monkeypatch: pytest.MonkeyPatch
+):
+    sleep, ran = asyncio.sleep, list[bool]()
+
+    async def sleep_and_be_held_up(delay_s: float) -> None:
+        await sleep(delay_s)
+        ran.append(rotor.running)
+        time.sleep(0.25)  # the fault under test
+
+    with monkeypatch.context() as holding_up:
+        holding_up.setattr(pump_module, "MAX_OVERRUN_S", 0.1)
+        holding_up.setattr("brushloop.drivers.ink.pump.asyncio.sleep", sleep_and_be_held_up)
+        with pytest.raises(DeviceError, match=r"instead of 0.10 s\. About .* too much.*is stopped"):
+            await pump.dose(0.01)
+    assert ran == [True]
+    assert not rotor.running
+
+
+def test_the_simulated_pump_pumps_by_the_clock_and_refuses_other_registers():
+    now_s = 0.0
+    rotor = PumpFirmware(ml_per_revolution=0.5, now_s=lambda: now_s)
+    rotor.answer(write_register(1, 1, 6000))
+    rotor.answer(write_register(1, 4, 1))
+    now_s = 10.0
+    assert rotor.pumped_ml == pytest.approx(5.0)
+    rotor.answer(write_register(1, 4, 0))
+    now_s = 20.0
+    assert rotor.pumped_ml == pytest.approx(5.0)
+    for request, code in ((write_register(1, 2, 1), 2), (write_register(1, 1, 60001), 3)):
+        assert rotor.answer(request) == exception(1, 6, code)
