@@ -205,7 +205,7 @@ def _write_protocol(path: Path, strokes: int, seed: int) -> None:
 
 async def _controller(path: Path, seed: int) -> None:
     """Serves the rig; each line on the input is answered with the spans of time in which the arm moved."""
-    from brushloop.collect.rig.config_devices import MOST_STALE_LOOPBACK_MS
+    from brushloop.drivers.force.sri_m8123 import MOST_STALE_LOOPBACK_MS
     from brushloop.drivers.sim.config import SimConfig
     from brushloop.drivers.sim.rig import LoopbackRig
 

@@ -53,7 +53,6 @@ DEVICES = (
     "tests/drivers/arcs",
     "tests/drivers/test_force.py",
     "tests/drivers/test_ink.py",
-    "tests/drivers/sim/test_device_faults.py",
 )
 """Tests that mostly wait for a device."""
 RUNS = (

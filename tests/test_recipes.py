@@ -25,7 +25,7 @@ from brushloop.collect.protocols.steps import PressStep
 from brushloop.collect.quality.measure import Mark
 from brushloop.collect.rig.config import InkConfig, RigConfig
 from brushloop.collect.rig.config_touch import QualityConfig
-from brushloop.drivers.camera import CameraOptions, OpenCvCamera
+from brushloop.drivers.camera import CameraTable, OpenCvCamera
 from brushloop.drivers.devices import Ink, Stamp
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.simulator import Well
@@ -161,7 +161,8 @@ async def test_a_fault_is_a_kind_and_what_it_does(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(KINDS, Device.CAMERA, KINDS[Device.CAMERA])
     recipe("fault").add()
     async with LoopbackRig(SimConfig(force_sensor=False, ink_device="none", view=SMALL)) as rig:
-        camera = OpenCvCamera(CameraOptions(f"http://127.0.0.1:{rig.camera.port}/stream.mjpg"), HostClock())
+        url = f"http://127.0.0.1:{rig.camera.port}/stream.mjpg"
+        camera = OpenCvCamera(CameraTable(kind="opencv", source=url), HostClock())
         await camera.connect()
         sound = (await camera.fresh(Stamp(time.time_ns()))).image
         rig.faults.hang(Fault(device=Device.CAMERA, kind="upside-down", count=ALWAYS))

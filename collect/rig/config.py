@@ -14,16 +14,48 @@ from pydantic import Field, ValidationError, model_validator
 
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.config_devices import CameraConfig, ForceConfig, RobotConfig
-from brushloop.collect.rig.config_file import Config, Finite, PaperSide, place, read_toml, refusal
+from brushloop.collect.rig.config_file import Config, Finite, PaperSide, Range, place, read_toml, refusal
 from brushloop.collect.rig.config_touch import QualityConfig, SelfCheckConfig, TouchConfig
-from brushloop.collect.rig.optics import with_optics
+from brushloop.collect.rig.optics import CameraConfig, with_optics
+from brushloop.drivers.arcs.settings import ArcsTable
+from brushloop.drivers.force.sri_m8123 import ForceTable
 from brushloop.drivers.ink import AnyInkTable
 
 PREFIX, DELIMITER = "BRUSHLOOP_", "__"
 MAX_CONFIG_BYTES = 1024 * 1024
 TRAVEL_CLEARANCE_MM = 15.0
 """Minimum travel height above the paper: more than the length of a drop hanging from the tip."""
+
+
+class LimitsConfig(Config):
+    """The region that the brush tip must never leave, in the robot's base frame."""
+
+    x_mm: Range
+    y_mm: Range
+    z_mm: Range
+    """The lower end is the floor: paper height minus the deepest press."""
+    tilt_deg: Annotated[float, Field(gt=0.0, le=30.0)] = 15.0
+    speed_mm_s: Annotated[float, Field(gt=0.0, le=500.0)] = 250.0
+    acc_mm_s2: Annotated[float, Field(gt=0.0, le=5000.0)] = 1000.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LimitsConfig:
+        for name in ("x_mm", "y_mm", "z_mm"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ValueError(f"{name} = [{low}, {high}]: the first must be less than the second")
+        return self
+
+
+class RobotConfig(ArcsTable, frozen=True):
+    """The arm, and where it may go."""
+
+    limits: LimitsConfig
+
+    @property
+    def on_this_machine(self) -> bool:
+        """Whether its controller has a loopback address, as the loopback rig's has."""
+        return self.host in ("localhost", "::1") or self.host.startswith("127.")
 
 
 class BrushConfig(Config):
@@ -109,7 +141,7 @@ class RigConfig(Config):
     name: str
     robot: RobotConfig
     camera: CameraConfig
-    force: ForceConfig | None = None
+    force: ForceTable | None = None
     brush: BrushConfig
     paper: PaperConfig
     ink: InkConfig

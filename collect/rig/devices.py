@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_devices import ForceConfig
-from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
-from brushloop.drivers.camera import CameraOptions, OpenCvCamera
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Camera, ForceSensor, Identity, Ink, Robot
 from brushloop.drivers.errors import noting_lateness
-from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions
+from brushloop.drivers.force.sri_m8123 import SriM8123
 from brushloop.drivers.host import Claimed, Clock, claimed
 from brushloop.drivers.limits import Limits
 
@@ -51,41 +50,7 @@ def limits_of(config: RigConfig) -> Limits:
 
 def make_robot(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AuboArcs:
     """The arm's driver, not yet connected."""
-    robot = config.robot
-    options = ArcsOptions(
-        robot.host,
-        robot.port,
-        robot.tcp_offset_mm,
-        robot.tcp_rotation_deg,
-        framing=robot.framing,
-        rtde_port=robot.rtde_port,
-        watchdog_s=robot.watchdog_s,
-        speed_fraction=robot.speed_fraction,
-        collision_level=robot.collision_level,
-        payload_kg=robot.payload_kg,
-        payload_cog_mm=robot.payload_cog_mm,
-    )
-    return AuboArcs(options, limits_of(config), clock, on_notice)
-
-
-def make_camera(config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> OpenCvCamera:
-    """The camera's driver, not yet connected."""
-    camera = config.camera
-    options = CameraOptions(camera.source, camera.latency_ms, camera.timeout_s, locked=camera.locked)
-    return OpenCvCamera(options, clock, on_notice)
-
-
-def make_force(config: ForceConfig, clock: Clock) -> SriM8123:
-    """The force sensor's driver, not yet connected."""
-    options = SriOptions(
-        config.interface,
-        config.channel,
-        config.bitrate,
-        host=config.host,
-        port=config.port,
-        stale_after_ms=config.stale_ms,
-    )
-    return SriM8123(options, clock)
+    return AuboArcs(config.robot, limits_of(config), clock, on_notice)
 
 
 def _resolved(host: str) -> str:
@@ -119,12 +84,12 @@ async def connected(config: RigConfig, clock: Clock, on_notice: Callable[[str], 
     async with contextlib.AsyncExitStack() as stack:
         stack.enter_context(sole_driver(config.robot.host, config.robot.port))
         await stack.enter_async_context(noting_lateness())
-        camera = make_camera(config, clock, on_notice)
+        camera = OpenCvCamera(config.camera, clock, on_notice)
         stack.push_async_callback(camera.close)
         camera_identity = await camera.connect()
         force = force_identity = ink = ink_identity = None
         if config.force is not None:
-            force = make_force(config.force, clock)
+            force = SriM8123(config.force, clock)
             stack.push_async_callback(force.close)
             force_identity = await force.connect()
         if config.ink.device is not None:

@@ -16,11 +16,12 @@ from rich.text import Text
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.rig.config import RigConfig
-from brushloop.collect.rig.config_devices import ForceConfig
-from brushloop.collect.rig.devices import make_camera, make_force, make_robot
+from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
+from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Identity, Stamp
 from brushloop.drivers.errors import DeviceError
+from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123
 from brushloop.drivers.host import Clock
 from brushloop.drivers.ink.port import InkTable
 
@@ -89,7 +90,7 @@ async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]
 
 async def _camera(config: RigConfig, clock: Clock) -> Finding:
     notices: list[str] = []
-    camera = make_camera(config, clock, notices.append)
+    camera = OpenCvCamera(config.camera, clock, notices.append)
     try:
         identity = await camera.connect()
         await camera.fresh(Stamp(clock.now_ns()))
@@ -117,13 +118,13 @@ def _board(config: RigConfig, image: Any) -> tuple[str, str, str]:
     return f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px", "", ""
 
 
-def _bus(config: ForceConfig) -> str:
+def _bus(config: ForceTable) -> str:
     gateway = "" if config.host is None else f" at {config.host}:{config.port}"
     return f"{config.interface} {config.channel}{gateway}"
 
 
-async def _force(config: ForceConfig, clock: Clock) -> Finding:
-    sensor = make_force(config, clock)
+async def _force(config: ForceTable, clock: Clock) -> Finding:
+    sensor = SriM8123(config, clock)
     try:
         identity = await sensor.connect()
         await asyncio.sleep(LISTEN_S)

@@ -8,12 +8,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.board.lens import read_lens
+from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError, StepError
-from brushloop.collect.rig.config_devices import CameraConfig
+from brushloop.drivers.camera import CameraTable
 
 Gray = NDArray[np.uint8]
+
+
+class CameraConfig(CameraTable, frozen=True):
+    """The camera, and its lens."""
+
+    lens: str = ""
+    """Name of the lens, for the record."""
+    lens_file: Path | None = None
+    """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is removed before anything is measured."""
+    optics: Lens | None = None
+    """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
 
 
 def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:

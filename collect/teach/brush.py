@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Choice
 from brushloop.collect.rig.check import Check, brush_shorter_than_tool, deepest_press
-from brushloop.collect.rig.config_devices import ForceConfig
-from brushloop.collect.rig.devices import make_force
 from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.sheet_fit import corners_of
 from brushloop.collect.teach.store import Notebook, Taught, taught
 from brushloop.drivers.devices import ForceSample
-from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
+from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL, ForceTable, SriM8123
 from brushloop.drivers.ink.port import InkTable
 from brushloop.drivers.ink.pump import ModbusPumpConfig
 from brushloop.drivers.ink.station import InkStationConfig
@@ -201,7 +199,7 @@ class ForceStep(Step):
 
     async def _pushed(self, day: Day) -> None:
         samples = list[ForceSample]()
-        sensor = make_force(ForceConfig.model_validate(day.notebook.table("force.")), day.clock)
+        sensor = SriM8123(ForceTable.model_validate(day.notebook.table("force.")), day.clock)
         try:
             await day.working("listening to the sensor; let nothing touch the brush")
             identity = await sensor.connect()

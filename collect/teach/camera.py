@@ -30,7 +30,7 @@ from brushloop.collect.operator import Choice
 from brushloop.collect.rig.optics import gray
 from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook
-from brushloop.drivers.camera import CameraOptions, Locked, OpenCvCamera, found_settings
+from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
 from brushloop.drivers.devices import Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import Clock
@@ -262,7 +262,9 @@ def board_of(notebook: Notebook) -> BoardSpec:
 @contextlib.asynccontextmanager
 async def opened(source: str, clock: Clock, locked: Locked | None = None) -> AsyncGenerator[OpenCvCamera]:
     """A connected camera, closed at the end. Raises `DeviceError`, also for a setting that the camera does not keep."""
-    camera = OpenCvCamera(CameraOptions(source, LATE_MS, 10.0, locked=locked or Locked()), clock)
+    camera = OpenCvCamera(
+        CameraTable(kind="opencv", source=source, latency_ms=LATE_MS, locked=locked or Locked()), clock
+    )
     await camera.connect()
     try:
         yield camera

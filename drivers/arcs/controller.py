@@ -11,7 +11,6 @@ MotionError
 from __future__ import annotations
 
 import asyncio
-import math
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -150,8 +149,6 @@ class OutOfReach(MotionFailed):
 NOT_RUNNING = -1
 """Return code of a motion in any robot mode but Running."""
 
-Triple = tuple[float, float, float]
-
 
 @dataclass(frozen=True, slots=True)
 class ArmState:
@@ -183,11 +180,6 @@ class Controller:
         if not isinstance(names, list) or not names:
             raise ProtocolViolation(DEVICE, "getRobotNames", f"expected a list of names, got {names!r}")
         return [str(name) for name in names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
-
-    async def set_tcp_offset(self, offset_mm: Triple, rotation_deg: Triple) -> None:
-        """Set the frame of the brush in the flange's. Raises `MotionRefused`: every height depends on it."""
-        offset = [*(v / 1e3 for v in offset_mm), *map(math.radians, rotation_deg)]
-        accepted("setTcpOffset", await self.ask("RobotConfig.setTcpOffset", offset=offset))
 
     async def pose(self) -> Pose:
         """Where the tip is. Raises `ProtocolViolation`."""

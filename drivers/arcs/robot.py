@@ -18,7 +18,7 @@ from brushloop.drivers.arcs.motion import (
     queue_all,
     until_settled,
 )
-from brushloop.drivers.arcs.settings import ArcsOptions, Departure, make_ready, power_on
+from brushloop.drivers.arcs.settings import ArcsTable, Departure, make_ready, power_on
 from brushloop.drivers.arcs.stopping import Stopper, Watchdog
 from brushloop.drivers.arcs.telemetry import Telemetry
 from brushloop.drivers.arcs.wire import DEVICE, RpcConnection, open_arcs
@@ -27,7 +27,7 @@ from brushloop.drivers.errors import DeviceError, MotionFailed, NotConnected
 from brushloop.drivers.host import Clock, finished
 from brushloop.drivers.limits import Limits
 
-__all__ = ["ArcsOptions", "ArmState", "AuboArcs"]
+__all__ = ["ArcsTable", "ArmState", "AuboArcs"]
 
 AUBOPE_PORT = 8899
 STOP_ACC_M_S2 = 2.0
@@ -39,16 +39,16 @@ class AuboArcs:
 
     def __init__(
         self,
-        options: ArcsOptions,
+        table: ArcsTable,
         limits: Limits,
         clock: Clock,
         on_notice: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        self._options = options
+        self._table = table
         self._limits = limits
         self._notice = on_notice
         self._motion, self._state, self._stop = (
-            Controller(RpcConnection(options.host, options.port, framing=options.framing)) for _ in range(3)
+            Controller(RpcConnection(table.host, table.port, framing=table.framing)) for _ in range(3)
         )
         self._reopening = asyncio.Lock()
         self._stopper = Stopper([self._stop, self._state], self._motion, self._restore_stop)
@@ -60,8 +60,8 @@ class AuboArcs:
         """Whether the controller may hold its path."""
         self._connected = False
         self._enabled = False
-        self._telemetry = Telemetry(self._state, options, clock, on_notice)
-        self._watchdog = Watchdog(self._state.connection, options.watchdog_s, on_notice)
+        self._telemetry = Telemetry(self._state, table, clock, on_notice)
+        self._watchdog = Watchdog(self._state.connection, table.watchdog_s, on_notice)
         self._messages = Messages(self._motion)
         self._departure = Departure(self._motion)
         self._motion.on_notice = on_notice
@@ -92,7 +92,7 @@ class AuboArcs:
         box = str(await self._state.ask("RobotConfig.getControlBoxType"))
         await self._telemetry.start()
         firmware = f"interface {version}"
-        if self._options.rtde_port is not None:
+        if self._table.rtde_port is not None:
             firmware += f", telemetry by {self._telemetry.source}"
         return Identity(DEVICE, f"{model} ({box})", firmware, box == LOOPBACK_CONTROL_BOX)
 
@@ -109,7 +109,7 @@ class AuboArcs:
             except MotionFailed:
                 await self._motion.require_safe("power on")  # a safety stop holds the path, and is the cause
                 raise
-        settings = await make_ready(self._motion, self._options, self._notice)
+        settings = await make_ready(self._motion, self._table, self._notice)
         await power_on(self._motion)
         self._held = True  # a process that was killed may have left it so
         await self._ready()

@@ -11,7 +11,9 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field
 
 from brushloop.drivers.arcs.controller import Controller, RobotMode, WrongOperationalMode, accepted
 from brushloop.drivers.arcs.motion import POLL_S
@@ -29,31 +31,39 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import distance, from_wire
 from brushloop.drivers.limits import Limits
 
+Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
+POSE_LAG_MS = 100.0
 
-@dataclass(frozen=True, slots=True)
-class ArcsOptions:
-    """Where the controller is and how the arm is set up."""
 
-    host: str
-    port: int = 30004
-    tcp_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Offset from flange to brush tip."""
-    tcp_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Turn from the flange's axes to the brush's, as `to_wire` orders it: R = Rz(rz) Ry(ry) Rx(rx)."""
+class ArcsTable(BaseModel, frozen=True, extra="forbid"):
+    """The table `[robot]` of `rig.toml` but for the limits: where the controller is and how the arm is set up."""
+
+    kind: Literal["aubo-arcs"]
+    host: str = Field(min_length=1)
+    port: int = Field(30004, ge=1, le=65535)
+    tcp_offset_mm: tuple[Finite, Finite, Finite]
+    """Flange to brush tip, along the flange's axes."""
+    tcp_rotation_deg: Annotated[tuple[Turn, Turn, Turn], Field(exclude_if=lambda turn: not any(turn))] = (0.0, 0.0, 0.0)
+    """Turn from the flange's axes to the brush's: about x, then y, then z of the flange. The brush is along its z.
+    It is not written if it is zero, so that sessions older than this field can be resumed."""
     framing: Framing = "sof"
-    """`sof` as the maker's client speaks, `bare` as the maker documents; a cabinet may accept only one of them."""
-    rtde_port: int | None = None
-    """Port that pushes poses, 30010 on a cabinet; None polls for them."""
-    payload_kg: float | None = None
-    """Mass at the flange; None keeps the pendant's setting, here and in the next three."""
-    payload_cog_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """`sof` as in the maker's client, `bare` as in the maker's documentation."""
+    rtde_port: int | None = Field(None, ge=1, le=65535)
+    """Port that pushes poses (30010); if left out, poses are polled."""
+    max_pose_lag_ms: Annotated[float, Field(ge=60.0, le=5000.0, exclude_if=lambda ms: ms == POSE_LAG_MS)] = POSE_LAG_MS
+    """Presses and touches during which poses arrive later than this are void: at 20 mm/s the recorded tip is 2 mm away
+    from where force and camera saw it after 100 ms. Below 60 ms a busy computer's own lag would count."""
+    watchdog_s: Annotated[float, Field(ge=0.5, le=60.0)] | None = None
+    """Dead-man switch on the controller: after this long without a sign of life it makes a protective stop, which only
+    a person can release and which leaves the brush where it is. If left out, it is not armed, and a press lifts by
+    itself."""
+    collision_level: Annotated[int, Field(ge=1, le=9)] | None = None
+    """1 to 9 (most sensitive); if left out, the pendant's setting stays."""
+    payload_kg: Annotated[float, Field(ge=0.0, le=5.0)] | None = None
+    """Mass of sensor, holder and brush; an i5 carries 5 kg. If left out, the pendant's setting stays."""
+    payload_cog_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     """Centre of that mass, from the flange."""
-    collision_level: int | None = None
-    """0 is off, 9 is the most sensitive."""
-    speed_fraction: float | None = None
-    """Share of every speed, in (0, 1]."""
-    watchdog_s: float | None = None
-    """Silence from this host after which the controller makes a protective stop; None arms no watchdog."""
 
 
 METHOD_NOT_FOUND = -32601
@@ -68,6 +78,10 @@ Settings = Mapping[str, Value]
 """By name, in the units of `SETTINGS`."""
 
 
+Command = tuple[str, dict[str, Any]]
+"""Name and parameters of a method of `RobotConfig`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Setting:
     """One setting of the controller."""
@@ -76,6 +90,8 @@ class Setting:
     units: tuple[str, ...]
     getter: str
     read: Callable[[Any], Value]
+    setter: Callable[[tuple[float, ...]], Command] | None = None
+    """How it is set; None for one that is only read back."""
 
 
 def _offset(answer: Any) -> Value:
@@ -83,22 +99,41 @@ def _offset(answer: Any) -> Value:
     return (*(v * 1e3 for v in values[:3]), *map(math.degrees, values[3:]))
 
 
+def _set_offset(value: tuple[float, ...]) -> Command:
+    return "setTcpOffset", {"offset": _metres(value)}
+
+
+def _metres(offset: tuple[float, ...]) -> list[float]:
+    """A tool offset in m and rad, from mm and deg."""
+    return [*(v / 1e3 for v in offset[:3]), *map(math.radians, offset[3:])]
+
+
 def _payload(answer: Any) -> Value:
     mass_kg, cog_m, *_ = answer
     return (*numbers([mass_kg], 1), *(v * 1e3 for v in numbers(cog_m, 3)))
+
+
+def _set_payload(value: tuple[float, ...]) -> Command:
+    mass_kg, *cog_mm = value
+    cog_m = [v / 1e3 for v in cog_mm]
+    return "setPayload", {"m": mass_kg, "cog": cog_m, "aom": [0.0] * 3, "inertia": [0.0] * 6}
 
 
 def _number(answer: Any) -> Value:
     return tuple(numbers([answer], 1))
 
 
+def _set_collision_level(value: tuple[float, ...]) -> Command:
+    return "setCollisionLevel", {"level": int(value[0])}
+
+
 TOOL_OFFSET, PAYLOAD, COLLISION_LEVEL = "tool offset", "payload", "collision level"
-SPEED_FRACTION, OPERATIONAL_MODE = "speed fraction", "operational mode"
+OPERATIONAL_MODE = "operational mode"
 SETTINGS = (
-    Setting(TOOL_OFFSET, ("mm", "mm", "mm", "deg", "deg", "deg"), "RobotConfig.getTcpOffset", _offset),
-    Setting(PAYLOAD, ("kg", "mm", "mm", "mm"), "RobotConfig.getPayload", _payload),
-    Setting(COLLISION_LEVEL, ("",), "RobotConfig.getCollisionLevel", _number),
-    Setting(SPEED_FRACTION, ("",), "MotionControl.getSpeedFraction", _number),
+    Setting(TOOL_OFFSET, ("mm",) * 3 + ("deg",) * 3, "RobotConfig.getTcpOffset", _offset, _set_offset),
+    Setting(PAYLOAD, ("kg", "mm", "mm", "mm"), "RobotConfig.getPayload", _payload, _set_payload),
+    Setting(COLLISION_LEVEL, ("",), "RobotConfig.getCollisionLevel", _number, _set_collision_level),
+    Setting("speed fraction", ("",), "MotionControl.getSpeedFraction", _number),
     Setting(OPERATIONAL_MODE, (), "RobotManage.getOperationalMode", str),
 )
 
@@ -118,15 +153,13 @@ async def read_back(controller: Controller) -> Settings:
     return values
 
 
-def configured(options: ArcsOptions) -> Settings:
-    """The settings that `options` gives; the others stay as they are on the pendant."""
-    wanted: dict[str, Value] = {TOOL_OFFSET: (*options.tcp_offset_mm, *options.tcp_rotation_deg)}
-    if options.payload_kg is not None:
-        wanted[PAYLOAD] = (options.payload_kg, *options.payload_cog_mm)
-    if options.collision_level is not None:
-        wanted[COLLISION_LEVEL] = (float(options.collision_level),)
-    if options.speed_fraction is not None:
-        wanted[SPEED_FRACTION] = (options.speed_fraction,)
+def configured(table: ArcsTable) -> dict[str, tuple[float, ...]]:
+    """The settings that `table` gives; the others stay as they are on the pendant."""
+    wanted: dict[str, tuple[float, ...]] = {TOOL_OFFSET: (*table.tcp_offset_mm, *table.tcp_rotation_deg)}
+    if table.payload_kg is not None:
+        wanted[PAYLOAD] = (table.payload_kg, *table.payload_cog_mm)
+    if table.collision_level is not None:
+        wanted[COLLISION_LEVEL] = (float(table.collision_level),)
     return wanted
 
 
@@ -151,7 +184,7 @@ def _same(setting: Setting, wanted: Value, current: Value) -> bool:
 
 def _tool(offset: tuple[float, ...]) -> Pose:
     """The tool centre point on the flange."""
-    return from_wire([*(v / 1e3 for v in offset[:3]), *map(math.radians, offset[3:])])
+    return from_wire(_metres(offset))
 
 
 def _in_words(setting: Setting, value: Value) -> str:
@@ -166,30 +199,20 @@ def _in_words(setting: Setting, value: Value) -> str:
     return ", ".join(parts)
 
 
-async def make_ready(controller: Controller, options: ArcsOptions, on_notice: Callable[[str], None]) -> Settings:
-    """Check the operational mode, set tool, payload, collision level and speed, where configured, and read all back.
+async def make_ready(controller: Controller, table: ArcsTable, on_notice: Callable[[str], None]) -> Settings:
+    """Check the operational mode, set tool, payload and collision level, where configured, and read all back.
 
     Raises `WrongOperationalMode`, `MotionRefused` for a setting that the controller refuses, and `SettingsChanged` for
     one that it accepted but did not apply.
     """
     _require_automatic((await read_back(controller))[OPERATIONAL_MODE], on_notice)
-    await controller.set_tcp_offset(options.tcp_offset_mm, options.tcp_rotation_deg)
-    if options.payload_kg is not None:
-        params = {
-            "m": options.payload_kg,
-            "cog": [v / 1e3 for v in options.payload_cog_mm],
-            "aom": [0.0] * 3,
-            "inertia": [0.0] * 6,
-        }
-        accepted("setPayload", await controller.ask("RobotConfig.setPayload", **params))
-    if options.collision_level is not None:
-        code = await controller.ask("RobotConfig.setCollisionLevel", level=options.collision_level)
-        accepted("setCollisionLevel", code)
-    if options.speed_fraction is not None:
-        code = await controller.ask("MotionControl.setSpeedFraction", fraction=options.speed_fraction)
-        accepted("setSpeedFraction", code)
+    wanted = configured(table)
+    for setting in SETTINGS:
+        if setting.setter is not None and setting.name in wanted:
+            method, params = setting.setter(wanted[setting.name])
+            accepted(method, await controller.ask(f"RobotConfig.{method}", **params))
     settings = await read_back(controller)
-    require_same("power on", configured(options), settings)
+    require_same("power on", wanted, settings)
     for name in (name for name, value in settings.items() if value is None and name != OPERATIONAL_MODE):
         on_notice(f"the controller does not report its {name}: a change would go unnoticed")
     return settings

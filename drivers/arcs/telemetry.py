@@ -29,7 +29,7 @@ import numpy as np
 
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.motion import arrived
-from brushloop.drivers.arcs.settings import ArcsOptions
+from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.wire import DEVICE, FrameDecoder, encode_short, numbers
 from brushloop.drivers.devices import Pose, PoseSample, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, ProtocolViolation, Stale
@@ -262,9 +262,9 @@ GIVE_UP_S = 2.0
 class Telemetry:
     """The newest pose, stamped when it came. RTDE that is closed or silent is never fatal: polling takes over."""
 
-    def __init__(self, state: Controller, options: ArcsOptions, clock: Clock, on_notice: Callable[[str], None]) -> None:
+    def __init__(self, state: Controller, table: ArcsTable, clock: Clock, on_notice: Callable[[str], None]) -> None:
         self._state = state
-        self._options = options
+        self._table = table
         self._clock = clock
         self._notice = on_notice
         self._latest: PoseSample | None = None
@@ -282,8 +282,8 @@ class Telemetry:
     async def start(self) -> None:
         """Read the first pose, then continue until `stop`. Raises what the first read raises."""
         await self.read()
-        if self._options.rtde_port is not None:
-            await self._subscribe(self._options.rtde_port)
+        if self._table.rtde_port is not None:
+            await self._subscribe(self._table.rtde_port)
         self._task = asyncio.create_task(self._run(), name="robot telemetry")
 
     async def stop(self) -> None:
@@ -324,7 +324,7 @@ class Telemetry:
         self._take(await self._state.pose())
 
     async def _subscribe(self, port: int) -> None:
-        stream = RtdeStream(self._options.host, port)
+        stream = RtdeStream(self._table.host, port)
         self._stream = stream
         try:
             await stream.open([POSE_SEGMENT, JOINTS_SEGMENT], RATE_HZ)

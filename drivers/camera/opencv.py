@@ -16,7 +16,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
-from brushloop.drivers.camera.source import DEVICE, CameraOptions, CaptureSource, FolderSource, open_source
+from brushloop.drivers.camera.source import DEVICE, CameraTable, CaptureSource, FolderSource, open_source
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
 from brushloop.drivers.host import Clock
@@ -35,6 +35,8 @@ TORN_BAND_SHARE = 0.02
 """Share of the rows, at the bottom, that are uniform if the decoder ran out of data."""
 END_ROWS = 16
 """Height of the last row of blocks of a JPEG."""
+FROZEN_AFTER = 5
+"""Number of identical consecutive frames that mean a frozen camera; real frames have noise."""
 BURST_SHARE = 0.5
 """Frames that arrive within less than this share of the usual period are a backlog."""
 PERIODS_KEPT = 31
@@ -64,10 +66,9 @@ LIKELY = {
 class FrameHealth:
     """Judges the frames of one camera in the order in which they arrive."""
 
-    def __init__(self, *, latency_ns: int, frozen_after: int, live: bool, independent: bool = False) -> None:
+    def __init__(self, *, latency_ns: int, live: bool, independent: bool = False) -> None:
         """`independent`: each frame is coded by itself, so pixels of the previous frame come from the decoder."""
         self._latency_ns = latency_ns
-        self._frozen_after = frozen_after
         self._live = live
         self._independent = independent
         self._last_end: int | None = None
@@ -139,7 +140,7 @@ class FrameHealth:
 
     def _is_frozen(self, same: bool) -> bool:
         self._equal = self._equal + 1 if same else 0
-        return self._equal + 1 >= self._frozen_after
+        return self._equal + 1 >= FROZEN_AFTER
 
     def _is_late(self, arrival_ns: int) -> bool:
         """True for a frame that had waited in a buffer: its arrival says nothing about its exposure."""
@@ -182,17 +183,15 @@ QUIET_NS = 30_000_000_000
 class OpenCvCamera:
     """`Camera` over one source. Each connection has its own grabber, so no frame outlives its connection."""
 
-    def __init__(
-        self, options: CameraOptions, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None
-    ) -> None:
-        self._options = options
+    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None] = lambda _text: None) -> None:
+        self._table = table
         self._clock = clock
         self._on_notice = on_notice
         self._grabber: _Grabber | None = None
 
     async def connect(self) -> Identity:
         """Start the grabber and wait for its first valid frame. Raises `ConnectionLost`, `DeviceError`, ..."""
-        grabber = self._grabber = _Grabber(self._options, self._clock, self._on_notice)
+        grabber = self._grabber = _Grabber(self._table, self._clock, self._on_notice)
         grabber.thread.start()
         try:
             frame = await self.fresh(Stamp(0))
@@ -201,7 +200,7 @@ class OpenCvCamera:
             raise
         height, width = frame.image.shape[:2]
         locked = "".join(f", {name} {value:g}" for name, value in grabber.settings.items())
-        return Identity(DEVICE, f"{self._options.source} {width}x{height}{locked}", "", grabber.simulated)
+        return Identity(DEVICE, f"{self._table.source} {width}x{height}{locked}", "", grabber.simulated)
 
     async def fresh(self, after: Stamp) -> Frame:
         """The first valid frame exposed after `after.host_ns`. Raises `DeviceTimeout`, `ConnectionLost`."""
@@ -221,8 +220,8 @@ class OpenCvCamera:
 class _Grabber:
     """The frames of one connection; its thread owns the source from open to release."""
 
-    def __init__(self, options: CameraOptions, clock: Clock, on_notice: Callable[[str], None]) -> None:
-        self._options = options
+    def __init__(self, table: CameraTable, clock: Clock, on_notice: Callable[[str], None]) -> None:
+        self._table = table
         self._clock = clock
         self._on_notice = on_notice
         self._condition = threading.Condition()
@@ -253,12 +252,12 @@ class _Grabber:
             return self._ended is not None or self._closing.is_set()
 
         with self._condition:
-            if not self._condition.wait_for(lambda: late_enough() or over(), self._options.timeout_s):
+            if not self._condition.wait_for(lambda: late_enough() or over(), self._table.timeout_s):
                 why = f" ({self._trouble})" if self._trouble else ""
                 raise DeviceTimeout(
                     DEVICE,
                     "fresh",
-                    f"no valid new frame from {self._options.source} in {self._options.timeout_s:g} s{why}",
+                    f"no valid new frame from {self._table.source} in {self._table.timeout_s:g} s{why}",
                     remedy="Check cable, light and stream; the arm does not move meanwhile.",
                 )
             frame = late_enough()
@@ -272,7 +271,7 @@ class _Grabber:
             while not self._closing.is_set():
                 opening_ns = self._clock.now_ns()
                 try:
-                    source = open_source(self._options)
+                    source = open_source(self._table)
                 except ConnectionLost:
                     if lost_ns is None:
                         raise
@@ -287,7 +286,7 @@ class _Grabber:
                 if self._closing.is_set():
                     return
                 if not source.live:
-                    raise ConnectionLost(DEVICE, "read", f"{self._options.source} ended")
+                    raise ConnectionLost(DEVICE, "read", f"{self._table.source} ended")
                 lost_ns = self._clock.now_ns()
                 self._report("the stream ended and is opened again")
                 self._closing.wait(REOPEN_AFTER_S)
@@ -302,10 +301,9 @@ class _Grabber:
         import cv2
 
         self.settings, self.simulated = source.settings, source.simulated
-        latency_ns = round(self._options.latency_ms * 1e6)
+        latency_ns = round(self._table.latency_ms * 1e6)
         health = FrameHealth(
             latency_ns=latency_ns,
-            frozen_after=self._options.frozen_after,
             live=source.live,
             independent=source.independent,
         )

@@ -1,13 +1,12 @@
-"""Where frames come from: OpenCV's capture, or a folder of images, behind one protocol; and the options of both."""
+"""Where frames come from: OpenCV's capture, or a folder of images, behind one protocol; and the table of both."""
 
 from __future__ import annotations
 
 import http.client
 import os
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, Field
@@ -49,31 +48,36 @@ class Locked(BaseModel, frozen=True, extra="forbid"):
         return {name: float(value) for name, value in self.model_dump(exclude_none=True).items()}
 
 
-@dataclass(frozen=True, slots=True)
-class CameraOptions:
-    """`source` is a stream URL, a file, a folder of images, or a device number as text."""
+class CameraTable(BaseModel, frozen=True, extra="forbid"):
+    """The table `[camera]` of `rig.toml` but for the lens: a camera that looks at the sheet."""
 
-    source: str
-    latency_ms: float = 250.0
-    """The longest time from exposure to arrival; a frame counts as exposed after (arrival - latency)."""
-    timeout_s: float = 10.0
-    locked: Locked = field(default_factory=Locked)
-    folder_fps: float = 10.0
-    """Rate at which the images of a folder are shown."""
-    frozen_after: int = 5
-    """Number of identical consecutive frames that mean a frozen camera; real frames have noise."""
+    kind: Literal["opencv"]
+    source: str = Field(min_length=1)
+    """Stream URL, file, folder of images, or device number as text."""
+    latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
+    """Approximate time from exposure to arrival, used by `doctor` and the live picture. A run measures it."""
+    max_delay_ms: Annotated[float, Field(ge=50.0, le=10_000.0)] = 1500.0
+    """A camera whose measured delay is longer is refused."""
+    max_jitter_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 500.0
+    """A camera whose measured delay varies by more is refused."""
+    exact_delay: bool = False
+    """Whether a delay that is not known to a tenth of its value (95 %) is measured again, then refused."""
+    timeout_s: Annotated[float, Field(gt=0.0, le=120.0)] = 10.0
+    locked: Locked = Locked()
 
 
+FOLDER_FPS = 10.0
+"""Rate at which the images of a folder are shown."""
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
 
 
-def open_source(options: CameraOptions) -> FolderSource | CaptureSource:
-    """Open what `options.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that have no effect."""
-    if Path(options.source).is_dir():
-        return FolderSource(options)
-    return CaptureSource(options)
+def open_source(table: CameraTable) -> FolderSource | CaptureSource:
+    """Open what `table.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that have no effect."""
+    if Path(table.source).is_dir():
+        return FolderSource(table)
+    return CaptureSource(table)
 
 
 def says_loopback(url: str) -> bool:
@@ -98,8 +102,8 @@ class FolderSource:
     ink of this session: they count as simulated.
     """
 
-    def __init__(self, options: CameraOptions) -> None:
-        folder = Path(options.source)
+    def __init__(self, table: CameraTable) -> None:
+        folder = Path(table.source)
         self._paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
         if not self._paths:
             raise ConnectionLost(DEVICE, "open", f"{folder} holds no PNG or JPEG images")
@@ -107,7 +111,7 @@ class FolderSource:
         self.independent = False
         self.simulated = True
         self.settings: dict[str, float] = {}
-        self._period_s = 1.0 / options.folder_fps
+        self._period_s = 1.0 / FOLDER_FPS
         self._shown = 0
 
     def read(self) -> NDArray[np.uint8] | None:
@@ -134,16 +138,16 @@ class CaptureSource:
     identifies itself, and for recordings.
     """
 
-    def __init__(self, options: CameraOptions) -> None:
+    def __init__(self, table: CameraTable) -> None:
         # Set before the first capture: otherwise the libraries would write their own lines across the screen.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         import cv2
 
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        source = options.source
+        source = table.source
         is_device = source.isdecimal()
         self.live = is_device or "://" in source
-        timeout_ms = round(options.timeout_s * 1e3)
+        timeout_ms = round(table.timeout_s * 1e3)
         # One decoder thread: frame-parallel decoding would hold every frame back by one or more periods.
         stream = [
             *(cv2.CAP_PROP_N_THREADS, 1),
@@ -156,7 +160,7 @@ class CaptureSource:
                 raise ConnectionLost(DEVICE, "open", f"cannot open {source}")
             fourcc = int(self._capture.get(cv2.CAP_PROP_FOURCC))
             self.independent = not is_device and fourcc == cv2.VideoWriter.fourcc(*"MJPG")
-            self.settings = self._lock(options, is_device)
+            self.settings = self._lock(table, is_device)
             self.simulated = not self.live or says_loopback(source)
         except BaseException:
             self.release()
@@ -171,16 +175,16 @@ class CaptureSource:
         """Close the capture."""
         self._capture.release()
 
-    def _lock(self, options: CameraOptions, is_device: bool) -> dict[str, float]:
+    def _lock(self, table: CameraTable, is_device: bool) -> dict[str, float]:
         import cv2
 
-        wanted = options.locked.wanted()
+        wanted = table.locked.wanted()
         if wanted and not is_device:
             names = ", ".join(wanted)
             raise DeviceError(
                 DEVICE,
                 "lock",
-                f"{names} cannot be set through {options.source}",
+                f"{names} cannot be set through {table.source}",
                 remedy="Lock them in the camera's own set-up and leave them out of the configuration.",
             )
         properties = _properties()

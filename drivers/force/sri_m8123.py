@@ -26,7 +26,9 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, Field, model_validator
 
 from brushloop.drivers.devices import ForceSample, Identity, Stamp
 from brushloop.drivers.errors import (
@@ -55,7 +57,6 @@ COMMAND_ID = 0x080
 START = b"\x02"
 STOP = b"\x00"
 FIRST_ID = 0x291
-BITRATE = 1_000_000
 BUS_OFF = 0x40
 """Bit of an error frame's id (Linux `can/error.h`): the controller took itself off the bus."""
 _PAIR = struct.Struct("<2f")
@@ -136,17 +137,42 @@ MORE_BIAS_S = 1.0
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class SriOptions:
-    """Which bus the board is on, and how old a sample may be."""
+MOST_STALE_MS = 100.0
+"""Longest silence allowed: at 20 mm/s the brush goes down 2 mm in this time without being felt."""
+MOST_STALE_LOOPBACK_MS = 2000.0
+"""The same on the loopback rig's bus, where simulated time may run faster than the sensor's rounds arrive."""
 
-    interface: str = "socketcan"
-    channel: str = "can0"
-    bitrate: int = BITRATE
+
+class ForceTable(BaseModel, frozen=True, extra="forbid"):
+    """The table `[force]` of `rig.toml`: a sensor between flange and brush (docs/zero-touch.md)."""
+
+    kind: Literal["sri-m8123"]
+    interface: str = Field("socketcan", min_length=1)
+    """As python-can names it: socketcan, slcan, pcan, socketcand and so on."""
+    channel: str = Field("can0", min_length=1)
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
     host: str | None = None
-    """Address of a CAN gateway, for the interface `socketcand`."""
-    port: int | None = None
-    stale_after_ms: float = 100.0
+    """Address of a CAN gateway, for the interface socketcand."""
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    rate_hz: Annotated[float, Field(gt=0.0, le=2000.0)] = 200.0
+    """Rate set on the sensor's board, from which gaps are counted."""
+    max_n: Annotated[float, Field(gt=0.0, le=1e6)] = 5.0
+    """Ceiling while the brush is down: above it the arm is stopped and the press is void."""
+    stale_ms: Annotated[float, Field(ge=20.0)] = 100.0
+    """While the brush goes down, silence of this length stops the arm; at most 100, except on the loopback bus."""
+    bias_s: Annotated[float, Field(ge=0.05, le=60.0)] = 0.5
+    """How long to average with nothing touching, before each zero touch."""
+
+    @model_validator(mode="after")
+    def _coherent(self) -> ForceTable:
+        if (self.interface == "socketcand") != (self.host is not None and self.port is not None):
+            raise ValueError("host and port belong to the interface socketcand, and to no other")
+        most_ms = MOST_STALE_LOOPBACK_MS if self.channel == LOOPBACK_CHANNEL else MOST_STALE_MS
+        if self.stale_ms > most_ms:
+            raise ValueError(
+                f"stale_ms = {self.stale_ms:g}: must be from 20 to {most_ms:g}; the brush is blind that long"
+            )
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,10 +195,10 @@ Round = tuple[Stamp, Wrench]
 class RoundStream:
     """Starts the sensor, reads it until `stop`, and stops it again. Use one for each connection."""
 
-    def __init__(self, options: SriOptions, clock: Clock, on_round: Callable[[Round | None], None]) -> None:
+    def __init__(self, table: ForceTable, clock: Clock, on_round: Callable[[Round | None], None]) -> None:
         """`on_round` gets each round, and None once the stream has ended by itself; in the reader's thread."""
-        self._options = options
-        self._name = f"{options.interface} {options.channel}"
+        self._table = table
+        self._name = f"{table.interface} {table.channel}"
         self._assembler = RoundAssembler()
         self._clock = clock
         self._on_round = on_round
@@ -244,16 +270,16 @@ class RoundStream:
     def _open(self) -> can.BusABC:
         import can
 
-        options = self._options
+        table = self._table
         # Use these settings only: python-can would also read can.ini, the environment and the home folder.
         # The library warns of frames that arrive in two pieces, which is harmless; a lost frame shows in the counts.
         logging.getLogger("can").setLevel(logging.ERROR)
-        gateway: dict[str, Any] = {} if options.host is None else {"host": options.host, "port": options.port}
-        return can.Bus(options.channel, options.interface, ignore_config=True, bitrate=options.bitrate, **gateway)
+        gateway: dict[str, Any] = {} if table.host is None else {"host": table.host, "port": table.port}
+        return can.Bus(table.channel, table.interface, ignore_config=True, bitrate=table.bitrate, **gateway)
 
     def _identity(self, bus: can.BusABC) -> Identity:
         """The board has no identification. No real board can be on a virtual bus or on the loopback rig's bus."""
-        interface, channel = self._options.interface, self._options.channel
+        interface, channel = self._table.interface, self._table.channel
         simulated = interface == "virtual" or (interface, channel) == ("socketcand", LOOPBACK_CHANNEL)
         return Identity(DEVICE, f"SRI M8123B2 on {bus.channel_info}", "", simulated)
 
@@ -285,7 +311,7 @@ class RoundStream:
     def _lose_bus(self, what: str) -> None:
         self._lose(
             f"the bus {self._name} {what}",
-            f"Check wiring, termination and that both ends run at {self._options.bitrate} bit/s; "
+            f"Check wiring, termination and that both ends run at {self._table.bitrate} bit/s; "
             "then set the interface down and up, and connect again.",
         )
 
@@ -304,8 +330,8 @@ def command(data: bytes) -> can.Message:
 class SriM8123:
     """`ForceSensor` over a `RoundStream`; samples reach listeners in the event loop that connected."""
 
-    def __init__(self, options: SriOptions, clock: Clock) -> None:
-        self._options = options
+    def __init__(self, table: ForceTable, clock: Clock) -> None:
+        self._table = table
         self._clock = clock
         self._stream: RoundStream | None = None
         self._listener: Callable[[ForceSample], None] | None = None
@@ -332,7 +358,7 @@ class SriM8123:
             if latest is not None and self._stream is stream and self._listener is not None:
                 self._listener(self._sample(*latest))
 
-        stream = RoundStream(self._options, self._clock, on_round)
+        stream = RoundStream(self._table, self._clock, on_round)
         self._stream = stream
         stream.start()
         try:
@@ -361,8 +387,8 @@ class SriM8123:
         if newest is None:
             raise NotConnected(DEVICE, "latest", "no sample yet")
         age_ms = (self._clock.now_ns() - newest[0].host_ns) / 1e6
-        if age_ms > self._options.stale_after_ms:
-            raise Stale(DEVICE, age_ms, self._options.stale_after_ms)
+        if age_ms > self._table.stale_ms:
+            raise Stale(DEVICE, age_ms, self._table.stale_ms)
         alike_ms = (newest[0].host_ns - stream.alike_since_ns) / 1e6
         if alike >= STUCK_ROUNDS and alike_ms > STUCK_MS:
             raise Stuck(DEVICE, alike_ms, alike)

@@ -7,7 +7,8 @@ from collections.abc import AsyncIterator, Callable
 
 import pytest
 
-from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig, View
@@ -44,7 +45,7 @@ def arm_at(limits: Limits) -> Callable[[int], AuboArcs]:
     """An arm that is not connected yet, by the port of its controller."""
 
     def make(port: int) -> AuboArcs:
-        options = ArcsOptions(host=HOST, port=port, tcp_offset_mm=(0.0, 0.0, 180.0))
+        options = ArcsTable(kind="aubo-arcs", host=HOST, port=port, tcp_offset_mm=(0.0, 0.0, 180.0))
         return AuboArcs(options, limits, LoopClock())
 
     return make

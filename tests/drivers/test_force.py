@@ -19,7 +19,7 @@ from brushloop.drivers.devices import ForceSample, ForceSensor
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck
 from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import CanFrame, ForceBoard
-from brushloop.drivers.force.sri_m8123 import SriM8123, SriOptions, Wrench
+from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123, Wrench
 from brushloop.drivers.host import HostClock
 from tests.drivers.failing import fail_rounds
 from tests.waiting import until
@@ -76,9 +76,9 @@ def board(channel: str) -> Iterator[ForceBoard]:
         yield board
 
 
-def sensor_on(channel: str, stale_after_ms: float = 1e6) -> SriM8123:
-    options = SriOptions(interface="virtual", channel=channel, stale_after_ms=stale_after_ms)
-    return SriM8123(options, HostClock())
+def sensor_on(channel: str, stale_ms: float = 1e6) -> SriM8123:
+    table = ForceTable(kind="sri-m8123", interface="virtual", channel=channel)
+    return SriM8123(table.model_copy(update={"stale_ms": stale_ms}), HostClock())
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def latest_error(sensor: SriM8123) -> DeviceError | None:
 async def test_silence_and_what_is_no_number_make_the_sample_stale_until_it_measures_again(
     board: ForceBoard, channel: str, fault: str
 ):
-    sensor, seen = sensor_on(channel, stale_after_ms=250.0), list[ForceSample]()
+    sensor, seen = sensor_on(channel, stale_ms=250.0), list[ForceSample]()
     await sensor.connect()
     sensor.listen(seen.append)
     board.next_fault = lambda: fault
@@ -232,7 +232,7 @@ async def test_where_no_board_answers_the_connection_times_out(channel: str, mon
 
 @pytest.mark.parametrize("interface", ["socketcan", "no-such-interface"])
 async def test_an_adapter_that_is_not_there_is_a_lost_connection(interface: str):
-    sensor = SriM8123(SriOptions(interface=interface, channel="can9"), HostClock())
+    sensor = SriM8123(ForceTable(kind="sri-m8123", interface=interface, channel="can9"), HostClock())
     with pytest.raises(ConnectionLost, match=f"cannot open {interface} can9"):
         await sensor.connect()
     assert readers() == 0

@@ -9,8 +9,7 @@ import pytest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.config_devices import RobotConfig
+from brushloop.collect.rig.config import RobotConfig, load_rig
 from brushloop.drivers.sim.brush.spec import SimFileError, load_brush
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml

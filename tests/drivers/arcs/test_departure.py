@@ -19,8 +19,8 @@ from brushloop.drivers.arcs.controller import (
     WrongOperationalMode,
 )
 from brushloop.drivers.arcs.motion import until_settled
-from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
-from brushloop.drivers.arcs.settings import TOOL_OFFSET, require_same
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.settings import TOOL_OFFSET, ArcsTable, require_same
 from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
@@ -60,8 +60,8 @@ async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> A
     wide = dataclasses.replace(limits, x_mm=(-2000.0, 2000.0))
 
     def make(**options: Any) -> AuboArcs:
-        whole = {"tcp_offset_mm": (0.0, 0.0, 180.0), **options}
-        arms.append(AuboArcs(ArcsOptions(host=HOST, port=cabinet.port, **whole), wide, LoopClock(), notices.append))
+        whole = {"kind": "aubo-arcs", "host": HOST, "port": cabinet.port, "tcp_offset_mm": (0.0, 0.0, 180.0), **options}
+        arms.append(AuboArcs(ArcsTable.model_validate(whole), wide, LoopClock(), notices.append))
         return arms[-1]
 
     yield make
@@ -120,12 +120,13 @@ async def test_a_brush_that_is_not_square_to_the_flange_is_pressed_upright(make_
     assert lean(pose_of(forward(cabinet.cabinet.joints())))[0] == pytest.approx(2.5, abs=0.05)
 
 
-@pytest.mark.parametrize("wrong", [{"payload_kg": 9.0}, {"collision_level": 12}])
+@pytest.mark.parametrize("method", ["setTcpOffset", "setPayload", "setCollisionLevel"])
 async def test_what_the_controller_does_not_take_keeps_the_power_off(
-    make_arm: MakeArm, cabinet: ArcsServer, wrong: dict[str, Any]
+    make_arm: MakeArm, cabinet: ArcsServer, method: str
 ):
-    with pytest.raises(MotionRefused):
-        await enabled(make_arm, **wrong)
+    cabinet._methods[f"rob1.RobotConfig.{method}"] = lambda _: -5
+    with pytest.raises(MotionRefused, match=method):
+        await enabled(make_arm, payload_kg=0.4, collision_level=8)
     assert cabinet.cabinet.power.mode == RobotMode.POWER_OFF
 
 

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from brushloop.drivers.arcs.robot import ArcsOptions, AuboArcs
+from brushloop.drivers.arcs.robot import AuboArcs
+from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.survey import survey
 from brushloop.drivers.arcs.wire import RpcConnection, encode
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, NotConnected, ProtocolViolation, RpcError
@@ -189,9 +190,14 @@ async def test_the_driver_finds_what_the_doctor_found(archive: Archive) -> None:
         pytest.skip("the driver could not connect to this cabinet")
     controller = AnsweringByName(archive)
     async with serving(controller):
-        arm = AuboArcs(
-            ArcsOptions(host="127.0.0.1", port=controller.port, framing=archive.framing), NOWHERE, LoopClock()
+        table = ArcsTable(
+            kind="aubo-arcs",
+            host="127.0.0.1",
+            port=controller.port,
+            tcp_offset_mm=(0.0, 0.0, 0.0),
+            framing=archive.framing,
         )
+        arm = AuboArcs(table, NOWHERE, LoopClock())
         identity = await arm.connect()
         state = await arm.state(1)
         await arm.close()

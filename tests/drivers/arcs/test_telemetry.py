@@ -14,7 +14,7 @@ import cbor2
 import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import ArcsOptions
+from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.telemetry import (
     PING,
     LagMeter,
@@ -146,8 +146,10 @@ async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> A
     arms: list[AuboArcs] = []
 
     def make(rtde_port: int | None) -> AuboArcs:
-        options = ArcsOptions(host=HOST, port=cabinet.port, tcp_offset_mm=(0.0, 0.0, 180.0), rtde_port=rtde_port)
-        arms.append(AuboArcs(options, limits, LoopClock(), notices.append))
+        table = ArcsTable(
+            kind="aubo-arcs", host=HOST, port=cabinet.port, tcp_offset_mm=(0.0, 0.0, 180.0), rtde_port=rtde_port
+        )
+        arms.append(AuboArcs(table, limits, LoopClock(), notices.append))
         return arms[-1]
 
     yield make
