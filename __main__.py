@@ -101,7 +101,7 @@ def options(
 app.add_typer(brushloop.collect.cli.app, name="collect")
 app.command("doctor")(brushloop.collect.cli.doctor)
 app.add_typer(brushloop.collect.cli_rig.app, name="rig")
-app.add_typer(brushloop.calibrate.cli.app, name="calibrate")
+app.command("calibrate")(brushloop.calibrate.cli.calibrate)
 app.add_typer(brushloop.calibrate.cli.camera, name="camera")
 app.add_typer(brushloop.calibrate.validate.cli.app, name="validate", cls=PathOrCommand)
 app.command("fit")(brushloop.calibrate.cli.fit)

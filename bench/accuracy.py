@@ -89,7 +89,7 @@ def few(*, n: int | None = None, seed: int = 0) -> Sequence[Result]:
             for draw in range(draws):
                 rng = np.random.default_rng([seed, draw, size])
                 chosen = [cells[cell][rng.integers(len(cells[cell]))] for cell in DESIGN[:size]]
-                job = Refit.of(chosen, captures.grid, captures.radius_mm, captures.length_mm, prior)
+                job = Refit(chosen, captures.grid, captures.radius_mm, captures.length_mm, prior)
                 press = FittedPress(job.radius_mm, job.length_mm, **refit(job))
                 left_out = DESIGN[size:]
                 images = [{FITTED: image_of(press.outline(*cell), captures.grid)} for cell in left_out]

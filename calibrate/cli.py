@@ -49,10 +49,6 @@ def calibrate(
     show_work(calibrate_session, CalibrateRequest(session, lens))
 
 
-app = typer.Typer(cls=PathOrCommand, help="Fit scale and paper plane of a SESSION from the board in view.")
-app.command("session")(calibrate)
-
-
 def fit(
     session: Annotated[Path, typer.Argument(help="A session of presses: its folder or its .mcap file.")],
     mm_per_px: Annotated[

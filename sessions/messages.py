@@ -69,7 +69,7 @@ def decode_gray(data: bytes, where: str) -> NDArray[np.uint8]:
 
     if len(data) > MAX_IMAGE_BYTES:
         raise SessionDamaged(where, f"image of {len(data)} bytes exceeds {MAX_IMAGE_BYTES}")
-    if data.count(b"\xff\xda") > MAX_JPEG_SCANS and not data.startswith(PNG_START):
+    if not data.startswith(PNG_START) and data.count(b"\xff\xda") > MAX_JPEG_SCANS:
         raise SessionDamaged(where, f"JPEG image in more than {MAX_JPEG_SCANS} scans")
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:

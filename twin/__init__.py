@@ -28,7 +28,7 @@ def twin(
     from brushloop.calibrate.compare.place import Field
     from brushloop.calibrate.errors import CalibrationError
     from brushloop.calibrate.files import check_target, write_whole
-    from brushloop.calibrate.fit.captures import read_presses
+    from brushloop.calibrate.fit.captures import near_ink, read_presses
     from brushloop.calibrate.report import source_note
     from brushloop.sessions.recording import Recording
     from brushloop.sessions.terminal import shown
@@ -43,9 +43,10 @@ def twin(
         captures = read_presses(session, Field(), progress)
         header, store = captures.session.header, captures.session.store
         brush = captures.radius_mm, captures.length_mm
+        strokes, grid = near_ink(captures.strokes, captures.grid)
         with workers() as pool:
             try:
-                fitted = fit_twin(captures.strokes, captures.grid, *brush, pool, progress, store)
+                fitted = fit_twin(strokes, grid, *brush, pool, progress, store)
             except ValueError as error:
                 raise CalibrationError(str(recording.path), str(error)) from None
     text = twin_toml(fitted, header.session_id, noise_gray(recording))

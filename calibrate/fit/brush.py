@@ -55,7 +55,6 @@ from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress
 from brushloop.model.outline import Outline
 from brushloop.model.similarity import csim
-from brushloop.sessions.recording import Recording
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "brushfit"
@@ -105,15 +104,18 @@ class FitRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
-    """The brush that was fitted to captures, and what they say about it."""
+class FitResult:
+    """The fitted brush that a session uses from now on, and what its captures say about it."""
 
     captures: Captures
     fit: BrushFit
+    """The contents of the file."""
     sizes: list[Size]
     """Empty where the session has too few cells for an interval."""
     held_out: list[HeldOut]
     """Empty with one cell only."""
+    path: Path
+    page: Path
 
     def lines(self) -> Iterator[object]:
         """What the command prints: lines and tables."""
@@ -140,24 +142,6 @@ class Fitted:
             yield scores
         else:
             yield "Only one cell: nothing can be held out."
-
-
-@dataclass(frozen=True, slots=True)
-class FitResult:
-    """The fitted brush that a session uses from now on."""
-
-    fitted: Fitted
-    path: Path
-    page: Path
-
-    @property
-    def fit(self) -> BrushFit:
-        """The contents of the file."""
-        return self.fitted.fit
-
-    def lines(self) -> Iterator[object]:
-        """What the command prints: lines and tables."""
-        yield from self.fitted.lines()
         yield f"Fit: {self.path}"
         yield f"Page: {self.page}"
 
@@ -166,40 +150,36 @@ class FitResult:
 
 
 def fit_presses(request: FitRequest, progress: Progress = unseen) -> FitResult:
-    """Fit the brush to the presses of a session, put the fit to use and write its page. Raises `CalibrationError`."""
-    view = Field(mm_per_px=request.mm_per_px)
-    captures = read_presses(request.session, view, progress)
-    fitted = fit_session(captures, view, progress)
-    path = put_to_use(fitted.fit, Recording(request.session).path.parent, FOLDER)
-    page = write_fit_page(captures, fitted.fit.press(), fitted.sizes, fitted.held_out, path)
-    return FitResult(fitted, path, page)
+    """Fit the brush to the presses of a session, leave each cell out in turn, and measure the marks.
 
-
-def fit_session(captures: Captures, view: Field, progress: Progress = unseen) -> Fitted:
-    """Fit, leave each cell out in turn, and measure the marks."""
-    grid, strokes = captures.grid, captures.strokes
+    The session uses the fit from now on, and its page is written. Raises `CalibrationError`.
+    """
+    captures = read_presses(request.session, Field(mm_per_px=request.mm_per_px), progress)
+    session, grid, strokes = captures.session, captures.grid, captures.strokes
     press = fit_parameters(strokes, grid, captures.radius_mm, captures.length_mm)
-    held_out = leave_cell_out(strokes, grid, press, progress=progress, store=captures.session.store)
+    held_out = leave_cell_out(strokes, grid, press, progress=progress, store=session.store)
     fit = BrushFit(
-        session_id=captures.session.header.session_id,
-        source=captures.session.header.source,
-        recording_sha256=captures.session.sha256,
-        calibration=captures.session.calibration_digest,
+        session_id=session.header.session_id,
+        source=session.header.source,
+        recording_sha256=session.sha256,
+        calibration=session.calibration_digest,
         software=made_by(),
         radius_mm=captures.radius_mm,
         length_mm=captures.length_mm,
         strokes=len(strokes),
         cells=tuple(by_cell(strokes)),
-        mm_per_px=view.mm_per_px,
+        mm_per_px=request.mm_per_px,
         parameters=dict(zip(NAMES, press.values.tolist(), strict=True)),
-        edges_mm=tuple(tuple(tuple(terms) for terms in side) for side in press.edges.tolist()),
-        ends_mm=tuple(tuple(terms) for terms in press.ends.tolist()),
+        edges_mm=press.edges.tolist(),
+        ends_mm=press.ends.tolist(),
         csim_percent={row.model: row.csim for row in held_out},
     )
-    return Fitted(captures, fit, sizes_of(strokes, grid), held_out)
+    sizes, path = sizes_of(strokes, grid), put_to_use(fit, session.recording.path.parent, FOLDER)
+    page = _write_page(captures, press, sizes, held_out, path)
+    return FitResult(captures, fit, sizes, held_out, path, page)
 
 
-def write_fit_page(
+def _write_page(
     captures: Captures, press: FittedPress, sizes: Sequence[Size], held_out: Sequence[HeldOut], path: Path
 ) -> Path:
     """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""

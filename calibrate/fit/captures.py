@@ -79,7 +79,6 @@ class Captures:
     radius_mm: float
     length_mm: float
     grid: Grid
-    """Cut to the rows that ink reaches, and 2 mm more, as the strokes are."""
     strokes: list[Pressed]
     refused: list[Refused]
     """Captures that cannot be used or are cut by the edge of their photograph."""
@@ -100,18 +99,16 @@ def read_presses(session: Path, view: Field, progress: Progress = unseen) -> Cap
     strokes = [pressed(press) for press in usable]
     if not strokes:
         raise CalibrationError(str(opened.recording.path), "holds no press that can be used for a fit")
-    brush, grid = brush_of(opened.header), grid_of(view)
-    rows = inked_rows([stroke.ink for stroke in strokes], view.mm_per_px)
-    grid = Grid(grid.x_mm, grid.y_mm[rows])
-    strokes = [replace(stroke, ink=stroke.ink[rows]) for stroke in strokes]
-    return Captures(opened, float(brush.radius_mm), float(brush.length_mm), grid, strokes, refused)
+    brush = brush_of(opened.header)
+    return Captures(opened, float(brush.radius_mm), float(brush.length_mm), grid_of(view), strokes, refused)
 
 
-def inked_rows(images: Sequence[NDArray[np.floating]], px_mm: float) -> slice:
-    """Rows that the ink of any of these (rows, columns) images reaches, and 2 mm more."""
-    inked = np.flatnonzero(np.any([image.any(axis=1) for image in images], axis=0))
-    margin = round(MARGIN_MM / px_mm)
-    return slice(max(0, int(inked[0]) - margin), min(len(images[0]), int(inked[-1]) + 1 + margin))
+def near_ink(strokes: Sequence[Pressed], grid: Grid) -> tuple[list[Pressed], Grid]:
+    """Strokes and grid, cut to the rows that the ink of any stroke reaches, and 2 mm more."""
+    inked = np.flatnonzero(np.any([stroke.ink.any(axis=1) for stroke in strokes], axis=0))
+    margin = round(MARGIN_MM / grid.px_mm)
+    rows = slice(max(0, int(inked[0]) - margin), int(inked[-1]) + 1 + margin)
+    return [replace(stroke, ink=stroke.ink[rows]) for stroke in strokes], Grid(grid.x_mm, grid.y_mm[rows])
 
 
 @dataclass(frozen=True, slots=True)

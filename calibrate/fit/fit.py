@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from brushloop.calibrate.artefact import Frozen
-from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Grid, Pressed, by_cell
+from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Grid, Pressed, by_cell, near_ink
 from brushloop.model.damped import Damping, Equations, descend
 from brushloop.model.fitted import (
     MODES,
@@ -160,6 +160,9 @@ def fit_presses(
     from there. Parameters that the strokes do not determine have the values that the prior expects. Raises ValueError
     without a stroke.
     """
+    if not strokes:
+        raise ValueError("a fit needs at least one stroke")
+    strokes, grid = near_ink(strokes, grid)
     prior = learned() if prior is None else prior
     expected = FittedPress(radius_mm, length_mm, prior.values if start is None else start)
     starts = [expected]
@@ -214,8 +217,6 @@ def _minimise(
 ) -> tuple[FittedPress, float]:
     """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
     costs as much as a pixel of wrong ink."""
-    if not strokes:
-        raise ValueError("a fit needs at least one stroke")
     inks = {cell: np.array([s.ink for s in group], np.float64) for cell, group in by_cell(strokes).items()}
     at = list(free)
     low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.compare.place import SIZE_PX, Alignment, similarity
-from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell, inked_rows
+from brushloop.calibrate.compare.place import Alignment, similarity
+from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell
 from brushloop.calibrate.fit.fit import Prior, fit_presses
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
@@ -71,30 +71,13 @@ def _without(cells: Mapping[C, Sequence[T]], fold: Sequence[C]) -> list[T]:
 class Refit:
     """A fit of the brush to some presses of a session."""
 
-    strokes: tuple[Pressed, ...]
-    """Cut to the rows with ink, so that equal presses are equal work for every command."""
+    strokes: Sequence[Pressed]
     grid: Grid
     radius_mm: float
     length_mm: float
     prior: Prior | None = None
     start: Floats | None = None
     """Parameters (17,) of the fit to all presses, where the descent begins; None searches from the prior."""
-
-    @classmethod
-    def of(
-        cls,
-        strokes: Sequence[Pressed],
-        grid: Grid,
-        radius_mm: float,
-        length_mm: float,
-        prior: Prior | None = None,
-        start: FittedPress | None = None,
-    ) -> Refit:
-        """The fit to these presses, whose ink is on the grid."""
-        rows = inked_rows([stroke.ink for stroke in strokes], grid.px_mm)
-        cut = tuple(replace(stroke, ink=stroke.ink[rows]) for stroke in strokes)
-        values = None if start is None else start.values
-        return cls(cut, Grid(grid.x_mm, grid.y_mm[rows]), radius_mm, length_mm, prior, values)
 
     @property
     def key(self) -> str:
@@ -139,14 +122,14 @@ def leave_cell_out(
     brush = press.radius_mm, press.length_mm
     published = FittedPress(*brush)
     left_out = leave_out(cells)
-    jobs = [Refit.of(others, grid, *brush, prior, press) for _, others in left_out]
+    jobs = [Refit(others, grid, *brush, prior, press.values) for _, others in left_out]
     with threads(1) as scheduler:  # a fit holds Python's lock nearly all the time: two at once take half as long again
         presses = refits(jobs, store, scheduler, "cells left out in turn", progress)
     predicted: list[Predicted] = []
-    for (fold, _), job, refitted in zip(left_out, jobs, presses, strict=True):
+    for (fold, others), refitted in zip(left_out, presses, strict=True):
         outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
         with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-            outlines[BEZIER] = refit_bezier(job.strokes, job.grid).outline
+            outlines[BEZIER] = refit_bezier(others, grid).outline
         for cell in fold:
             images: dict[str, Images] = {}
             for name, outline in outlines.items():
@@ -229,9 +212,8 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
 
 
 def _binary(image: Images) -> Floats:
-    """Ink or paper as 1 or 0, with blank rows up to the height of the field, which SSIM is averaged over."""
-    blank = max(0, SIZE_PX - len(image))
-    return np.pad(np.where(image > 0.5, 1.0, 0.0), ((blank // 2, blank - blank // 2), (0, 0)))
+    """Ink or paper as 1 or 0."""
+    return np.where(image > 0.5, 1.0, 0.0)
 
 
 def _score(captured: Floats, other: Floats) -> tuple[float, float]:

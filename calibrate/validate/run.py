@@ -194,7 +194,7 @@ def _refitted(
     if session.fit is None:
         return {}
     start, grid = session.fit.press(), grid_of(view)
-    jobs = [Refit.of(others, grid, start.radius_mm, start.length_mm, start=start) for _, others in left_out]
+    jobs = [Refit(others, grid, start.radius_mm, start.length_mm, start=start.values) for _, others in left_out]
     what = f"{session.header.session_id}: cells left out in turn"
     fits = refits(jobs, session.store, scheduler, what, progress)
     return {cell: fit for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
@@ -259,7 +259,7 @@ def _similarity_by_strokes(
     name, brush, grid = session.header.session_id, brush_of(session.header), grid_of(view)
     trials = list(_trials(name, number, scores))
     fitted = [[pressed(press) for press in few] for few, _ in trials]
-    jobs = [Refit.of(few, grid, float(brush.radius_mm), float(brush.length_mm)) for few in fitted]
+    jobs = [Refit(few, grid, float(brush.radius_mm), float(brush.length_mm)) for few in fitted]
     fits = refits(jobs, session.store, scheduler, "fits from few strokes")
     values: dict[tuple[int, str], list[tuple[float, float]]] = {}
     for (_, others), few, fit in zip(trials, fitted, fits, strict=True):

@@ -9,17 +9,14 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import FOLDER, BrushFit, fit_session
-from brushloop.calibrate.fit.captures import read_presses
+from brushloop.calibrate.fit.brush import FOLDER, BrushFit, FitRequest, fit_presses
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.validate.report import load_report
 from brushloop.model.fitted import NAME, NAMES
 from tests.photographed import imported_presses
 
 CELLS = [(11.0, 0.0), (11.0, 10.0), (15.0, 5.0), (20.0, 0.0), (20.0, 10.0)]
-VIEW = Field(mm_per_px=0.4)
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +60,9 @@ def test_a_session_is_fitted_written_and_shown_in_validate(session: Path) -> Non
         load_artefact(edited, BrushFit)
 
 
-def test_a_single_cell_gives_neither_intervals_nor_held_out_scores(session: Path) -> None:
-    captures = read_presses(session, VIEW)
-    del captures.strokes[1:]
-    fitted = fit_session(captures, VIEW)
+def test_a_single_cell_gives_neither_intervals_nor_held_out_scores(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    pressed = imported_presses(tmp_path / "photos", tmp_path / "presses", CELLS[:1], (300, 480), (380, 150))
+    fitted = fit_presses(FitRequest(pressed))
     assert fitted.held_out == []
     assert fitted.sizes == []

@@ -15,10 +15,9 @@ from typer.testing import CliRunner
 
 import brushloop
 from brushloop.__main__ import app
-from brushloop.calibrate.compare.place import KEYS, Field
+from brushloop.calibrate.compare.place import KEYS
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import fit_session
-from brushloop.calibrate.fit.captures import read_presses
+from brushloop.calibrate.fit.brush import FitRequest, fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.command import Request, validate
@@ -75,9 +74,9 @@ def test_every_model_is_scored_in_both_alignments_and_tones(report: Report) -> N
 
 
 def test_fit_and_validate_print_the_same_held_out_scores(session: Path, tmp_path: Path) -> None:
-    fitted = fit_session(read_presses(session, Field()), Field())
-    fit = fitted.fit.save(tmp_path)
-    report = validate(Request(places=(str(session),), fit=fit, out=tmp_path / "report")).report
+    copied = Path(shutil.copytree(session, tmp_path / session.name))
+    fitted = fit_presses(FitRequest(copied))
+    report = validate(Request(places=(str(copied),), fit=fitted.path, out=tmp_path / "report")).report
     assert report is not None
     rows = {row.model: row for row in fitted.held_out}
     for name, validated in {CEILING: CEILING, FITTED: FITTED_HELD_OUT, BEZIER: BEZIER_REFITTED}.items():
