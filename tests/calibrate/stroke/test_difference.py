@@ -84,6 +84,7 @@ def left_out_mm(given_mm: np.ndarray, seen_mm: np.ndarray) -> np.ndarray:
     return off
 
 
+@pytest.mark.soak  # half a minute
 @pytest.mark.skipif(not DATA.is_dir(), reason="the real page sequence is not here")
 def test_on_a_real_page_every_stroke_is_found_and_its_start_nearer_than_by_a_plain_difference() -> None:
     with (DATA / "strokes.csv").open() as file:
