@@ -6,41 +6,61 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.calibrated import Calibrated, CalibrateRequest
-from brushloop.calibrate.calibrated import calibrate_session as calibrate
 from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
-from brushloop.calibrate.export import FORCES, POSES, SAMPLE_COLUMNS, Series, samples, verdicts
-from brushloop.calibrate.fit.brush import FOLDER as FITS
-from brushloop.calibrate.fit.brush import BrushFit, FitRequest, FitResult, fit_presses
 from brushloop.calibrate.presses import Refused, crop, read_presses
 from brushloop.calibrate.remote import local_path
 from brushloop.calibrate.session import Calibration, OpenSession, open_session
-from brushloop.calibrate.validate.command import Request, ValidationOutput, check
-from brushloop.calibrate.validate.command import validate as run_validation
+from brushloop.calibrate.stroke.preprocess import Prepared
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.similarity import csim, ssim
+from brushloop.sessions.errors import SessionDamaged
+from brushloop.sessions.events import Begin, StepEvent, StepKind
 from brushloop.sessions.recording import Capture, Recording
-from brushloop.sessions.records import Condition, Header
+from brushloop.sessions.records import Condition, Header, Quality, Topic, Wrench
 
 if TYPE_CHECKING:
+    # What only some of the functions need is imported when they are called.
+    from brushloop.calibrate.calibrated import Calibrated
+    from brushloop.calibrate.fit.brush import BrushFit, FitResult
     from brushloop.calibrate.invert import Recovered
+    from brushloop.calibrate.validate.command import ValidationOutput
     from brushloop.model.strokes import StrokeModel
 
 Gray = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 GENERATOR = "ccd-bsmg"
 """The generator that comes with brushloop."""
+SAMPLE_COLUMNS = ("episode_index", "frame_index", "t_ns", "log_ns", "sequence")
+"""Numbers of the stroke and of the sample within it; times at the device and the recorder; the sample's own number."""
+
+
+class Samples(NamedTuple):
+    """What was sampled on one topic during the presses of a session, in the order of the recording."""
+
+    columns: tuple[str, ...]
+    when: NDArray[np.int64]
+    """(n, 5) `SAMPLE_COLUMNS`."""
+    values: Floats
+    """(n, len(columns))."""
+
+    def of_press(self, number: int) -> tuple[NDArray[np.int64], Floats]:
+        """Device times (n,) and values (n, len(columns)) of the press of that number."""
+        its_own = self.when[:, SAMPLE_COLUMNS.index("episode_index")] == number
+        return self.when[its_own, SAMPLE_COLUMNS.index("t_ns")], self.values[its_own]
 
 
 class Poses(NamedTuple):
@@ -66,46 +86,52 @@ class Forces(NamedTuple):
 class RecordedPress:
     """A press of a session; a picture is decoded when it is first asked for."""
 
-    def __init__(self, session: Session, capture: Capture) -> None:
-        self._session, self._capture = session, capture
+    def __init__(self, session: Session, capture: Capture, number: int) -> None:
+        self.capture = capture
+        self._session, self._number = session, number
 
     @property
     def name(self) -> str:
         """Its name in the session, such as `H13-a05-r02`."""
-        return self._capture.stroke.stroke_id
+        return self.capture.stroke.stroke_id
 
     @property
     def condition(self) -> Condition:
         """What was commanded. Raises `CalibrationError` for an import that does not say it."""
-        stroke = self._capture.stroke
+        stroke = self.capture.stroke
         if stroke.depth_mm is None or stroke.tilt_deg is None:
-            raise CalibrationError(self._capture.where, "has no depth or tilt")
+            raise CalibrationError(self.capture.where, "has no depth or tilt")
         return Condition(depth_mm=stroke.depth_mm, tilt_deg=stroke.tilt_deg, heading_deg=stroke.heading_deg)
 
     @property
     def reached_mm(self) -> float | None:
         """Depth that the arm reached; None where the recording does not say it."""
-        return self._capture.stroke.reached_mm
+        return self.capture.stroke.reached_mm
 
     @property
     def verdict(self) -> str:
         """`passed` or `failed: ...` by the checks of the run, `was marked bad` by a person, or empty."""
-        return self._capture.bad or self._session.verdicts.get(self.name, "")
+        return self.capture.bad or self._session.verdicts.get(self.name, "")
 
     @cached_property
     def photograph(self) -> Gray:
         """(h, w) uint8, as it was taken."""
-        return self._capture.image()
+        return self.capture.image()
+
+    @cached_property
+    def crop(self) -> tuple[Gray, NDArray[np.bool_], Prepared]:
+        """`image`, `mask`, and what else was found in them. Raises `CaptureRefused`."""
+        return crop(self.capture, self._session.opened.calibration)
 
     @property
     def image(self) -> Gray:
         """(h, w) uint8: what surrounds the press, seen from above at 20 px/mm. Raises `CaptureRefused`."""
-        return self._crop[0]
+        return self.crop[0]
 
     @property
     def mask(self) -> NDArray[np.bool_]:
         """(h, w), of the same shape: True where the ink is. Raises `CaptureRefused` where none is found."""
-        return self._crop[1]
+        return self.crop[1]
 
     @cached_property
     def coverage(self) -> NDArray[np.float32]:
@@ -118,17 +144,13 @@ class RecordedPress:
     @property
     def poses(self) -> Poses:
         """Path of the brush tip; empty for an import."""
-        t_ns, values = self._session.samples_of(POSES, self.name)
+        t_ns, values = self._session.poses.of_press(self._number)
         return Poses(t_ns, values[:, :3], values[:, 3:])
 
     @property
     def forces(self) -> Forces:
         """Force during the press."""
-        return Forces(*self._session.samples_of(FORCES, self.name))
-
-    @cached_property
-    def _crop(self) -> tuple[Gray, NDArray[np.bool_]]:
-        return crop(self._capture, self._session.opened.calibration)[:2]
+        return Forces(*self._session.forces.of_press(self._number))
 
 
 class Session:
@@ -159,7 +181,9 @@ class Session:
     @property
     def fit(self) -> BrushFit | None:
         """The brush fit in use."""
-        path = current(self.recording.path.parent, FITS)
+        from brushloop.calibrate.fit.brush import FOLDER, BrushFit
+
+        path = current(self.recording.path.parent, FOLDER)
         return None if path is None else load_artefact(path, BrushFit)
 
     @cached_property
@@ -169,29 +193,55 @@ class Session:
 
     @cached_property
     def verdicts(self) -> dict[str, str]:
-        """Result of the checks of the run by name of stroke."""
-        return verdicts(self.recording)
+        """Result of the checks of the run, `passed` or `failed: ...`, by name of stroke."""
+        return {judged.stroke_id: judged.verdict for judged in self.recording.events(Topic.QUALITY, Quality)}
 
     def presses(self) -> Iterator[RecordedPress]:
         """Every press in order, those that were marked bad included."""
-        return (RecordedPress(self, capture) for capture in self.recording.captures())
-
-    def samples_of(self, series: Series, stroke: str) -> tuple[NDArray[np.int64], Floats]:
-        """Times (n,) and values (n, width) of what was sampled during the press of a stroke."""
-        if series not in self._samples:
-            self._samples[series] = samples(self.recording, series)
-        when, values = self._samples[series]
-        episode, t_ns = (when[:, SAMPLE_COLUMNS.index(name)] for name in ("episode_index", "t_ns"))
-        its_own = episode == self._numbers[stroke]
-        return t_ns[its_own], values[its_own]
+        return (RecordedPress(self, capture, k) for k, capture in enumerate(self.recording.captures()))
 
     @cached_property
-    def _samples(self) -> dict[Series, tuple[NDArray[np.int64], Floats]]:
-        return {}
+    def poses(self) -> Samples:
+        """Poses of the brush tip during all presses, in the robot's base frame. Raises `SessionDamaged`."""
+        return self._sampled(Topic.TCP, ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"), _pose)
 
     @cached_property
-    def _numbers(self) -> dict[str, int]:
-        return {stroke.stroke_id: number for number, stroke in enumerate(self.recording.stroke_records())}
+    def forces(self) -> Samples:
+        """Forces during all presses, in the sensor's own frame. Raises `SessionDamaged`."""
+        return self._sampled(Topic.WRENCH, tuple(Wrench.model_fields), _wrench)
+
+    def _sampled(
+        self, topic: Topic, columns: tuple[str, ...], values_of: Callable[[bytes], tuple[float, ...]]
+    ) -> Samples:
+        numbers = {stroke.stroke_id: number for number, stroke in enumerate(self.recording.stroke_records())}
+        when: list[tuple[int, ...]] = []
+        values: list[tuple[float, ...]] = []
+        current, frame, on = -1, 0, topic
+        try:
+            for _schema, channel, message in self.recording.messages(Topic.STEP, topic):
+                on = channel.topic
+                if on == Topic.STEP:
+                    step = StepEvent.model_validate_json(message.data).step
+                    pressed = step.press if isinstance(step, Begin) and step.kind != StepKind.CAPTURE else None
+                    current, frame = -1 if pressed is None else numbers.get(pressed.stroke_id, -1), 0
+                elif current >= 0:
+                    when.append((current, frame, message.publish_time, message.log_time, message.sequence))
+                    values.append(values_of(message.data))
+                    frame += 1
+        except (ValidationError, DecodeError):
+            raise SessionDamaged(self.recording.path, f"a message on {on} does not fit its schema") from None
+        shape = -1, len(columns)
+        return Samples(columns, np.array(when, np.int64).reshape(-1, 5), np.array(values, np.float64).reshape(shape))
+
+
+def _pose(data: bytes) -> tuple[float, ...]:
+    pose = PoseInFrame.FromString(data).pose
+    at, turned = pose.position, pose.orientation
+    return at.x * 1e3, at.y * 1e3, at.z * 1e3, turned.x, turned.y, turned.z, turned.w
+
+
+def _wrench(data: bytes) -> tuple[float, ...]:
+    return tuple(Wrench.model_validate_json(data).model_dump().values())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +279,7 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
 
 
 def _model(brush: Brush | BrushFit, name: str) -> StrokeModel:
-    if isinstance(brush, BrushFit):
+    if not isinstance(brush, Brush):
         from brushloop.model.fitted import fitted_model
 
         return fitted_model(brush.press())
@@ -261,11 +311,15 @@ Place = Session | str | os.PathLike[str]
 
 def calibrate_session(session: Place, *, lens: Path | None = None) -> Calibrated:
     """Fit scale and paper plane of a session from the board in view, as `brushloop calibrate` does."""
-    return calibrate(CalibrateRequest(_path(session), lens))
+    from brushloop.calibrate import calibrated
+
+    return calibrated.calibrate_session(calibrated.CalibrateRequest(_path(session), lens))
 
 
 def fit(session: Place, **options: Any) -> FitResult:
     """Fit the brush to the presses of a session, as `brushloop fit` does; `options` are fields of `FitRequest`."""
+    from brushloop.calibrate.fit.brush import FitRequest, fit_presses
+
     return fit_presses(FitRequest(_path(session), **options))
 
 
@@ -275,11 +329,10 @@ def recover(session: Place, out: Path | None = None, **options: Any) -> Recovere
     Writes `recovered.csv` and the protocol that repeats the presses, beside the recording unless `out` says where.
     `options` are fields of `RecoverRequest`.
     """
-    from brushloop.calibrate.invert import RecoverRequest
-    from brushloop.calibrate.invert import recover as run
+    from brushloop.calibrate import invert
 
     path = _path(session)
-    return run(RecoverRequest(session=path, out=out or Recording(path).path.parent / "recovered.csv", **options))
+    return invert.recover(invert.RecoverRequest(session=path, out=out or path.parent / "recovered.csv", **options))
 
 
 def validate(*sessions: Place, **options: Any) -> ValidationOutput:
@@ -287,12 +340,14 @@ def validate(*sessions: Place, **options: Any) -> ValidationOutput:
 
     Raises `GateMissed` if a gate is missed, once the report is written.
     """
-    places = tuple(str(one.recording.path) if isinstance(one, Session) else str(one) for one in sessions)
-    request = Request(places=places, command=f"brushloop.validate{places}", **options)
-    output = run_validation(request)
-    check(output, request)
+    from brushloop.calibrate.validate import command
+
+    places = tuple(str(place.recording.path) if isinstance(place, Session) else str(place) for place in sessions)
+    request = command.Request(places=places, command=f"brushloop.validate{places}", **options)
+    output = command.validate(request)
+    command.check(output, request)
     return output
 
 
 def _path(session: Place) -> Path:
-    return session.recording.path if isinstance(session, Session) else local_path(str(session))
+    return (session if isinstance(session, Session) else Session(session)).recording.path
