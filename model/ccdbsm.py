@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.model.arrays import Array, as_batch, as_numpy, library, like, safe_sqrt
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Array, Outline, as_batch, safe_sqrt
 
 
 class DomainError(ValueError):
@@ -40,7 +39,7 @@ class DomainError(ValueError):
 class Brush:
     """The hair bundle as a cone: largest radius R and length L, mm; both must be positive, else DomainError.
 
-    R and L are floats, or (B,) arrays or tensors for a batch of brushes or gradients with respect to the brush.
+    R and L are floats, or (B,) arrays for a batch of brushes.
     """
 
     radius_mm: Array = 6.0
@@ -101,21 +100,19 @@ class CcdBsm:
 
     def outline(self) -> Outline:
         """Eq. 1 as two quarters of an ellipse and two parabolas, exactly; (B, 4) arcs from the end of the heel."""
-        xp = library(self.o3a_mm)
         heel, tip, wide = (size[:, None, None] for size in (self.o3a_mm, self.o4o3_mm, self.half_width_mm))
         # Shares of heel, tip and half width. The parabolas' tangents, level at x = 0 and 2 w / O4O3 steep at the tip,
         # meet halfway.
-        x = like(((1, 1, 0), (0, -0.5, -1), (-1, -0.5, 0), (0, 1, 1)), heel)
-        y = like(((0, 1, 1), (1, 1, 0), (0, -1, -1), (-1, -1, 0)), heel)
+        x = np.array(((1, 1, 0), (0, -0.5, -1), (-1, -0.5, 0), (0, 1, 1)))
+        y = np.array(((0, 1, 1), (1, 1, 0), (0, -1, -1), (-1, -1, 0)))
         quarter = math.sqrt(0.5)
-        weights = xp.ones_like(heel[:, 0]) * like((quarter, 1, 1, quarter), heel)
-        return Outline(xp.stack((xp.where(x > 0, heel, tip) * x, wide * y), -1), weights)
+        weights = np.ones_like(heel[:, 0]) * (quarter, 1, 1, quarter)
+        return Outline(np.stack((np.where(x > 0, heel, tip) * x, wide * y), -1), weights)
 
     def half_width(self, x_mm: Array) -> Array:
         """Eq. 1 at x, (B, N) -> (B, N) mm; zero outside the mark."""
-        xp = library(self.o3a_mm)
-        heel = xp.clip(x_mm / self.o3a_mm[:, None], 0, 1)
-        tip = xp.clip(x_mm / self.o4o3_mm[:, None], -1, 0)
+        heel = np.clip(x_mm / self.o3a_mm[:, None], 0, 1)
+        tip = np.clip(x_mm / self.o4o3_mm[:, None], -1, 0)
         # The other side's fraction is clipped to 0, so its factor is 1 and one product covers both sides.
         return self.half_width_mm[:, None] * safe_sqrt((1 - heel) * (1 + heel)) * (1 - tip) * (1 + tip)
 
@@ -123,7 +120,7 @@ class CcdBsm:
 def basic_lengths(
     depth_mm: Array, alpha: Array, radius_mm: Array, length_mm: Array, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """O3A, O3C and O4O3 in mm (Eq. 2-5) of presses at alpha in radians, computed by `xp`: numpy, torch or math."""
+    """O3A, O3C and O4O3 in mm (Eq. 2-5) of presses at alpha in radians, computed by `xp`: numpy or math."""
     theta = xp.atan(radius_mm / length_mm)
     o3a = depth_mm * (xp.tan(alpha) - xp.tan(alpha - theta))
     o3c = depth_mm * (radius_mm / (length_mm * xp.cos(alpha)))
@@ -133,19 +130,18 @@ def basic_lengths(
 def ccdbsm(brush: Brush, depth_mm: Array, tilt_deg: Array, lam: Array = math.pi) -> CcdBsm:
     """The CCD-BSM mark (Eq. 1-5) of presses to depth H at tilt alpha; scalars or (B,), broadcast to one (B,).
 
-    See `model.arrays` for the dtype. lambda = pi preserves the area of each cross-section. Raises DomainError unless
-    alpha >= 0, alpha + theta < 90 deg, 0 < H <= L cos alpha, lambda > 0.
+    lambda = pi preserves the area of each cross-section. Raises DomainError unless alpha >= 0,
+    alpha + theta < 90 deg, 0 < H <= L cos alpha, lambda > 0.
     """
     _require_positive("lam", lam)
     depth, tilt, radius, length, dilation = as_batch(depth_mm, tilt_deg, brush.radius_mm, brush.length_mm, lam)
-    _check_domain(*map(as_numpy, (depth, tilt, radius, length)))
-    xp = library(depth)
-    return CcdBsm(*basic_lengths(depth, xp.deg2rad(tilt), radius, length, xp), dilation)
+    _check_domain(depth, tilt, radius, length)
+    return CcdBsm(*basic_lengths(depth, np.deg2rad(tilt), radius, length, np), dilation)
 
 
 def _require_positive(name: str, value: Array) -> None:
     """Raise DomainError unless every element is positive and finite."""
-    values = as_numpy(value).reshape(-1)
+    values = np.ravel(value)
     bad = values[~((values > 0) & np.isfinite(values))]
     if len(bad):
         raise DomainError(name, float(bad[0]), "(0, inf)")

@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.arrays import Array, as_batch, as_numpy, library, like
 from brushloop.model.ccdbsm import DomainError, basic_lengths
-from brushloop.model.outline import Outline, closed
+from brushloop.model.outline import Array, Outline, as_batch, closed
 from brushloop.model.strokes import StrokeModel
 
 Floats = NDArray[np.float64]
@@ -189,18 +188,13 @@ def command_terms(depth_mm: Array, tilt_deg: Array) -> Floats:
 
 
 def fitted_model(press: FittedPress, label: str = "CCD-BSM fitted") -> StrokeModel:
-    """The stroke model of a calibrated brush. Its outlines carry no gradient; the fit computes its derivatives itself.
-
-    Their origin is where the brush axis meets the paper, as in every model.
-    """
+    """The stroke model of a calibrated brush: its origin is where the brush axis meets the paper, as in every model."""
 
     def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
         depth, tilt = as_batch(depth_mm, tilt_deg)
-        h, a = as_numpy(depth), as_numpy(tilt)
-        points = press.outline(h, a).points
-        points[..., 0] -= (h * np.tan(np.radians(a)))[:, None, None]
-        points = like(points, depth)
-        return Outline(points, library(points).ones_like(points[..., 0, 0]))
+        outline = press.outline(depth, tilt)
+        outline.points[..., 0] -= (depth * np.tan(np.radians(tilt)))[:, None, None]
+        return outline
 
     definition = "CCD-BSM's lengths with gains, powers, profile and edges fitted to captured strokes."
     return StrokeModel(NAME, label, definition, profile, fitted=True)

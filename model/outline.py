@@ -5,18 +5,32 @@ Book", 2nd ed., ch. 7): w = 1 is a parabola or, with the middle point halfway, a
 of an ellipse that spans 2 acos(w) of it. So lines, circles, ellipses and CCD-BSM's parabolas are exact; other
 curves are cut into short parabolas by `through`.
 
-The frame is defined in `model.raster`. All parameters are batched: one mark per row, `(B,)`. Everything here computes
-in numpy or, with gradients, in torch (`model.arrays`).
+The frame is defined in `model.raster`. All parameters are batched: one mark per row, `(B,)`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from brushloop.model.arrays import Array, library, like, safe_sqrt
+Array = Any
+"""An array of numpy; where a parameter is meant, a number as well."""
+
+
+def as_batch(*values: Array) -> tuple[Array, ...]:
+    """All values as float64 arrays (B,), broadcast to each other. Raises ValueError for more than one dimension."""
+    batch = [np.atleast_1d(np.asarray(value, np.float64)) for value in values]
+    if any(part.ndim > 1 for part in batch):
+        raise ValueError(f"stroke parameters are scalars or (B,), got shapes {[part.shape for part in batch]}")
+    return tuple(np.broadcast_arrays(*batch))
+
+
+def safe_sqrt(value: Array) -> Array:
+    """The square root of max(value, 0): rounding may take what is 0 below it."""
+    return np.sqrt(np.maximum(value, 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,40 +62,38 @@ class Outline:
     @property
     def area_mm2(self) -> Array:
         """The enclosed area by Green's theorem, (B,): the polygon of the arcs' ends plus a segment under each."""
-        xp = library(self.points)
         start, middle, end = _nodes(self.points)
         polygon = 0.5 * cross(start, end)
         # A parabola fills two thirds of its triangle (Archimedes).
         parabola = cross(middle - start, end - start) / 3
         curved = self.weights < 1
-        w = xp.where(curved, self.weights, xp.full_like(self.weights, 0.5))
+        w = np.where(curved, self.weights, 0.5)
         _, along, across = ellipse_of(self.points, w)
         sine = safe_sqrt((1 - w) * (1 + w))
-        segment = cross(along, across) * (xp.arctan2(sine, w) - sine * w)
-        return (polygon + xp.where(curved, segment, parabola)).sum(-1)
+        segment = cross(along, across) * (np.arctan2(sine, w) - sine * w)
+        return (polygon + np.where(curved, segment, parabola)).sum(-1)
 
     def polyline(self, per_arc: int = 32) -> Array:
         """Points on the loop in order, per_arc on each arc, (B, K per_arc, 2) mm; the last joins the first."""
         if per_arc < 1:
             raise ValueError(f"per_arc = {per_arc}: expected at least one point per arc")
-        t = like(np.arange(per_arc) / per_arc, self.points)
+        t = np.arange(per_arc) / per_arc
         points = evaluate(self.points[:, :, None], self.weights[:, :, None], t)
         return points.reshape(len(points), -1, 2)
 
     def _extreme(self, axis: int, sign: int) -> Array:
         """The greatest of sign * coordinate over each loop, times sign, (B,)."""
-        xp = library(self.points)
         p0, p1, p2 = (sign * node[..., axis] for node in _nodes(self.points))
-        ends = xp.maximum(p0, p2)
+        ends = np.maximum(p0, p2)
         # An arc leaves the span of its ends only if its middle point does.
         curved = self.weights < 1
-        w = xp.where(curved, self.weights, xp.full_like(self.weights, 0.5))
+        w = np.where(curved, self.weights, 0.5)
         centre, along, across = (sign * part[..., axis] for part in ellipse_of(self.points, w))
         ellipse = centre + safe_sqrt(along**2 + across**2)
         bend = p0 - 2 * p1 + p2
-        parabola = p0 - (p0 - p1) ** 2 / xp.where(bend == 0, xp.ones_like(bend), bend)
-        beyond = xp.where(curved, ellipse, parabola)
-        return sign * xp.amax(xp.where(p1 > ends, beyond, ends), -1)
+        parabola = p0 - (p0 - p1) ** 2 / np.where(bend == 0, 1.0, bend)
+        beyond = np.where(curved, ellipse, parabola)
+        return sign * np.max(np.where(p1 > ends, beyond, ends), -1)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -114,18 +126,17 @@ def through(curve: Array) -> Array:
     The error falls with the third power of the step; its sign changes within a piece, so areas keep the fourth.
     """
     start, on, end = curve[:, :-1:2], curve[:, 1::2], curve[:, 2::2]
-    return library(curve).stack((start, 2 * on - 0.5 * (start + end), end), 2)
+    return np.stack((start, 2 * on - 0.5 * (start + end), end), 2)
 
 
 def closed(*curves: Array) -> Outline:
     """The outline of parabolas through finely sampled curves (B, 2 N + 1, 2), joined by straight lines in order."""
-    xp = library(*curves)
     arcs: list[Array] = []
     for curve, following in zip(curves, (*curves[1:], curves[0]), strict=True):
         end, start = curve[:, -1], following[:, 0]
-        arcs += [through(curve), xp.stack((end, 0.5 * (end + start), start), 1)[:, None]]
-    points = xp.concat(arcs, 1)
-    return Outline(points, xp.ones_like(points[..., 0, 0]))
+        arcs += [through(curve), np.stack((end, 0.5 * (end + start), start), 1)[:, None]]
+    points = np.concatenate(arcs, 1)
+    return Outline(points, np.ones_like(points[..., 0, 0]))
 
 
 def rounded(centre: Array, half_x: Array, half_y: Array, corner_x: Array, corner_y: Array) -> Outline:
@@ -133,20 +144,19 @@ def rounded(centre: Array, half_x: Array, half_y: Array, corner_x: Array, corner
 
     Corners as large as the box make an ellipse, whose sides have no length.
     """
-    xp = library(centre)
     flat_x, flat_y = half_x - corner_x, half_y - corner_y
     corners: list[Array] = []
     for k, (right, up) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
-        side = xp.stack((centre + right * half_x, up * flat_y), -1)
-        top = xp.stack((centre + right * flat_x, up * half_y), -1)
-        corner = xp.stack((centre + right * half_x, up * half_y), -1)
-        corners.append(xp.stack((side, corner, top) if k % 2 == 0 else (top, corner, side), 1))
+        side = np.stack((centre + right * half_x, up * flat_y), -1)
+        top = np.stack((centre + right * flat_x, up * half_y), -1)
+        corner = np.stack((centre + right * half_x, up * half_y), -1)
+        corners.append(np.stack((side, corner, top) if k % 2 == 0 else (top, corner, side), 1))
     arcs: list[Array] = []
     for this, following in zip(corners, (*corners[1:], corners[0]), strict=True):
         end, start = this[:, 2], following[:, 0]
-        arcs += [this, xp.stack((end, 0.5 * (end + start), start), 1)]
-    points = xp.stack(arcs, 1)
-    return Outline(points, xp.ones_like(points[..., 0, 0]) * like([math.sqrt(0.5), 1.0] * 4, points))
+        arcs += [this, np.stack((end, 0.5 * (end + start), start), 1)]
+    points = np.stack(arcs, 1)
+    return Outline(points, np.ones_like(points[..., 0, 0]) * ([math.sqrt(0.5), 1.0] * 4))
 
 
 def _nodes(points: Array) -> tuple[Array, Array, Array]:

@@ -15,10 +15,9 @@ from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cel
 from brushloop.calibrate.fit.fit import Prior, fit_presses
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
-from brushloop.model.arrays import as_batch
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Outline, as_batch
 from brushloop.model.strokes import Plane, fit_plane
 from brushloop.model.strokes.peers import bezier
 from brushloop.sessions.records import Condition

@@ -5,8 +5,7 @@ Put such a file into `model/strokes/`; being there is enough, and `brushloop val
 
 from __future__ import annotations
 
-from brushloop.model.arrays import Array
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Array, Outline
 from brushloop.model.strokes import Basis, StrokeModel
 from brushloop.model.strokes.peers import ellipse
 

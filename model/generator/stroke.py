@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
-from brushloop.model.arrays import Array, as_batch, as_numpy
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.generator import TrainError
 from brushloop.model.generator.config import INPUTS, MAX_WEIGHTS, Target, TrainConfig, checked
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Array, Outline, as_batch
 from brushloop.model.strokes import StrokeModel
 
 Singles = NDArray[np.float32]
@@ -41,7 +41,7 @@ class GeneratorFile:
         target, layers, weights = self.config.target, self.config.layers, self.weights
         low, high = np.transpose([getattr(target, name) for name in INPUTS]).astype(np.float32)
         unit = 2 * (np.asarray(inputs, np.float32) - low) / (high - low) - 1
-        x = chebyshev(unit, layers.degree)[..., 1:].reshape(len(unit), -1)
+        x = chebvander(unit, layers.degree)[..., 1:].reshape(len(unit), -1)
         for k in range(layers.depth + 1):
             x = x @ weights[f"fully_connected.{2 * k}.weight"].T + weights[f"fully_connected.{2 * k}.bias"]
             if k < layers.depth:
@@ -53,14 +53,6 @@ class GeneratorFile:
         map_ = (map_ + weights["convolution.0.bias"]).reshape(-1, side, side, scale, scale)
         field = map_.transpose(0, 1, 3, 2, 4).reshape(-1, target.size_px, target.size_px)  # pixel shuffle
         return np.clip(field + np.float32(0.5), 0, 1)
-
-
-def chebyshev(unit: Array, degree: int) -> Any:
-    """T_0 to T_degree of numbers in [-1, 1], (...) -> (..., degree + 1), by T_k+1 = 2 x T_k - T_k-1."""
-    terms = [np.ones_like(unit), unit]
-    for _ in range(degree - 1):
-        terms.append(2 * unit * terms[-1] - terms[-2])
-    return np.stack(terms[: degree + 1], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +80,7 @@ def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorMod
     target, is_tuned = file.config.target, file.config.tuning is not None
     if brush is not None:
         for name in ("radius_mm", "length_mm"):
-            trained, wanted = getattr(target, name), float(as_numpy(getattr(brush, name)))
+            trained, wanted = getattr(target, name), float(getattr(brush, name))
             if wanted != trained:
                 raise TrainError(path, f"was trained for a brush with {name} = {trained:g}, not {wanted:g}")
     learned = target.stroke_model
@@ -96,7 +88,7 @@ def load_generator(path: Path | str, brush: Brush | None = None) -> GeneratorMod
     tuned = ", then tuned on captured strokes" if is_tuned else ""
 
     def profile(depth_mm: Array, tilt_deg: Array) -> Outline:
-        inputs = np.stack([as_numpy(part) for part in as_batch(depth_mm, tilt_deg)], axis=-1)
+        inputs = np.stack(as_batch(depth_mm, tilt_deg), axis=-1)
         target.check(inputs)
         return traced(file.images(inputs), target.origin_mm(inputs), target.px_mm)
 

@@ -15,8 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.model.arrays import Array, as_numpy, library, like
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Array, Outline
 
 SIZE_PX = 128
 PX_MM = 0.2
@@ -39,9 +38,9 @@ def coverage(
     from brushloop.model.raster.kernel import rasterise  # numba takes a fifth of a second to import
 
     check_raster(size_px, px_mm)
-    points, weights = as_numpy(outline.points), as_numpy(outline.weights)
+    points, weights = (np.ascontiguousarray(part, np.float64) for part in (outline.points, outline.weights))
     out = np.empty((len(points), size_px, size_px), np.float32)
-    rasterise(points, weights, to_pixels(as_numpy(origin_mm), as_numpy(heading_deg), px_mm, weights), out)
+    rasterise(points, weights, to_pixels(origin_mm, heading_deg, px_mm, len(points)), out)
     return out
 
 
@@ -51,20 +50,20 @@ def check_raster(size_px: int, px_mm: float) -> None:
         raise ValueError(f"size_px = {size_px}, px_mm = {px_mm:g}: both must be positive")
 
 
-def to_pixels(origin_mm: Array, heading_deg: Array, px_mm: float, marks: Array) -> Array:
-    """The map of the module's last two lines for B `marks`, (B, 6): column = m0 x + m1 y + m2, row = m3 x + m4 y + m5.
+def to_pixels(origin_mm: Array, heading_deg: Array, px_mm: float, marks: int) -> Array:
+    """The map of the module's last two lines for `marks` marks, (B, 6): column = m0 x + m1 y + m2, row = m3 x + m4 y +
+    m5.
 
     Raises ValueError for an origin or headings of another number of marks.
     """
-    xp = library(marks, origin_mm, heading_deg)
-    origin, heading = like(origin_mm, marks), xp.deg2rad(like(heading_deg, marks))
-    if tuple(origin.shape) not in ((2,), (len(marks), 2)):
-        raise ValueError(f"origin_mm has shape {tuple(origin.shape)}, expected (2,) or ({len(marks)}, 2)")
-    if tuple(heading.shape) not in ((), (1,), (len(marks),)):
-        raise ValueError(f"heading_deg has shape {tuple(heading.shape)}, expected a scalar or ({len(marks)},)")
-    origin = xp.broadcast_to(origin, (len(marks), 2)) / px_mm
-    cosine, sine = (xp.broadcast_to(part, (len(marks),)) / px_mm for part in (xp.cos(heading), xp.sin(heading)))
-    return xp.stack((cosine, -sine, origin[:, 0], -sine, -cosine, origin[:, 1]), -1)
+    origin, heading = np.asarray(origin_mm, np.float64), np.deg2rad(np.asarray(heading_deg, np.float64))
+    if origin.shape not in ((2,), (marks, 2)):
+        raise ValueError(f"origin_mm has shape {origin.shape}, expected (2,) or ({marks}, 2)")
+    if heading.shape not in ((), (1,), (marks,)):
+        raise ValueError(f"heading_deg has shape {heading.shape}, expected a scalar or ({marks},)")
+    origin = np.broadcast_to(origin, (marks, 2)) / px_mm
+    cosine, sine = (np.broadcast_to(part, (marks,)) / px_mm for part in (np.cos(heading), np.sin(heading)))
+    return np.stack((cosine, -sine, origin[:, 0], -sine, -cosine, origin[:, 1]), -1)
 
 
 def centred_origin(outline: Outline, *, size_px: int = SIZE_PX, px_mm: float = PX_MM) -> Array:
@@ -72,4 +71,4 @@ def centred_origin(outline: Outline, *, size_px: int = SIZE_PX, px_mm: float = P
     check_raster(size_px, px_mm)
     x = 0.5 * (outline.x_min_mm + outline.x_max_mm)
     middle = 0.5 * size_px * px_mm
-    return library(x).stack((middle - x, middle + 0 * x), -1)
+    return np.stack((middle - x, np.full_like(x, middle)), -1)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brushloop.model.arrays import Array, as_batch, as_numpy
 from brushloop.model.ccdbsm import Brush, CcdBsm, ccdbsm
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Array, Outline, as_batch
 
 # The paper's H and alpha; H as a share of its brush's 48 mm, so that the cells lie in the domain of any brush.
 DEPTHS = tuple(depth_mm / 48 for depth_mm in (11.0, 13.0, 15.0, 17.0, 20.0))
@@ -74,7 +73,7 @@ class Basis:
         def parameters(depth_mm: Array, tilt_deg: Array) -> dict[str, Array]:
             self.mark(depth_mm, tilt_deg)
             if not planes:
-                length_mm = float(as_numpy(self.brush.length_mm).reshape(-1)[0])
+                length_mm = float(np.ravel(self.brush.length_mm)[0])
                 cells = np.meshgrid(np.multiply(length_mm, DEPTHS), TILTS_DEG, indexing="ij")
                 depth, tilt = (part.ravel() for part in cells)
                 planes.append(fit_plane(depth, tilt, measure(self.mark(depth, tilt))))

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.model.arrays import Array, as_numpy, library, like, safe_sqrt
 from brushloop.model.ccdbsm import CcdBsm, DomainError
-from brushloop.model.outline import Outline, closed, evaluate, rounded, through
+from brushloop.model.outline import Array, Outline, closed, evaluate, rounded, safe_sqrt, through
 from brushloop.model.strokes import Basis, Profile, StrokeModel
 
 BEZIER_PIECES = 128
@@ -93,7 +92,7 @@ def line(mark: CcdBsm) -> Outline:
     rectangle of that length and width (butt ends), and round ends added beyond the length.
     """
     half_length, half_width = 0.5 * mark.length_mm, 0.5 * mark.width_mm
-    radius = library(half_length).minimum(half_length, half_width)
+    radius = np.minimum(half_length, half_width)
     return rounded(mark.middle_mm, half_length, half_width, radius, radius)
 
 
@@ -104,13 +103,12 @@ def bezier(tip_mm: Array, base_mm: Array, belly_mm: Array, shoulder: Array) -> O
     are the distances of the ends from the origin, `belly_mm` is the greatest width, and `shoulder` from 0 to 1 is where
     the curve's second point stands, as a share of the length.
     """
-    xp = library(tip_mm)
     tip, base, belly, share = (value[:, None] for value in (tip_mm, base_mm, belly_mm, shoulder))
-    t = like(np.linspace(1, 0, 2 * BEZIER_PIECES + 1), tip)
+    t = np.linspace(1, 0, 2 * BEZIER_PIECES + 1)
     second = share * (tip + base) - tip
     x = (1 - t) ** 3 * -tip + 3 * t * (1 - t) ** 2 * second + t**2 * (3 - 2 * t) * base
     y = 2 * belly * t * (1 - t)
-    return closed(xp.stack((x, y), -1), xp.flip(xp.stack((x, -y), -1), (1,)))
+    return closed(np.stack((x, y), -1), np.stack((x, -y), -1)[:, ::-1])
 
 
 def bezier_sizes(mark: CcdBsm) -> dict[str, Any]:
@@ -133,10 +131,9 @@ def qbc(start_width_mm: Array, end_width_mm: Array, **control_mm: Array) -> Outl
     is tighter than the stroke is thick, so that its inner side folds over. Where a stroke overlaps itself elsewhere,
     `area_mm2` counts the overlap twice and the rasterisers are wrong along its boundary.
     """
-    xp = library(start_width_mm, *control_mm.values())
-    nodes = xp.stack([xp.stack((control_mm[f"x{k}_mm"], control_mm[f"y{k}_mm"]), -1) for k in range(3)], 1)
-    t = like(np.linspace(0, 1, 2 * QBC_PIECES + 1), nodes)
-    centre = evaluate(nodes[:, None], xp.ones_like(t), t)
+    nodes = np.stack([np.stack((control_mm[f"x{k}_mm"], control_mm[f"y{k}_mm"]), -1) for k in range(3)], 1)
+    t = np.linspace(0, 1, 2 * QBC_PIECES + 1)
+    centre = evaluate(nodes[:, None], np.ones_like(t), t)
     steps = 2 * (nodes[:, 1:] - nodes[:, :-1])
     velocity = (1 - t)[:, None] * steps[:, :1] + t[:, None] * steps[:, 1:]
     speed = safe_sqrt((velocity**2).sum(-1))
@@ -144,20 +141,20 @@ def qbc(start_width_mm: Array, end_width_mm: Array, **control_mm: Array) -> Outl
     growth = (0.5 * (end_width_mm - start_width_mm))[:, None]
     _check_speed(start_width_mm, end_width_mm, growth, speed)
     along = velocity / speed[..., None]
-    left = xp.stack((-along[..., 1], along[..., 0]), -1)
+    left = np.stack((-along[..., 1], along[..., 0]), -1)
     k = growth / speed
     sine = safe_sqrt((1 - k) * (1 + k))
     back, aside = -(radius * k)[..., None] * along, (radius * sine)[..., None] * left
     right_side, left_side = centre + back - aside, centre + back + aside
     _check_folds(right_side, left_side, along, nodes)
-    heading = xp.arctan2(along[..., 1], along[..., 0])
-    lean = xp.arctan2(sine, -k)  # angle from the tangent to the envelope's point of contact
+    heading = np.arctan2(along[..., 1], along[..., 0])
+    lean = np.arctan2(sine, -k)  # angle from the tangent to the envelope's point of contact
     end, end_weights = _cap(centre[:, -1], radius[:, -1], heading[:, -1] - lean[:, -1], 2 * lean[:, -1])
     start, start_weights = _cap(centre[:, 0], radius[:, 0], heading[:, 0] + lean[:, 0], 2 * (math.pi - lean[:, 0]))
-    sides = through(right_side), through(xp.flip(left_side, (1,)))
-    flat = xp.ones_like(sides[0][..., 0, 0])
-    points = xp.concat((sides[0], end, sides[1], start), 1)
-    return Outline(points, xp.concat((flat, end_weights, flat, start_weights), 1))
+    sides = through(right_side), through(left_side[:, ::-1])
+    flat = np.ones_like(sides[0][..., 0, 0])
+    points = np.concatenate((sides[0], end, sides[1], start), 1)
+    return Outline(points, np.concatenate((flat, end_weights, flat, start_weights), 1))
 
 
 def qbc_sizes(mark: CcdBsm) -> dict[str, Any]:
@@ -182,20 +179,18 @@ def qbc_sizes(mark: CcdBsm) -> dict[str, Any]:
 
 def _cap(centre: Array, radius: Array, start: Array, span: Array) -> tuple[Array, Array]:
     """A circular arc from the angle `start` over `span`, all (B,): points (B, n, 3, 2) and weights (B, n)."""
-    xp = library(centre)
     half = (span / (2 * _CAP_ARCS))[:, None]
     k = np.arange(2 * _CAP_ARCS + 1)
-    angle = start[:, None] + like(k, centre) * half
-    corners = like(k % 2, centre)
-    reach = radius[:, None] * (1 + corners * (1 / xp.cos(half) - 1))
-    points = centre[:, None] + reach[..., None] * xp.stack((xp.cos(angle), xp.sin(angle)), -1)
-    arcs = xp.stack((points[:, :-1:2], points[:, 1::2], points[:, 2::2]), 2)
-    return arcs, xp.cos(half) * xp.ones_like(arcs[..., 0, 0])
+    angle = start[:, None] + k * half
+    reach = radius[:, None] * (1 + k % 2 * (1 / np.cos(half) - 1))
+    points = centre[:, None] + reach[..., None] * np.stack((np.cos(angle), np.sin(angle)), -1)
+    arcs = np.stack((points[:, :-1:2], points[:, 1::2], points[:, 2::2]), 2)
+    return arcs, np.cos(half) * np.ones_like(arcs[..., 0, 0])
 
 
 def _check_speed(start_width_mm: Array, end_width_mm: Array, growth: Array, speed: Array) -> None:
     """Raise DomainError where the width changes faster than the curve runs."""
-    held = (np.abs(as_numpy(growth)) >= as_numpy(speed)).any(-1)
+    held = (np.abs(growth) >= speed).any(-1)
     if held.any():
         at = int(held.argmax())
         allowed = f"{float(start_width_mm[at]):g} +- {float(2 * speed[at].min()):g} mm"
@@ -206,8 +201,8 @@ def _check_speed(start_width_mm: Array, end_width_mm: Array, growth: Array, spee
 
 def _check_folds(right: Array, left: Array, along: Array, nodes: Array) -> None:
     """Raise DomainError unless both sides run forward with the curve."""
-    tangent = as_numpy(along[:, 1:] + along[:, :-1])
-    steps = (np.diff(as_numpy(side), axis=1) for side in (right, left))
+    tangent = along[:, 1:] + along[:, :-1]
+    steps = (np.diff(side, axis=1) for side in (right, left))
     folded = np.any([((step * tangent).sum(-1) < 0).any(-1) for step in steps], axis=0)
     if folded.any():
         at = int(folded.argmax())

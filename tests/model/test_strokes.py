@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brushloop.model.arrays import as_batch
 from brushloop.model.ccdbsm import Brush, CcdBsm, DomainError, ccdbsm
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Outline, as_batch
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import UnknownModelError, fit_plane, stroke_model, stroke_models
 from brushloop.model.strokes.peers import bezier, bounding_ellipse, circle, line, qbc
