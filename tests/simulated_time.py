@@ -1,10 +1,15 @@
-"""An event loop in which time is simulated: it passes only while every task waits, and then jumps to the next timer."""
+"""Event loops in which time is simulated: no test waits, and what happens does not depend on how busy the machine is.
+
+Time passes only while every task waits, and then jumps to the next timer.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import selectors
+import threading
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 STEP_S = 1e-6
 """Time that passes at least between two looks at what is ready, so that a wait for the next moment ends."""
@@ -12,38 +17,28 @@ LATENCY_S = 2e-4
 """The same where there are sockets: a call over a network takes a few of these."""
 SETTLE_SHARE = 0.05
 """Share of a jump that is really waited for where there are sockets: a busy system may deliver a little later."""
+PATIENCE_S = 600.0
+"""Simulated time that a test waits for anything."""
+LOOK_S = 0.05
+"""Real time between two looks at whether a run is over that no longer takes turns."""
+
+_R = TypeVar("_R")
 
 
-class _Jumping(selectors.SelectSelector):
-    """Instead of waiting, it says how long it would have waited."""
-
-    def __init__(self, waited: Callable[[float], None]) -> None:
-        super().__init__()
-        self._waited = waited
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(None if timeout is None else 0.0)
-        step_s = STEP_S
-        if len(self.get_map()) > 1:  # the first is the loop's own
-            step_s = LATENCY_S
-            if not ready and timeout:
-                ready = super().select(SETTLE_SHARE * timeout)
-        self._waited(step_s if ready or timeout is None else max(timeout, step_s))
-        return ready
-
-
-class SimulatedTimeLoop(asyncio.SelectorEventLoop):
-    """For tests without threads and other processes, which are not waited for."""
+class SimulatedTime:
+    """The time of one loop, or of several one after the other; a `Clock`."""
 
     def __init__(self) -> None:
-        self._now_s = 1000.0
-        super().__init__(_Jumping(self._pass))
+        self.now_s = 1000.0
 
-    def time(self) -> float:
-        return self._now_s
+    def now_ns(self) -> int:
+        return round(1e9 * self.now_s)
 
-    def _pass(self, s: float) -> None:
-        self._now_s += s
+    def seconds(self) -> float:
+        return self.now_s
+
+    def pass_s(self, seconds: float) -> None:
+        self.now_s += seconds
 
 
 class LoopClock:
@@ -51,3 +46,179 @@ class LoopClock:
 
     def now_ns(self) -> int:
         return round(1e9 * asyncio.get_running_loop().time())
+
+
+class _Jumping(selectors.SelectSelector):
+    """Instead of waiting, it lets simulated time pass."""
+
+    def __init__(self, time: SimulatedTime, idle: Callable[[], None]) -> None:
+        super().__init__()
+        self._time = time
+        self._idle = idle
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0.0)
+        if not ready and timeout != 0.0:
+            self._idle()
+            ready = super().select(None if timeout is None else 0.0)
+        step_s = STEP_S
+        if len(self.get_map()) > 1:  # the first is the loop's own
+            step_s = LATENCY_S
+            if not ready and timeout:
+                ready = super().select(SETTLE_SHARE * timeout)
+        self._time.pass_s(step_s if ready or timeout is None else max(timeout, step_s))
+        return ready
+
+
+class SimulatedTimeLoop(asyncio.SelectorEventLoop):
+    """For tests without threads and other processes, which are not waited for."""
+
+    def __init__(self, time: SimulatedTime | None = None, idle: Callable[[], None] = lambda: None) -> None:
+        """`idle` is called whenever every task waits, before time passes."""
+        self._simulated = time or SimulatedTime()
+        super().__init__(_Jumping(self._simulated, idle))
+
+    def time(self) -> float:
+        return self._simulated.now_s
+
+
+class MemoryLoop(SimulatedTimeLoop):
+    """Servers and their clients in this loop are connected in memory, and what a thread of an executor would do is done
+    at once in the thread of the loop."""
+
+    def __init__(self, time: SimulatedTime | None = None, idle: Callable[[], None] = lambda: None) -> None:
+        super().__init__(time, idle)
+        self._servers: dict[tuple[str, int], MemoryServer] = {}
+
+    def run_in_executor(self, executor: object, func: Callable[..., _R], *args: Any) -> asyncio.Future[_R]:  # type: ignore[override]
+        future: asyncio.Future[_R] = self.create_future()
+        try:
+            future.set_result(func(*args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    async def create_server(self, protocol_factory: Any, host: Any = None, port: Any = None, **_: Any) -> Any:  # type: ignore[override]
+        server = MemoryServer(self._servers, host, port, protocol_factory)
+        assert self._servers.setdefault((host, port), server) is server, f"{host}:{port} is in use"
+        return server
+
+    async def create_connection(self, protocol_factory: Any, host: Any = None, port: Any = None, **_: Any) -> Any:  # type: ignore[override]
+        if (server := self._servers.get((host, port))) is None:
+            raise ConnectionRefusedError(f"nobody listens on {host}:{port} in this loop")
+        near, far = MemoryTransport(self, protocol_factory()), MemoryTransport(self, server.protocol_factory())
+        near.peer, far.peer = far, near
+        for end in (far, near):
+            end.protocol.connection_made(end)
+        await asyncio.sleep(0)
+        return near, near.protocol
+
+
+class MemoryServer:
+    """As much of an `asyncio.Server`, and of its socket, as a server of the loopback rig uses."""
+
+    def __init__(self, servers: dict[tuple[str, int], MemoryServer], host: str, port: int, factory: Any) -> None:
+        self.protocol_factory = factory
+        self.sockets = [self]
+        self._servers = servers
+        self._address = host, port
+
+    def getsockname(self) -> tuple[str, int]:
+        return self._address
+
+    def close(self) -> None:
+        self._servers.pop(self._address, None)
+
+    async def wait_closed(self) -> None:
+        pass
+
+
+class MemoryTransport(asyncio.Transport):
+    """One end of a connection; what is written arrives at the other in the next turn of the loop."""
+
+    peer: MemoryTransport
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, protocol: Any) -> None:
+        super().__init__()
+        self.protocol = protocol
+        self._loop = loop
+        self._closing = False
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        if not self._closing:
+            self._loop.call_soon(self.peer.receive, bytes(data))
+
+    def receive(self, data: bytes) -> None:
+        """Hand `data` to the protocol; the end of the stream if there is none."""
+        if self._closing:
+            return
+        if data:
+            self.protocol.data_received(data)
+        elif not self.protocol.eof_received():
+            self.close()
+
+    def close(self) -> None:
+        if not self._closing:
+            self.write(b"")
+            self._closing = True
+            self._loop.call_soon(self.protocol.connection_lost, None)
+
+    abort = close
+
+    def is_closing(self) -> bool:
+        return self._closing
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+    def pause_reading(self) -> None:
+        raise NotImplementedError
+
+
+class Turns:
+    """A test and a run in another thread take turns: the run goes on while the test waits for it, and stands still from
+    the moment at which what the test waits for is so."""
+
+    def __init__(self, time: SimulatedTime) -> None:
+        self.time = time
+        self._turn = threading.Condition()
+        self._met: Callable[[], bool] | None = None
+        self._until_s = 0.0
+        self._error: BaseException | None = None
+        self._over = False
+
+    def idle(self) -> None:
+        """For the loop of the run, whenever all of its tasks wait: stand still while it is the test's turn."""
+        with self._turn:
+            while not self._over and (self._met is None or self._is_met(self._met)):
+                self._met = None
+                self._turn.notify_all()
+                self._turn.wait()
+
+    def end(self) -> None:
+        """For the test: from now on the run does not stand still."""
+        with self._turn:
+            self._over = True
+            self._turn.notify_all()
+
+    def wait_until(self, met: Callable[[], bool], run_is_over: Callable[[], bool]) -> bool:
+        """For the test: let the run go on until the condition is met, or the run is over.
+
+        False where neither is so after `PATIENCE_S`. Raises what the condition raises.
+        """
+        with self._turn:
+            self._met, self._until_s, self._error = met, self.time.now_s + PATIENCE_S, None
+            self._turn.notify_all()
+            while self._met is not None and not run_is_over():
+                self._turn.wait(LOOK_S)
+            self._met = None
+        if self._error is not None:
+            raise self._error
+        return self.time.now_s <= self._until_s
+
+    def _is_met(self, met: Callable[[], bool]) -> bool:
+        try:
+            return met() or self.time.now_s > self._until_s
+        except BaseException as error:
+            self._error = error
+            return True

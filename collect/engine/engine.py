@@ -68,6 +68,8 @@ class Engine:
 
     presses: ClassVar[bool] = True
     """False for a dry run. A real run warns when it has no self-check, and its log names the session's folder."""
+    new_event_loop: Callable[[], asyncio.AbstractEventLoop] = staticmethod(asyncio.new_event_loop)
+    """Makes the event loop of the run."""
 
     def __init__(
         self,
@@ -205,7 +207,8 @@ class Engine:
 
     def _run_thread(self) -> None:
         try:
-            asyncio.run(self._main())
+            with asyncio.Runner(loop_factory=self.new_event_loop) as runner:
+                runner.run(self._main())
         except BaseException as error:
             self._outcome.set_exception(error)
         else:

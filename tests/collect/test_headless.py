@@ -18,7 +18,12 @@ from tests.command import brushloop
 from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
+
+
+@pytest.fixture
+def lab(wired_lab: Lab) -> Lab:
+    return wired_lab
 
 
 def wait_for_presses(lab: Lab, count: int) -> None:

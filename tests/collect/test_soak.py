@@ -30,7 +30,7 @@ from brushloop.sessions.verify import verify_session
 from tests.journal_lines import read_lines
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
 
 LONGEST_LIFE_S = 120.0
 START_S, STROKE_S = 3.2, 0.9
@@ -65,6 +65,11 @@ class Toll:
             f"seed {self.seed}: {self.kills.total()} kills ({phases}), {self.sessions} sessions, "
             f"{self.strokes} strokes, {self.presses} presses on paper, {self.files} files read again, lost 0"
         )
+
+
+@pytest.fixture
+def lab(wired_lab: Lab) -> Lab:
+    return wired_lab
 
 
 def test_a_session_that_is_killed_three_times_ends_whole(lab: Lab) -> None:

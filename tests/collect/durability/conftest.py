@@ -15,7 +15,7 @@ from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.journal import JOURNAL_NAME
 
 if TYPE_CHECKING:
-    from tests.collect.conftest import Lab
+    from tests.rigs import Lab
 
 DISK_MIB = 90
 """A step is begun with 80 MiB free or more."""
@@ -40,6 +40,11 @@ class Disk:
 
     def read_only(self, yes: bool) -> None:
         subprocess.run(["mount", "-o", f"remount,{'ro' if yes else 'rw'}", self.folder], check=True)
+
+
+@pytest.fixture
+def lab(wired_lab: Lab) -> Lab:
+    return wired_lab
 
 
 @pytest.fixture

@@ -27,9 +27,8 @@ from brushloop.sessions.records import Condition
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
-    from conftest import Lab
-
     from brushloop.drivers.sim.rig import LoopbackRig
+    from tests.rigs import Lab
 
 HOLD, LINE, RELEASE = (f"rob1.MotionControl.{name}" for name in ("stopMove", "moveLine", "startMove"))
 REQUESTS_IN_HOLD = 10

@@ -13,11 +13,11 @@ from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import the_session
-from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import until, wait_for_end
 
 if TYPE_CHECKING:
-    from tests.collect.conftest import Lab
+    from tests.rigs import Lab
 
 HOUR_S = 3600
 

@@ -13,7 +13,7 @@ from tests.journal_lines import read_lines
 from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
-    from tests.collect.conftest import Lab
+    from tests.rigs import Lab
 
 
 def wait_for_a_file(lab: Lab, pattern: str) -> None:

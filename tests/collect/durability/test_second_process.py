@@ -10,13 +10,13 @@ import pytest
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.sessions.verify import verify_session
-from tests.collect.conftest import SMALL_VIEW, serving
 from tests.collect.durability.conftest import the_session
 from tests.command import brushloop
+from tests.rigs import SMALL_VIEW, serving
 from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
-    from tests.collect.conftest import Lab
+    from tests.rigs import Lab
 
 
 def where(rig: LoopbackRig) -> dict[str, str]:

@@ -22,7 +22,7 @@ from tests.collect.durability.conftest import parked, the_session
 from tests.waiting import PATIENCE_S, wait_until
 
 if TYPE_CHECKING:
-    from tests.collect.conftest import Lab
+    from tests.rigs import Lab
 
 ROWS, COLUMNS = 40, 120
 

@@ -19,13 +19,13 @@ from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic
 from tests.collect.sent import noting
-from tests.collect.until import wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import Lab
+    from tests.rigs import Lab
 
 LIST = 'kind = "list"\npresses = [{depth_mm = 11.0}, {depth_mm = 13.0}]\ndwell_s = 0.0\n'
 FIGURE = (

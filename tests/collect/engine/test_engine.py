@@ -18,11 +18,12 @@ from brushloop.drivers.errors import RobotNotSafe
 from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import replay
 from brushloop.sessions.recording import Recording
-from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import until, wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Collected, Lab
+    from tests.collect.conftest import Collected
+    from tests.rigs import Lab
 
 
 def run(engine: Engine) -> None:
@@ -211,8 +212,8 @@ def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.M
 
 def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    engine = lab.engine(armed=True)
-    run(engine)
+    lab.edit_rig("", "\n[self_check]\nenabled = false\n")
+    engine = lab.run(armed=True)
     assert any(UNCHECKED in line for line in engine.snapshot().messages)
     assert "self_check" not in {step.kind for step in replay(next(lab.sessions.glob("*/journal.jsonl"))).files.values()}
 

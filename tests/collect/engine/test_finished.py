@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.collect.start import CollectRequest, collect, ending
-from tests.collect.until import wait_for_end
+from tests.rigs import wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
 
 
 def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:

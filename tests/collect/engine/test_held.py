@@ -11,16 +11,15 @@ from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.errors import ConfigError
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
-from tests.collect.until import until, wait_for_end
 from tests.command import brushloop
+from tests.rigs import until, wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import Lab
-
     from brushloop.collect.engine.engine import Engine
     from brushloop.collect.operator import Prompt
+    from tests.rigs import Lab
 
 
 def slowly(lab: Lab) -> None:

@@ -17,14 +17,14 @@ from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.journal import RunState, replay
 from brushloop.sessions.records import Topic
-from tests.collect.until import until, wait_for_end
+from tests.rigs import until, wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from conftest import Collected, Lab
-
     from brushloop.collect.engine.engine import Engine
+    from tests.collect.conftest import Collected
+    from tests.rigs import Lab
 
 
 def run(engine: Engine) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,37 +15,17 @@ from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
-from tests.collect.until import until, wait_for_end
-from tests.waiting import wait_until
+from tests.rigs import answered_alike, until, wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Lab
-
     from brushloop.calibrate.stroke import Gray
     from brushloop.collect.engine.engine import Engine
-    from brushloop.collect.engine.snapshot import Snapshot
+    from tests.rigs import Lab
 
 
 def run(engine: Engine) -> None:
     engine.start()
     wait_for_end(engine)
-
-
-def answered(engine: Engine, answer: str, *, over: Callable[[Snapshot], bool]) -> list[str]:
-    """Run, answering every question the same way; the questions."""
-    engine.start()
-    asked: dict[int, str] = {}
-
-    def answering() -> bool:
-        now = engine.snapshot()
-        if now.prompt is not None and now.prompt.number not in asked and not over(now):
-            asked[now.prompt.number] = now.prompt.question
-            assert engine.answer(now.prompt.number, answer)
-        return over(now) or engine.finished
-
-    wait_until(answering, "the end of the questions")
-    wait_for_end(engine)
-    return list(asked.values())
 
 
 def used(lab: Lab) -> int:
@@ -92,7 +71,7 @@ def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab
     assert left.snapshot().given_up == 0
 
     resumed = sharp_lab.engine(watched=True)
-    questions = answered(resumed, "g", over=lambda now: now.state is State.DONE)
+    questions = answered_alike(resumed, "g")
     assert [question.partition(":")[0] for question in questions[1:]] == ["H13-a0-r01, take 3"]
     assert (resumed.snapshot().strokes_done, resumed.snapshot().given_up) == (1, 0)
     assert len(sharp_lab.rig.world.presses) == 3
@@ -101,7 +80,7 @@ def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab
 def test_an_operator_who_watches_may_keep_it(sharp_lab: Lab) -> None:
     sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
     engine = sharp_lab.engine(watched=True)
-    [question] = answered(engine, "g", over=lambda now: now.state is State.DONE)
+    [question] = answered_alike(engine, "g")
     assert question.startswith("H13-a0-r01, take 3: ")
     assert (engine.snapshot().strokes_done, engine.snapshot().given_up) == (1, 0)
 
@@ -138,7 +117,7 @@ def test_saying_no_to_real_hardware_leaves_it_as_it_is(sharp_lab: Lab, monkeypat
     monkeypatch.setattr("brushloop.drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
     engine = sharp_lab.engine(watched=True)
     with pytest.raises(CollectAborted, match="nothing moved"):
-        answered(engine, "x", over=lambda now: now.state in (State.STOPPED, State.FAILED))
+        answered_alike(engine, "x")
     assert sharp_lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
 

@@ -18,11 +18,11 @@ from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
 from tests.calibrate.given import kept_lens
-from tests.collect.until import wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
 
 K1 = -0.08
 

@@ -36,7 +36,7 @@ from tests.command import brushloop
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
 
 pytest.importorskip("foxglove", reason="needs the extra [live]")
 

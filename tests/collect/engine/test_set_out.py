@@ -13,11 +13,11 @@ from brushloop.collect.engine.steps import capture as capturing
 from brushloop.collect.engine.steps.context import meanwhile
 from brushloop.collect.errors import BadPicture, CollectAborted
 from brushloop.collect.motion import Procedures
-from tests.collect.until import until, wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import until, wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
 
 
 def events(lab: Lab) -> list[tuple[str, str]]:

@@ -9,10 +9,10 @@ import pytest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.motion import dip_moves, wash_moves
 from brushloop.collect.rig.config import RigConfig, load_rig
-from tests.collect.until import wait_for_end
+from tests.rigs import wait_for_end
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
 
 WIPE = "\n[ink.wipe]\nrim_mm = [322.0, 20.0]\nz_mm = 130.0\n"
 WASH = "\n[ink.wash]\npot_mm = [305.0, 80.0]\ndip_z_mm = 125.0\nevery_dips = 2\nstrokes = 2\n"

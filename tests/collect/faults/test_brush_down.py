@@ -9,7 +9,7 @@ import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import describe
-from tests.collect.until import until, wait_for_end
+from tests.rigs import until, wait_for_end
 from tests.waiting import wait_until
 
 if TYPE_CHECKING:

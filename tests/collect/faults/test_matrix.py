@@ -32,8 +32,8 @@ from brushloop.drivers.sim.faults import ALWAYS, Fault, Phase
 from brushloop.sessions.journal import replay
 from brushloop.sessions.store import SessionStore
 from tests.collect.faults.conftest import CAMERA_TIMEOUT_S
-from tests.collect.until import wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import wait_for_end
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:

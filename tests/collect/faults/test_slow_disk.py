@@ -20,8 +20,8 @@ from brushloop.sessions.errors import SessionError
 from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_writer import McapWriter
 from brushloop.sessions.recording import Recording
-from tests.collect.until import wait_for_end
 from tests.journal_lines import read_lines
+from tests.rigs import wait_for_end
 
 if TYPE_CHECKING:
     from conftest import Stage

@@ -17,9 +17,8 @@ from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import StepResult
-from tests.collect.conftest import Lab
 from tests.collect.sent import not_checked, not_sent, noting
-from tests.collect.until import wait_for_end
+from tests.rigs import Lab, wait_for_end
 from tests.waiting import wait_until
 
 EXTRAS = """

@@ -24,7 +24,12 @@ from tests.command import brushloop
 from tests.drivers.arcs.transcript import Archive
 
 if TYPE_CHECKING:
-    from conftest import Lab
+    from tests.rigs import Lab
+
+
+@pytest.fixture
+def lab(wired_lab: Lab) -> Lab:
+    return wired_lab
 
 
 async def test_a_rig_in_order_is_reported_as_it_is_and_left_as_it_was(lab: Lab) -> None:

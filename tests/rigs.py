@@ -1,0 +1,448 @@
+"""Loopback rigs for a collection: one that serves on sockets in real time, and one without wires in simulated time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import itertools
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import can
+import pytest
+
+from brushloop.collect import start
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.open_or_resume import Opening
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.operator import Prompt
+from brushloop.collect.rig import devices
+from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.devices import Rig, connected
+from brushloop.drivers.camera.source import CameraOptions
+from brushloop.drivers.devices import Frame, Identity, Stamp
+from brushloop.drivers.errors import DeviceTimeout
+from brushloop.drivers.force import sri_m8123 as force_driver
+from brushloop.drivers.host import Clock
+from brushloop.drivers.sim.brush.footprint import Flaw
+from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.faults import Device
+from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
+from brushloop.drivers.sim.world import SimClock
+from tests.command import brushloop
+from tests.simulated_time import MemoryLoop, SimulatedTime, Turns
+from tests.waiting import PATIENCE_S
+
+SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=15.0)
+SMALL_TABLE = Table(
+    sheet_mm=(110.0, 80.0),
+    board_origin_mm=(-20.0, -20.0),
+    board_squares=(15, 12),
+    board_square_mm=10.0,
+    board_marker_mm=7.0,
+    well_mm=(150.0, 20.0),
+)
+SHARP_VIEW = View(width_px=1024, height_px=832, px_per_mm=6.25, centre_mm=(55.0, 40.0), fps=12.0)
+"""Of the small table, as sharp as the camera is by default: a quarter of its pixels."""
+BENT_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=12.0, k1=-0.08)
+"""Of a whole sheet, through a lens that distorts by ten pixels and more."""
+COARSE = SimConfig(rate=60.0, view=SMALL_VIEW, force_hz=100.0)
+"""A camera too coarse to judge ink by."""
+SHARP = SimConfig(rate=60.0, view=SHARP_VIEW, table=SMALL_TABLE)
+OPTIONS = ("--out", "--config", "--protocol")
+
+_R = TypeVar("_R")
+
+
+@contextlib.contextmanager
+def serving(config: SimConfig) -> Iterator[LoopbackRig]:
+    """The rig serves from another thread's event loop until the block ends."""
+    ready: Future[tuple[LoopbackRig, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def serve() -> None:
+        over = asyncio.Event()
+        async with LoopbackRig(config) as rig:
+            ready.set_result((rig, asyncio.get_running_loop(), over))
+            await over.wait()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="loopback rig", daemon=True)
+    thread.start()
+    rig, loop, over = ready.result(timeout=PATIENCE_S)
+    try:
+        yield rig
+    finally:
+        loop.call_soon_threadsafe(over.set)
+        thread.join(timeout=PATIENCE_S)
+        assert not thread.is_alive(), f"waited {PATIENCE_S:g} s for the loopback rig to end"
+
+
+@dataclass
+class Lab:
+    """A rig, its configuration on disk, and a folder for sessions."""
+
+    rig: LoopbackRig
+    folder: Path
+    processes: list[subprocess.Popen[str]] = field(default_factory=list)
+    make: type[Engine] = Engine
+    engines: list[Engine] = field(default_factory=list)
+
+    @property
+    def sessions(self) -> Path:
+        return self.folder / "sessions"
+
+    @property
+    def session(self) -> Path:
+        """The folder of the only session."""
+        [folder] = self.sessions.iterdir()
+        return folder
+
+    @property
+    def at_rest(self) -> bool:
+        """Nothing moves and nothing is queued."""
+        motion = self.rig.world.motion
+        return motion.exec_id(self.rig.world.clock.now_s()) == -1 and motion.size == 0
+
+    def engine(self, *, new: bool = False, sheet: int | None = None, armed: bool = False, **options: Any) -> Engine:
+        """As `brushloop collect` makes it; `options` are those of `brushloop.collect.start.engine_for`."""
+        opening = Opening.load(
+            self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml", new=new, sheet=sheet, armed=armed
+        )
+        self.engines.append(start.engine_for(opening, make=self.make, **{"watched": False, **options}))
+        return self.engines[-1]
+
+    def run(self, **options: Any) -> Engine:
+        """An engine at its end. Raises what ended it."""
+        engine = self.engine(**options)
+        engine.start()
+        wait_for_end(engine)
+        return engine
+
+    def process(self) -> subprocess.Popen[str]:
+        """`brushloop collect` as an operator starts it, without a screen."""
+        command = [sys.executable, "-m", "brushloop", "collect", "--no-tui", *self.options]
+        self.processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        return self.processes[-1]
+
+    def command(self, *more: str) -> subprocess.CompletedProcess[str]:
+        """The same in this process."""
+        return brushloop("collect", "--no-tui", *more, *self.options)
+
+    @property
+    def options(self) -> list[str]:
+        """Of `brushloop collect`: where its files lie."""
+        paths = (self.sessions, self.folder / "rig.toml", self.folder / "protocol.toml")
+        return [word for option, path in zip(OPTIONS, paths, strict=True) for word in (option, str(path))]
+
+    def edit_rig(self, old: str, new: str) -> None:
+        """Change `rig.toml`; with nothing old, append to it."""
+        path = self.folder / "rig.toml"
+        text = path.read_text(encoding="utf-8")
+        assert old in text
+        path.write_text(text.replace(old, new) if old else text + new, encoding="utf-8")
+
+    def write_protocol(
+        self, heights: str = "[11.0, 15.0]", tilts: str = "[0.0]", repeats: int = 1, dwell_s: float = 0.0
+    ) -> None:
+        """A grid; two strokes unless more are asked for."""
+        text = f'kind = "grid"\ndepths_mm = {heights}\ntilts_deg = {tilts}\nrepeats = {repeats}\ndwell_s = {dwell_s}\n'
+        (self.folder / "protocol.toml").write_text(text, encoding="utf-8")
+
+
+def coarse(lab: Lab) -> Lab:
+    """Write its files: captures are not judged, and two strokes are pressed."""
+    text = lab.rig.toml().replace("latency_ms = 250.0", "latency_ms = 60.0") + "\n[quality]\nenabled = false\n"
+    (lab.folder / "rig.toml").write_text(text.replace("[force]", "[force]\nbias_s = 0.25"), encoding="utf-8")
+    lab.write_protocol()
+    return lab
+
+
+def sharp(lab: Lab, latency_ms: int = 100) -> Lab:
+    """Write its files: captures are judged, one stroke is pressed, and nothing splits by itself."""
+    text = lab.rig.toml().replace("latency_ms = 250.0", f"latency_ms = {latency_ms}")
+    (lab.folder / "rig.toml").write_text(text.replace("[force]", "[force]\nbias_s = 0.25"), encoding="utf-8")
+    lab.write_protocol("[13.0]", "[0.0]")
+    lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 0.0)))
+    return lab
+
+
+@contextlib.contextmanager
+def wired_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
+    """A coarse lab on sockets, whose processes end with the block."""
+    with serving(config) as rig:
+        lab = coarse(Lab(rig, folder))
+        yield lab
+        for process in lab.processes:
+            process.kill()
+            process.communicate()
+
+
+# Without wires
+
+PORTS = {"arcs_port": 30004, "rtde_port": 30010, "camera_port": 8080, "force_port": 29536}
+"""In memory, where nobody else has them."""
+_rigs = itertools.count()
+
+
+def _own_address() -> str:
+    """A loopback address of a rig's own on this machine: two arms at one address would be taken for one arm."""
+    number = os.getpid() * 64 + next(_rigs)
+    return ".".join(["127", *(str(number >> shift & 255) for shift in (16, 8, 0))])
+
+
+class WorldClock(SimClock):
+    """The world's time, which passes `rate` times as fast as that of the loop."""
+
+    def __init__(self, time: SimulatedTime, rate: float) -> None:
+        super().__init__(rate)
+        self._time = time
+        self._since = time.now_s, 0.0
+
+    def now_s(self) -> float:
+        since_s, world_s = self._since
+        return world_s + (self._time.now_s - since_s) * self.rate
+
+    def shift(self, rate: float) -> None:
+        """Go on at another pace."""
+        self._since, self.rate = (self._time.now_s, self.now_s()), rate
+
+
+class WirelessRig(LoopbackRig):
+    """The loopback rig in the event loop of the run: the arm's driver is connected in memory, the other drivers read
+    their devices directly."""
+
+    def __init__(self, config: SimConfig) -> None:
+        self.address = _own_address()
+        super().__init__(config, self.address)
+        self.time = SimulatedTime()
+        self.clock = WorldClock(self.time, config.rate)
+        self.world.clock = self.clock
+        self.faults._real_s = self.time.seconds
+
+    def toml(self) -> str:
+        ink_path = None if self.ink is None else "in memory"
+        force_port = None if self.force is None else PORTS["force_port"]
+        ports = PORTS["arcs_port"], PORTS["rtde_port"], PORTS["camera_port"]
+        return rig_toml(self.config, Addresses(self.address, *ports, force_port, ink_path))
+
+    @contextlib.asynccontextmanager
+    async def connected(self, config: RigConfig, clock: Clock, on_notice: Callable[[str], None]) -> AsyncGenerator[Rig]:
+        """In place of `brushloop.collect.rig.devices.connected`."""
+        async with contextlib.AsyncExitStack() as stack:
+            patch = stack.enter_context(pytest.MonkeyPatch.context())
+            patch.setattr(devices, "make_camera", lambda config, clock, _: SceneCamera(self, config, clock))
+            patch.setattr(force_driver, "RoundStream", lambda *arguments: LoopRounds(self, *arguments))
+            patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self))
+            for server, port in ((self.arcs, PORTS["arcs_port"]), (self.rtde, PORTS["rtde_port"])):
+                await server.start(self.address, port)
+                stack.push_async_callback(server.stop)
+            watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
+            stack.callback(watching.cancel)
+            yield await stack.enter_async_context(connected(config, clock, on_notice))
+
+
+class SceneCamera:
+    """`Camera` that sees the scene itself: a picture is drawn only when somebody asks for it."""
+
+    def __init__(self, rig: WirelessRig, config: RigConfig, clock: Clock) -> None:
+        self._rig, self._clock = rig, clock
+        self._options = CameraOptions(config.camera.source, config.camera.latency_ms, config.camera.timeout_s)
+        self._latency_ns = round(config.camera.latency_ms * 1e6)
+        self._newest: Frame | None = None
+
+    async def connect(self) -> Identity:
+        height, width = (await self.fresh(Stamp(0))).image.shape[:2]
+        return Identity("camera", f"{self._options.source} {width}x{height}", "", True)
+
+    async def fresh(self, after: Stamp) -> Frame:
+        began_ns, period_ns = self._clock.now_ns(), round(1e9 / self._rig.config.view.fps)
+        while self._newest is None or self._newest.exposed_after_ns < after.host_ns:
+            now_ns = self._clock.now_ns()
+            due_ns = (max(now_ns, after.host_ns + self._latency_ns) // period_ns + 1) * period_ns
+            await asyncio.sleep((due_ns - now_ns) / 1e9)
+            if self._rig.faults.meet(Device.CAMERA) is None:
+                seq = 0 if self._newest is None else self._newest.stamp.seq + 1
+                self._newest = Frame(Stamp(due_ns, None, seq), due_ns - self._latency_ns, self._rig.scene.render())
+            elif due_ns - began_ns > self._options.timeout_s * 1e9:
+                raise DeviceTimeout("camera", "fresh", f"no valid new frame in {self._options.timeout_s:g} s")
+        return self._newest
+
+    async def close(self) -> None:
+        self._newest = None
+
+
+class LoopRounds(force_driver.RoundStream):
+    """The rounds of the force board, read by a task instead of a thread."""
+
+    def __init__(self, rig: WirelessRig, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        assert rig.force is not None
+        self._rig, self._board = rig, rig.force.board
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        self.identity = Identity("force", "SRI M8123B2 on the loopback rig", "", True)
+        self._board.streaming = True
+        self._task = asyncio.get_running_loop().create_task(self._read(), name="force rounds")
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _read(self) -> None:
+        while self.loss is None:
+            for frame in self._board.round(self._rig.clock.now_s()):
+                at_s, is_error = self._rig.time.now_s, frame.error
+                self._take(can.Message(at_s, frame.can_id, False, False, is_error, data=frame.data))
+            await asyncio.sleep(1.0 / self._rig.config.force_hz)
+
+
+class MemoryLine:
+    """The serial line of the ink device: as much of pyserial's `Serial` as its driver uses."""
+
+    def __init__(self, rig: WirelessRig) -> None:
+        assert rig.ink is not None
+        self._instrument = rig.ink.instrument
+        self._request, self._reply = bytearray(), b""
+
+    @property
+    def in_waiting(self) -> int:
+        return len(self._reply)
+
+    def write(self, data: bytes) -> None:
+        self._request += data
+        while (request := self._instrument.take(self._request)) is not None:
+            self._reply += self._instrument.answer(request) or b""
+
+    def read(self, size: int) -> bytes:
+        taken, self._reply = self._reply[:size], self._reply[size:]
+        return taken
+
+    def close(self) -> None:
+        pass
+
+
+class SteppedEngine(Engine):
+    """An engine that stands still unless its test waits for it."""
+
+    def __init__(self, rig: RigConfig, protocol: Any, open_store: Any, clock: Any, **options: Any) -> None:
+        super().__init__(rig, protocol, open_store, clock, **options)
+        self.turns = Turns(clock)
+        self._loop: MemoryLoop | None = None
+
+    def new_event_loop(self) -> asyncio.AbstractEventLoop:
+        self._loop = MemoryLoop(self.turns.time, self.turns.idle)
+        return self._loop
+
+    def meanwhile(self, work: Coroutine[Any, Any, _R]) -> _R:
+        """Do this in the loop of the run, as somebody else beside it, while the run goes on."""
+        assert self._loop is not None
+        doing = asyncio.run_coroutine_threadsafe(work, self._loop)
+        self.turns.wait_until(doing.done, lambda: self.finished)
+        return doing.result(timeout=0.0)
+
+
+@contextlib.contextmanager
+def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
+    """A lab whose runs, within the block, need neither wires nor time; write its files with `coarse` or `sharp`."""
+    rig = WirelessRig(config)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
+        patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
+        patch.setattr(start, "HostClock", lambda: rig.time)
+        patch.setattr("brushloop.collect.headless.REFRESH_S", 0.01)
+        lab = Lab(rig, folder, make=SteppedEngine)
+        yield lab
+        for engine in lab.engines:
+            end(engine)
+
+
+def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> Snapshot:
+    """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
+    met: list[Snapshot] = []
+
+    def looked() -> bool:
+        now = engine.snapshot()
+        met.extend([now] if condition(now) else [])
+        return bool(met)
+
+    in_time = _wait(engine, looked)
+    if not met:
+        why = "the run ended" if engine.finished else "the run went on" if in_time else "time ran out"
+        pytest.fail(f"{why} while a test waited for {_source(condition)}: {engine.snapshot()}")
+    return met[0]
+
+
+def wait_for_end(engine: Engine) -> None:
+    """Wait until the run is over, and raise what ended it; stops the run and fails where it does not end in time."""
+    if not _wait(engine, lambda: False):
+        now = engine.snapshot()
+        end(engine)
+        pytest.fail(f"a test waited in vain for the end of the run; it is: {now}")
+    engine.join()
+
+
+def question(engine: Engine, words: str = "") -> Prompt:
+    """The next open question that holds these words."""
+    prompt = until(engine, lambda now: now.prompt is not None and words in now.prompt.question).prompt
+    assert prompt is not None
+    return prompt
+
+
+def answer(engine: Engine, words: str, key: str) -> None:
+    """Answer the next question that holds these words."""
+    number = question(engine, words).number
+    assert engine.answer(number, key)
+    until(engine, lambda now: now.prompt is None or now.prompt.number != number)
+
+
+def answered_alike(engine: Engine, key: str) -> list[str]:
+    """Run to the end, answering every question the same way; the questions. Raises what ended the run."""
+    questions: dict[int, str] = {}
+
+    def answering() -> bool:
+        prompt = engine.snapshot().prompt
+        if prompt is not None and prompt.number not in questions:
+            questions[prompt.number] = prompt.question
+            assert engine.answer(prompt.number, key)
+        return False
+
+    engine.start()
+    _wait(engine, answering)
+    wait_for_end(engine)
+    return list(questions.values())
+
+
+def end(engine: Engine) -> None:
+    """Stop a run that a test has left."""
+    if not engine.finished:
+        engine.stop()
+    if isinstance(engine, SteppedEngine):
+        engine.turns.end()
+
+
+def _wait(engine: Engine, met: Callable[[], bool]) -> bool:
+    """Wait until the condition is met or the run is over; False where neither comes in time."""
+    if isinstance(engine, SteppedEngine):
+        return engine.turns.wait_until(met, lambda: engine.finished)
+    deadline = time.monotonic() + PATIENCE_S
+    while not met() and not engine.finished:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def _source(condition: Callable[[Snapshot], bool]) -> str:
+    try:
+        return inspect.getsource(condition).strip()
+    except OSError:
+        return repr(condition)
