@@ -28,7 +28,7 @@ from brushloop.collect.operator import Prompt
 from brushloop.collect.rig import devices
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
-from brushloop.drivers.camera.source import CameraOptions
+from brushloop.drivers.camera.source import CameraTable
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import DeviceTimeout
 from brushloop.drivers.force import sri_m8123 as force_driver
@@ -238,7 +238,7 @@ class WirelessRig(LoopbackRig):
         """In place of `brushloop.collect.rig.devices.connected`."""
         async with contextlib.AsyncExitStack() as stack:
             patch = stack.enter_context(pytest.MonkeyPatch.context())
-            patch.setattr(devices, "make_camera", lambda config, clock, _: SceneCamera(self, config, clock))
+            patch.setattr(devices, "OpenCvCamera", lambda table, clock, _: SceneCamera(self, table, clock))
             patch.setattr(force_driver, "RoundStream", lambda *arguments: LoopRounds(self, *arguments))
             patch.setattr("serial.Serial", lambda *_, **__: MemoryLine(self))
             for server, port in ((self.arcs, PORTS["arcs_port"]), (self.rtde, PORTS["rtde_port"])):
@@ -252,15 +252,14 @@ class WirelessRig(LoopbackRig):
 class SceneCamera:
     """`Camera` that sees the scene itself: a picture is drawn only when somebody asks for it."""
 
-    def __init__(self, rig: WirelessRig, config: RigConfig, clock: Clock) -> None:
-        self._rig, self._clock = rig, clock
-        self._options = CameraOptions(config.camera.source, config.camera.latency_ms, config.camera.timeout_s)
-        self._latency_ns = round(config.camera.latency_ms * 1e6)
+    def __init__(self, rig: WirelessRig, table: CameraTable, clock: Clock) -> None:
+        self._rig, self._table, self._clock = rig, table, clock
+        self._latency_ns = round(table.latency_ms * 1e6)
         self._newest: Frame | None = None
 
     async def connect(self) -> Identity:
         height, width = (await self.fresh(Stamp(0))).image.shape[:2]
-        return Identity("camera", f"{self._options.source} {width}x{height}", "", True)
+        return Identity("camera", f"{self._table.source} {width}x{height}", "", True)
 
     async def fresh(self, after: Stamp) -> Frame:
         began_ns, period_ns = self._clock.now_ns(), round(1e9 / self._rig.config.view.fps)
@@ -271,8 +270,8 @@ class SceneCamera:
             if self._rig.faults.meet(Device.CAMERA) is None:
                 seq = 0 if self._newest is None else self._newest.stamp.seq + 1
                 self._newest = Frame(Stamp(due_ns, None, seq), due_ns - self._latency_ns, self._rig.scene.render())
-            elif due_ns - began_ns > self._options.timeout_s * 1e9:
-                raise DeviceTimeout("camera", "fresh", f"no valid new frame in {self._options.timeout_s:g} s")
+            elif due_ns - began_ns > self._table.timeout_s * 1e9:
+                raise DeviceTimeout("camera", "fresh", f"no valid new frame in {self._table.timeout_s:g} s")
         return self._newest
 
     async def close(self) -> None:
