@@ -149,7 +149,6 @@ def sim(
         int | None, typer.Option(min=0, help="Serve a lab that nobody has measured, drawn from this seed.")
     ] = None,
     trap: Annotated[str | None, typer.Option(help="What is wrong in the unknown lab, such as swapped-corner.")] = None,
-    truth: Annotated[Path | None, typer.Option(help="File for the unknown lab's true values, for tests.")] = None,
 ) -> None:
     """Serve the loopback rig: an ARCS controller and an MJPEG camera over one simulated world, on 127.0.0.1 only.
 
@@ -162,11 +161,11 @@ def sim(
 
     if unknown is not None:
         if write_rig is not None or brush != Path("loopback") or arcs_port or camera_port:
-            raise LabRefused("--unknown: can only be combined with --trap, --truth, --control, --rate and --idle-exit")
-        serve_unknown(unknown, trap, rate, idle_exit, say, truth=truth, control=control)
+            raise LabRefused("--unknown: can only be combined with --trap, --control, --rate and --idle-exit")
+        serve_unknown(unknown, trap, rate, idle_exit, say, control)
         return
-    if trap is not None or truth is not None:
-        raise LabRefused("--trap and --truth: need --unknown SEED")
+    if trap is not None:
+        raise LabRefused("--trap: needs --unknown SEED")
     pressed = load_brush(brush, seed)
     config = SimConfig(
         seed=seed,

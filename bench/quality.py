@@ -105,7 +105,7 @@ class Bench:
             marker_mm=table.board_marker_mm,
             origin_mm=table.board_origin_mm,
         )
-        self.still = self._scene.render(0, self._away)
+        self.still = self._scene.render(self._away)
         self.plane = see_board(self.still, self._board)
         self._presses = 0
 
@@ -292,11 +292,11 @@ class Bench:
     def _render(self, view: View | None = None) -> Gray:
         self.world.version += 1
         if view is None:
-            return self._scene.render(0, self._away)
+            return self._scene.render(self._away)
         sound = self.world.config
         self.world.config = dataclasses.replace(sound, view=view)
         try:
-            return Scene(self.world).render(0, self._away)
+            return Scene(self.world).render(self._away)
         finally:
             self.world.config = sound
 

@@ -21,8 +21,8 @@ import contextlib
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Generator, Sequence
+from typing import Any
 
 import cbor2
 import numpy as np
@@ -42,24 +42,6 @@ GREETING_END = b"}\n\n"
 MAX_GREETING_BYTES = 256 * 1024
 MAX_MESSAGE_BYTES = 64 * 1024
 MAX_DEPTH = 16
-
-
-class _NoTags(Mapping[int, Any]):
-    """Refuses every tag. Poses and modes need none, and a tagged regular expression of 64 KiB takes
-    cbor2 half a minute to compile, a tagged big decimal half a second."""
-
-    def __getitem__(self, tag: int) -> Any:
-        return _refuse
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(())
-
-    def __len__(self) -> int:
-        return 1
-
-
-def _refuse(*_: object) -> NoReturn:
-    raise ValueError("a tagged value")
 
 
 def outputs_of(greeting: bytes, device: str) -> dict[str, int]:
@@ -98,9 +80,7 @@ def decode_message(payload: bytes, device: str) -> tuple[int, list[Any]]:
         if payload.startswith(b"["):
             message: Any = json.loads(payload)
         else:
-            message = cbor2.loads(
-                payload, semantic_decoders=_NoTags(), tag_hook=_refuse, max_depth=MAX_DEPTH, strict_hashable_types=True
-            )
+            message = cbor2.loads(payload, max_depth=MAX_DEPTH)
     except Exception as error:  # the decoders may raise anything
         raise ProtocolViolation(device, "decode", f"neither CBOR nor JSON: {error}") from None
     match message:

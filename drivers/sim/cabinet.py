@@ -335,10 +335,10 @@ class Cabinet:
                 self.safety_stop(SafetyMode.PROTECTIVE_STOP)
 
     def set_speed_fraction(self, fraction: float) -> int:
-        """Scale the speed of every move that has not begun."""
+        """Scale the speed of every move that is queued from now on."""
         if not 0.0 < fraction <= 1.0:
             return -ReturnCode.INVALID_ARGUMENT
-        self.motion.set_fraction(fraction, self.now_s())
+        self.motion.fraction = fraction
         return ReturnCode.OK
 
     def configure(self, name: str, value: object, allowed: bool) -> int:

@@ -115,8 +115,6 @@ class View:
     """Real seconds that a picture waits before it is sent, on top of drawing and coding it."""
     delay_jitter_s: float = 0.0
     """Largest random extra delay; pictures never overtake each other."""
-    stamp_strip: bool = False
-    """Draw the host time into the top rows, for tests of `fresh(after)`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.lab_facts import PICTURE_PX, Trap, draw, mended, spring
+from brushloop.drivers.sim.lab_facts import PICTURE_PX, Trap, draw, trapped
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
 from brushloop.drivers.sim.person import TOUCHED, Person
 from brushloop.drivers.sim.rig import LoopbackRig
@@ -104,8 +104,8 @@ class UnknownLab:
     def __init__(
         self, seed: int, trap: Trap | None = None, *, rate: float = 1.0, picture_px: tuple[int, int] = PICTURE_PX
     ) -> None:
-        self._clean = draw(seed, rate, picture_px)
-        self.facts = self._clean if trap is None else spring(self._clean, trap)
+        clean = draw(seed, rate, picture_px)
+        self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
         self.host = _free_address(seed)
         config = replace(
             self.facts.config,
@@ -222,7 +222,7 @@ class UnknownLab:
         was = self.facts
         if was.trap is None:
             return "Nothing is wrong that I know of."
-        self.facts = self.person.facts = mended(was, self._clean)
+        self.facts = self.person.facts = self._mended
         if was.trap is Trap.CABLE_PULLED:
             return self.plug()
         if self.facts.config != was.config:

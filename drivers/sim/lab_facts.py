@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Any
 
@@ -16,7 +16,7 @@ from brushloop.drivers.geometry import DOWN, brush_pose, of_vector, product
 from brushloop.drivers.sim.brush.brush import BrushSpec
 from brushloop.drivers.sim.config import SimConfig, Table, View
 from brushloop.drivers.sim.kinematics import HOME, inverse, inverted, matrix_of
-from brushloop.drivers.sim.scene import Floats, camera_matrix, homography, mapped
+from brushloop.drivers.sim.scene import Floats, homography, mapped
 from brushloop.drivers.sim.world import tool_of
 
 Place = tuple[float, float, float]
@@ -347,58 +347,36 @@ def patched(facts: Facts, patch: Mapping[str, Any]) -> Facts:
     return replace(facts, config=replace(config, **of(config)), **of(facts))
 
 
-def spring(facts: Facts, trap: Trap) -> Facts:
-    """The same lab with the trap in it."""
-    return patched(facts, {"trap": trap, **_mistake(facts, trap)})
+def trapped(facts: Facts, trap: Trap) -> tuple[Facts, Facts]:
+    """The lab with the trap in it, and as it is once the person has corrected the mistake."""
+    wrong, mended = _patches(facts, trap)
+    return patched(facts, {"trap": trap, **wrong}), patched(facts, mended)
 
 
-def _mistake(facts: Facts, trap: Trap) -> dict[str, Any]:
-    """What is otherwise with the trap, by field."""
+def _patches(facts: Facts, trap: Trap) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What is otherwise with the trap, and still otherwise once it is mended, by field."""
     table, rng = facts.config.table, np.random.default_rng([facts.seed, 18])
     match trap:
         case Trap.SWAPPED_CORNER:
             first = int(rng.integers(4))
-            return {"swapped": (CORNERS[first], CORNERS[(first + 1) % 4])}
+            return {"swapped": (CORNERS[first], CORNERS[(first + 1) % 4])}, {}
         case Trap.MIRRORED_CAMERA:
-            return {"mirrored": True}
-        case Trap.WRONG_BOARD_SIZE:
-            return {field: SHRUNK * getattr(table, field) for field in ("board_square_mm", "board_marker_mm")}
+            return {"mirrored": True}, {}
+        case Trap.WRONG_BOARD_SIZE:  # a board that was printed too small is measured
+            square_mm, marker_mm = SHRUNK * table.board_square_mm, SHRUNK * table.board_marker_mm
+            small = {"board_square_mm": square_mm, "board_marker_mm": marker_mm}
+            return small, {**small, "printed_square_mm": square_mm, "printed_marker_mm": marker_mm}
         case Trap.TCP_IN_METRES:
-            return {"cabinet_tcp": (0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0)}
+            return {"cabinet_tcp": (0.0, 0.0, facts.config.tool_mm / 1e6, 0.0, 0.0, 0.0)}, {}
         case Trap.SLOW_CAMERA:
-            return {"delay_s": SLOW_S}
+            return {"delay_s": SLOW_S}, {}
         case Trap.FORCE_SIGN:
-            return {"sensor_sign": -1}
+            return {"sensor_sign": -1}, {"sensor_sign": 1}
         case Trap.SHEET_OUT_OF_REACH:  # with board, pots and camera; the pin stays within reach
             x, y, _ = over_sheet(table)
             stretch = TOO_FAR_MM / math.hypot(x, y)
-            return {"origin_mm": (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)}
+            return {"origin_mm": (table.origin_mm[0] + stretch * x, table.origin_mm[1] + stretch * y)}, {}
         case Trap.CABLE_PULLED:
-            return {"cable_after": int(rng.integers(2, 7))}
+            return {"cable_after": int(rng.integers(2, 7))}, {}
         case Trap.PARK_IN_PICTURE | Trap.OLD_SOFTWARE:
-            return {}
-
-
-def mended(facts: Facts, clean: Facts) -> Facts:
-    """The lab once the person has corrected the mistake. A board that was printed too small is measured."""
-    table = facts.config.table
-    match facts.trap:
-        case Trap.WRONG_BOARD_SIZE:
-            printed = {"printed_square_mm": table.board_square_mm, "printed_marker_mm": table.board_marker_mm}
-            return patched(facts, {"trap": None, **printed})
-        case Trap.FORCE_SIGN:
-            return patched(facts, {"trap": None, "sensor_sign": 1})
-        case _:
-            return clean
-
-
-def truth(facts: Facts) -> dict[str, Any]:
-    """The facts as JSON, and what a first day should find from them; lengths in mm, angles in deg, base frame."""
-    table, view, tool = facts.config.table, facts.config.view, tool_of(facts.config)
-    return {
-        **asdict(facts),
-        "tool": {"tcp_offset_mm": (1e3 * tool[:3, 3]).tolist(), "brush_axis": tool[:3, 2].tolist()},
-        "corners_mm": {of: {name: corner(table, of, name) for name in CORNERS} for of in ("board", "sheet")},
-        "well_rim_mm": table.to_base(*table.well_mm, table.well_depth_mm),
-        "camera": {"matrix": camera_matrix(view).tolist(), "delay_s": view.delay_s + 0.5 * view.delay_jitter_s},
-    }
+            return {}, {}

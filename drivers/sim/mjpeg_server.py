@@ -148,14 +148,12 @@ class MjpegServer(LoopbackServer):
 
     async def _jpeg(self, line: _Line) -> bytes:
         async with self._rendering:  # the scene keeps a cache: one thread at a time
-            # Read the time first, so that no frame shows anything older than its stamp. Read the tool here, because
-            # the motion queue belongs to the event loop's thread.
-            host_ns, tool = time.time_ns(), self._scene.tool()
+            tool = self._scene.tool()  # here, because the motion queue belongs to the event loop's thread
             line.exposed()
-            return await asyncio.to_thread(self._encode, host_ns, tool)
+            return await asyncio.to_thread(self._encode, tool)
 
-    def _encode(self, host_ns: int, tool: Pose) -> bytes:
-        image: NDArray[np.uint8] = self._scene.render(host_ns, tool)
+    def _encode(self, tool: Pose) -> bytes:
+        image: NDArray[np.uint8] = self._scene.render(tool)
         for coded, data in self._coded:
             if coded is image:
                 return data

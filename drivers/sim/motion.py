@@ -170,7 +170,7 @@ class MotionQueue:
     ) -> None:
         self.tool: Matrix = np.eye(4) if tool is None else tool
         self.fraction = 1.0
-        """Speed factor for every move that has not begun."""
+        """Speed factor for every move that is added from now on."""
         self.near: Joints = HOME
         """The last known joints, from which inverse kinematics starts."""
         self.rests: deque[Rest] = deque(maxlen=RESTS_KEPT)
@@ -273,25 +273,6 @@ class MotionQueue:
         left = [piece for piece in self._pieces if piece.stop > rest.along]
         if left:
             self._go_on(left, now_s)
-
-    def set_fraction(self, fraction: float, now_s: float) -> None:
-        """Run every move that has not begun at this share of its speed, 0 to 1.
-
-        A change that the arm could not follow in time takes effect with the next move.
-        """
-        self.fraction = fraction
-        begun = self.exec_id(now_s)
-        slowed = [
-            piece
-            if piece.corner or piece.move.ident == begun
-            else replace(piece, cap=piece.move.paced(fraction, piece.rests))
-            for piece in self._pieces
-        ]
-        if slowed == self._pieces:
-            return
-        knots = self._knots if self.held else timetable(slowed, self._at(now_s))
-        if knots is not None:
-            self._pieces, self._knots = slowed, knots
 
     def pose(self, now_s: float) -> Pose:
         """Where the tip is."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.devices import Pose
-from brushloop.drivers.geometry import interpolate, of_vector, product, turned, unit, vector
+from brushloop.drivers.geometry import of_vector, product, turned, unit, vector
 from brushloop.drivers.sim.cabinet import Cabinet
 from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
 from brushloop.drivers.sim.lab_facts import (
@@ -46,8 +46,6 @@ LOOK_S = 0.005
 PUSH_N, PUSH_S = 2.0, 1.0
 PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
 """Forces in the brush's frame, N: along the brush toward the flange, then along its x and y."""
-HALVINGS = 5
-"""Bisection steps on the way to a thing out of reach, which find how near the arm can come."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,36 +192,19 @@ class Person:
     async def guide(self, aim: Pose, *, along_brush: bool = False) -> float:
         """Lift, swing over, lower; return by how many mm the aim was missed because it is out of reach.
 
-        The last stretch leads down, or along the brush.
+        The last stretch leads down, or along the brush; a place that the arm does not reach is passed over.
         """
-        world = self._world
-        here = world.tool()
-        near = world.motion.joints(world.clock.now_s())
+        reached = self._world.tool()
+        near = self._world.motion.joints(self._world.clock.now_s())
         above = _withdrawn(aim) if along_brush else replace(aim, z_mm=aim.z_mm + LIFT_MM)
-        lifted = _withdrawn(here)
-        reached, way = here, list[Joints]()
-        for pose in (lifted, above, aim):
-            joints = self._joints_for(pose, near)
-            if joints is None and pose is not lifted:
-                joints, pose = self._nearest(reached, pose, near)
-            if joints is None:
-                continue  # a stretched arm is not lifted along its brush: it swings over at once
-            way.append(joints)
-            near, reached = joints, pose
+        way: list[Joints] = []
+        for pose in (_withdrawn(reached), above, aim):
+            joints = inverse(matrix_of(pose) @ inverted(self._world.motion.tool), near)
+            if joints is not None:
+                way.append(joints)
+                near, reached = joints, pose
         await self._move(way)
         return math.dist(reached.position_mm, aim.position_mm)
-
-    def _joints_for(self, tip: Pose, near: Joints) -> Joints | None:
-        return inverse(matrix_of(tip) @ inverted(self._world.motion.tool), near)
-
-    def _nearest(self, start: Pose, end: Pose, near: Joints) -> tuple[Joints | None, Pose]:
-        """The joints for the last pose within reach on the straight way to `end`, and that pose, by halving."""
-        best, reached, part = None, start, 0.0
-        for halving in range(1, HALVINGS + 1):
-            pose = interpolate(start, end, part + 0.5**halving)
-            if (joints := self._joints_for(pose, near)) is not None:
-                best, reached, part = joints, pose, part + 0.5**halving
-        return best, reached
 
     async def _move(self, way: list[Joints]) -> None:
         world, motion = self._world, self._world.motion

@@ -210,8 +210,8 @@ class Scene:
         """Pose of the tool now. Advances the world, so only the thread that owns the world may call it."""
         return self._world.tool()
 
-    def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
-        """A (height, width) gray image of the world now; `host_ns` goes into the strip if the view has one.
+    def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
+        """A (height, width) gray image of the world now.
 
         With `tool` given it only reads the world, and may run in another thread. Do not write to the array: it is
         returned again while the picture does not change.
@@ -241,9 +241,6 @@ class Scene:
             if config.view.mirrored:
                 frame = np.ascontiguousarray(frame[:, ::-1])
             self._finished[field] = disc_px, frame
-        if config.view.stamp_strip:
-            frame = frame.copy()
-            draw_strip(frame, host_ns)
         return frame
 
     def _sheet_alone(self, field: int, lit: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -337,24 +334,6 @@ def _draw(
     return raster, [rng.normal(0.0, noise, shape).astype(np.float32) for _ in range(NOISE_FIELDS)]
 
 
-STRIP_BITS = 64
-STRIP_PX = 8
-
-
-def draw_strip(frame: NDArray[np.uint8], host_ns: int) -> None:
-    """Write `host_ns` as 64 black or white blocks into the top rows, in place."""
-    bits = (host_ns >> np.arange(STRIP_BITS, dtype=np.uint64).astype(object)) & 1
-    row = np.repeat(np.where(bits.astype(bool), 255, 0).astype(np.uint8), STRIP_PX)
-    frame[: 2 * STRIP_PX, : row.size] = row
-
-
-def read_strip(frame: NDArray[np.uint8]) -> int:
-    """Read the number that `draw_strip` wrote, also after JPEG compression."""
-    row = frame[STRIP_PX // 2 : STRIP_PX * 3 // 2, : STRIP_BITS * STRIP_PX].mean(axis=0)
-    blocks = row.reshape(STRIP_BITS, STRIP_PX)[:, 2:-2].mean(axis=1) > 127
-    return sum(1 << i for i, bit in enumerate(blocks) if bit)
-
-
 WIDTH_PX, HEIGHT_PX = 640, 480
 WALL, WALL_NOISE = 185, 2.0
 
@@ -370,6 +349,6 @@ class Wall:
         """Pose of the tool now."""
         return self._world.tool()
 
-    def render(self, host_ns: int = 0, tool: Pose | None = None) -> NDArray[np.uint8]:
+    def render(self, tool: Pose | None = None) -> NDArray[np.uint8]:
         """A (480, 640) gray image."""
         return self._noise.normal(WALL, WALL_NOISE, (HEIGHT_PX, WIDTH_PX)).astype(np.uint8)

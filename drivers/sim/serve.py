@@ -23,7 +23,6 @@ import json
 import os
 import signal
 import socket
-import stat
 from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -38,8 +37,6 @@ Person = Callable[[Mapping[str, object]], Awaitable[dict[str, Any]]]
 """Carries out a `hand` request. Raises ValueError, with a one-line message, for an invalid request."""
 MAX_LINE_BYTES = 8192
 MAX_CLIENTS = 16
-MAX_PATH_BYTES = 100
-"""Longest allowed path of a unix socket; the system's limit is slightly higher."""
 USAGE = (
     'not a request: {"do": "add", "fault": {...}}, or "list", "clear" (with a number "id" or without), '
     '"state", "release", "fresh-sheet", "hand"'
@@ -54,24 +51,29 @@ class ControlServer(LoopbackServer):
         self._rig = rig
         self._person = person
         self._path: Path | None = None
-        self._made = (0, 0)
 
     async def open(self, path: Path) -> None:
-        """Listen at `path`, replacing the socket of a rig that has ended. Raises `SimFileError`."""
-        listener = _listener(path)
-        status = path.stat()
-        self._path, self._made = path, (status.st_dev, status.st_ino)
-        self._server = await asyncio.start_unix_server(self._serve, sock=listener, limit=MAX_LINE_BYTES)
+        """Listen at `path` for its owner alone; a socket of a rig that has ended is replaced. Raises `SimFileError`."""
+        if path.exists() and not path.is_socket():
+            raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
+        if _listens(path):
+            raise SimFileError(path, "", "another rig listens here")
+        # Set before the path exists: another user could connect before a later `chmod`.
+        mask = os.umask(0o177)
+        try:
+            self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES)
+        except OSError as error:
+            raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
+        finally:
+            os.umask(mask)
+        self._path = path
 
     async def stop(self) -> None:
         """Close the listener and every client, and remove the socket."""
         await super().stop()
         path, self._path = self._path, None
         if path is not None:
-            with contextlib.suppress(OSError):
-                now = path.lstat()
-                if (now.st_dev, now.st_ino) == self._made:
-                    path.unlink()
+            path.unlink(missing_ok=True)
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer line by line; an overlong line is answered, then the connection is closed."""
@@ -150,41 +152,15 @@ def _line(body: dict[str, Any]) -> bytes:
     return json.dumps(body, separators=(",", ":")).encode() + b"\n"
 
 
-def _listener(path: Path) -> socket.socket:
-    """A bound socket to which only its owner can connect. Raises `SimFileError`."""
-    if len(os.fsencode(path)) > MAX_PATH_BYTES:
-        raise SimFileError(path, "", f"the path of a socket has at most {MAX_PATH_BYTES} bytes")
-    _clear_away(path)
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    # Set before the path exists: another user could connect before a later `chmod`.
-    mask = os.umask(0o177)
-    try:
-        listener.bind(str(path))
-    except OSError as error:
-        listener.close()
-        raise SimFileError(path, "", f"cannot listen here: {error.strerror or error}") from None
-    finally:
-        os.umask(mask)
-    listener.setblocking(False)
-    return listener
-
-
-def _clear_away(path: Path) -> None:
-    """Remove a socket that has no listener; refuse to remove anything else."""
-    try:
-        mode = path.lstat().st_mode
-    except OSError:
-        return
-    if not stat.S_ISSOCK(mode):
-        raise SimFileError(path, "", "exists and is not a socket; it is not overwritten")
+def _listens(path: Path) -> bool:
+    """Whether a rig answers at this socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         try:
             probe.connect(str(path))
         except OSError:
-            path.unlink(missing_ok=True)
-            return
-    raise SimFileError(path, "", "another rig listens here")
+            return False
+    return True
 
 
 def serve(
@@ -215,42 +191,22 @@ def serve(
 
 
 def serve_unknown(
-    seed: int,
-    trap: str | None,
-    rate: float,
-    idle_exit_s: float,
-    tell: Callable[..., None],
-    *,
-    truth: Path | None = None,
-    control: Path | None = None,
+    seed: int, trap: str | None, rate: float, idle_exit_s: float, tell: Callable[..., None], control: Path | None
 ) -> None:
-    """Serve the unknown lab of this seed and print what a person sees there; its truth goes to the file `truth`.
+    """Serve the unknown lab of this seed and print what a person sees there.
 
-    Raises `LabRefused` for an unknown trap or a file that cannot be written, and `SimFileError` for the control socket.
+    Raises `LabRefused` for an unknown trap, and `SimFileError` for the control socket.
     """
     from brushloop.drivers.sim.lab import UnknownLab
     from brushloop.drivers.sim.lab_facts import Trap
-    from brushloop.drivers.sim.lab_facts import truth as truth_of
 
     if trap is not None and trap not in [*Trap]:
         raise LabRefused(f"--trap is {trap!r}, allowed: {', '.join(Trap)}")
-    if truth is not None and truth.exists() and b'"seed"' not in truth.read_bytes()[:100]:
-        raise LabRefused(f"{truth}: exists and is not the truth of a lab; it is not overwritten")
     lab = UnknownLab(seed, None if trap is None else Trap(trap), rate=rate)
-
-    def write_truth() -> None:
-        if truth is not None:
-            _write_whole(truth, json.dumps(truth_of(lab.facts), indent=1) + "\n")
-
-    async def obey(request: Mapping[str, object]) -> dict[str, Any]:
-        answer = await lab.obey(request)
-        write_truth()  # what was mended is no longer as it was
-        return answer
 
     async def served() -> None:
         over = _signalled()
-        async with lab, live_control(lab.rig, control, obey):
-            write_truth()
+        async with lab, live_control(lab.rig, control, lab.obey):
             how = [] if control is None else [f"hand      brushloop hand {control} bring pin"]
             tell(*lab.seen().lines(), *how, "Ctrl-C ends")
             await _until_over(lab.rig, over, idle_exit_s)
@@ -276,7 +232,7 @@ async def _until_over(rig: LoopbackRig, over: asyncio.Event, idle_exit_s: float)
 
 
 class LabRefused(Exception):
-    """No such lab can be served, or its truth cannot be written."""
+    """No such lab can be served."""
 
     exit_code: ClassVar[int] = 2
 

@@ -182,7 +182,7 @@ def _photographed(world: World, anchors: tuple[tuple[float, float], ...]) -> Sho
     scene = Scene(world)
     world.version += 1
     table = world.config.table
-    image = scene.render(0, brush_pose(*world.config.home_mm))
+    image = scene.render(brush_pose(*world.config.home_mm))
     # The arm stands where it hides no corner.
     assert math.isfinite(float(image.mean()))
     return Shot(image, scene.optics, board_of(table), anchors, world.paper.density, table.sheet_mm)

@@ -38,7 +38,7 @@ SPEC, SHEET_MM = board_of(Table()), Table().sheet_mm
 
 def sheet(view: View) -> np.ndarray:
     config = SimConfig(view=view)
-    return Scene(World(config)).render(0, brush_pose(*config.home_mm))
+    return Scene(World(config)).render(brush_pose(*config.home_mm))
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,8 @@ RATE = 20.0
 
 @pytest.fixture
 def small_view() -> View:
-    """A camera image that renders in a few milliseconds, with the time of rendering in its top rows."""
-    return View(width_px=640, height_px=480, px_per_mm=1.95, stamp_strip=True)
+    """A camera image that renders in a few milliseconds."""
+    return View(width_px=640, height_px=480, px_per_mm=1.95)
 
 
 @pytest.fixture

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import math
+import random
 import re
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count, pairwise
 
@@ -19,7 +20,7 @@ from brushloop.drivers.devices import ForceSample, ForceSensor
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected, Stale, Stuck
 from brushloop.drivers.force import sri_m8123
 from brushloop.drivers.force.simulator import CanFrame, ForceBoard
-from brushloop.drivers.force.sri_m8123 import ForceTable, SriM8123, Wrench
+from brushloop.drivers.force.sri_m8123 import FIRST_ID, ForceTable, RoundAssembler, SriM8123, Wrench, encode_round
 from brushloop.drivers.host import HostClock
 from tests.drivers.failing import fail_rounds
 from tests.waiting import until
@@ -286,3 +287,81 @@ async def test_closing_while_averaging_ends_in_an_error(sensor: SriM8123):
     await sensor.close()
     with pytest.raises(NotConnected, match="closed while averaging"):
         await averaging
+
+
+# ---------------------------------------------------------------- the rounds of the force board
+
+
+def feed(parts: RoundAssembler, wrench: Sequence[float], leave_out: int = -1, at_s: float = 0.0) -> list[Wrench]:
+    fx, fy, fz, mx, my, mz = wrench
+    frames = [frame for place, frame in enumerate(encode_round((fx, fy, fz, mx, my, mz))) if place != leave_out]
+    return [whole for can_id, data in frames if (whole := parts.feed(can_id, data, at_s)) is not None]
+
+
+@pytest.mark.parametrize("leave_out", [0, 1, 2])
+def test_each_round_without_one_frame_is_dropped_and_counted_once(leave_out: int):
+    parts = RoundAssembler()
+    assert feed(parts, WRENCH) == [WRENCH]
+    for _ in range(5):
+        assert feed(parts, WRENCH, leave_out) == []
+    assert feed(parts, WRENCH) == [WRENCH]
+    assert (parts.torn, parts.refused) == (5, 0)
+
+
+def test_joining_in_mid_round_is_no_fault_and_a_frame_of_the_wrong_size_tears_its_round():
+    parts, (first, second, third) = RoundAssembler(), encode_round(WRENCH)
+    assert parts.feed(*third, 0.0) is None
+    assert feed(parts, WRENCH) == [WRENCH]
+    assert parts.torn == 0
+    assert [parts.feed(*frame, 0.0) for frame in (first, (second[0], second[1][:4]), third)] == [None] * 3
+    assert parts.torn == 1
+
+
+@pytest.mark.parametrize("bad", [math.nan, -math.inf, -1000.5])
+@pytest.mark.parametrize("axis", range(6))
+def test_what_no_sensor_can_measure_is_refused(axis: int, bad: float):
+    values, parts = list(WRENCH), RoundAssembler()
+    values[axis] = bad
+    assert feed(parts, values) == []
+    assert (parts.torn, parts.refused) == (0, 1)
+    assert feed(parts, WRENCH) == [WRENCH]
+
+
+def injured(rounds: int, rng: random.Random) -> Iterator[tuple[int, bytes, float]]:
+    """A stream of rounds of which some frames are lost, doubled, cut, late, or say what none could measure."""
+    for number in range(rounds):
+        wrench = [rng.choice((rng.uniform(-9, 9), math.nan, math.inf, 3e38)) if rng.random() < 0.1 else 1.0] * 6
+        for can_id, data in encode_round(tuple(wrench)):  # type: ignore[arg-type]
+            late_s = rng.choice((-1.0, 0.006, 1e9, math.nan, math.inf)) if rng.random() < 0.1 else 0.0
+            data = data[: rng.randint(0, 8)] + rng.randbytes(rng.randint(0, 2)) if rng.random() < 0.1 else data
+            can_id = rng.randint(0x28F, 0x295) if rng.random() < 0.1 else can_id
+            yield from [(can_id, data, number * 0.01 + late_s)] * rng.choice((0, 1, 1, 1, 1, 2))
+
+
+def test_any_frames_give_plausible_wrenches_or_nothing_and_then_the_next_round(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sri_m8123, "ROUND_S", 0.005)
+    rng, whole = random.Random(21), 0
+    for _ in range(500):
+        parts = RoundAssembler()
+        for can_id, data, at_s in injured(10, rng):
+            wrench = parts.feed(can_id, data, at_s)
+            if wrench is not None:
+                assert can_id == FIRST_ID + 2, "the last frame completes a round"
+                assert all(math.isfinite(v) and abs(v) <= 1000.0 for v in wrench)
+                whole += 1
+            assert len(parts._values) <= 4, "no more than two frames wait for the third"
+        assert feed(parts, WRENCH, at_s=7.0) == [WRENCH]
+    assert whole > 500
+
+
+def test_with_frames_lost_at_random_every_wrench_is_of_one_round(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sri_m8123, "ROUND_S", 0.005)
+    rng = random.Random(22)
+    for _ in range(500):
+        parts, kept, whole = RoundAssembler(), [[rng.random() > 0.3 for _ in range(3)] for _ in range(8)], 0
+        for number, keeps in enumerate(kept):
+            for keep, frame in zip(keeps, encode_round((float(number),) * 6), strict=True):
+                wrench = parts.feed(*frame, number * 0.010) if keep else None
+                assert wrench is None or set(wrench) == {float(number)}
+                whole += wrench is not None
+        assert whole == kept.count([True, True, True])

@@ -33,8 +33,8 @@ from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.config import SimConfig
-from brushloop.drivers.sim.lab_facts import truth
 from brushloop.drivers.sim.rig import Addresses, rig_toml
+from brushloop.drivers.sim.world import tool_of
 from tests.collect.teach.conftest import Person
 from tests.collect.teach.unknown import InLab, in_lab
 
@@ -95,7 +95,7 @@ async def test_holds_that_were_not_upright_are_named_and_asked_for_again(tmp_pat
     turn = TipStep().derived(day.notebook)["robot.tcp_rotation_deg"]
     assert "12 times" in turn.how
     axis = Rotation.from_euler("ZYX", np.array(turn.value)[::-1], degrees=True).apply([0.0, 0.0, 1.0])
-    true = np.array(truth(person.lab.facts)["tool"]["brush_axis"])
+    true = tool_of(person.lab.facts.config)[:3, 2]
     assert math.degrees(math.acos(float(axis @ true))) < 0.2
 
 

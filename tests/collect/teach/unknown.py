@@ -22,7 +22,8 @@ from brushloop.collect.teach.day import Day, LeftOff, Picture, Shown, Target
 from brushloop.collect.teach.wizard import Wizard
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.lab import Seen, UnknownLab
-from brushloop.drivers.sim.lab_facts import Trap, truth
+from brushloop.drivers.sim.lab_facts import Trap
+from brushloop.drivers.sim.world import tool_of
 from tests.waiting import PATIENCE_S
 
 KIND = {"ink-station": "i", "modbus-pump": "p"}
@@ -183,16 +184,15 @@ class Errors:
 
 def errors(rig_path: Path, lab: UnknownLab) -> Errors:
     """Compare a `rig.toml` with the truth of its lab."""
-    rig, true = load_rig(rig_path), truth(lab.facts)
-    tcp_error = np.array(rig.robot.tcp_offset_mm) - true["tool"]["tcp_offset_mm"]
+    rig, tool = load_rig(rig_path), tool_of(lab.facts.config)
+    tcp_error = np.array(rig.robot.tcp_offset_mm) - 1e3 * tool[:3, 3]
     paper = rig.paper
     x, y = to_base(paper, *paper.touch_point_mm)
     table = lab.facts.config.table
     paper_x, paper_y = lab.world.to_paper(x, y)
     # A brush held upright with a tool that is taken for too long stands that much higher.
-    axis = np.array(true["tool"]["brush_axis"])
-    true_tip_z_mm = paper.touch_z_mm + float(tcp_error @ axis)
-    delay_s = true["camera"]["delay_s"]
+    true_tip_z_mm = paper.touch_z_mm + float(tcp_error @ tool[:3, 2])
+    delay_s = lab.facts.config.view.delay_s + 0.5 * lab.facts.config.view.delay_jitter_s
     return Errors(
         float(np.linalg.norm(tcp_error)),
         math.dist(paper.origin_mm, table.origin_mm),

@@ -349,7 +349,7 @@ async def test_two_rigs_do_not_share_a_socket_and_one_that_is_dead_is_replaced(r
 
 
 async def test_a_path_that_the_system_would_cut_is_refused(rig: LoopbackRig, tmp_path: Path):
-    for path, words in ((tmp_path / ("x" * 120), "at most"), (tmp_path / "no" / "where", "cannot listen here")):
+    for path, words in ((tmp_path / ("x" * 120), "too long"), (tmp_path / "no" / "where", "cannot listen here")):
         with pytest.raises(SimFileError, match=words) as caught:
             await ControlServer(rig).open(path)
         assert caught.value.exit_code == 2

@@ -288,17 +288,6 @@ def test_a_path_held_anywhere_goes_on_along_itself(hold_s: float, acc: float):
         assert distance(a, b)[0] < 1e-6
 
 
-def test_a_slower_fraction_applies_after_the_corner_that_is_planned_and_nothing_is_faster():
-    queue = cornered()
-    queue.pose(0.5)
-    queue.set_fraction(0.25, 0.5)
-    walk = walked_from(queue, 0.5, 8.0)
-    moving = speeds(walk)
-    late = walk[:-1, 2] > 40.0
-    assert moving[late].max() <= 0.25 * V + 1e-6
-    assert tuple(walk[-1, 1:]) == BEYOND.position_mm
-
-
 @pytest.mark.parametrize("blend_mm", [0.0, 20.0])
 def test_a_duration_is_how_long_a_move_takes_rounded_or_not(blend_mm: float):
     queue = MotionQueue(at(0.0), lambda *_: None)

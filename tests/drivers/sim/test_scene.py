@@ -13,7 +13,7 @@ import pytest
 
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.mjpeg_server import _Line
-from brushloop.drivers.sim.scene import Optics, Scene, board, homography, read_strip
+from brushloop.drivers.sim.scene import Optics, Scene, board, homography
 from brushloop.drivers.sim.world import World
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
@@ -79,14 +79,6 @@ def test_the_arm_hides_what_is_under_it():
     assert gray_at(image, 82.0, 74.0) == pytest.approx(70.0, abs=3.0)
 
 
-@pytest.mark.parametrize("host_ns", [0, 2**63 - 1, 1_795_000_000_123_456_789])
-def test_the_time_in_the_top_rows_survives_jpeg(small_view: View, host_ns: int):
-    scene = Scene(World(SimConfig(view=small_view)))
-    _, encoded = cv2.imencode(".jpg", scene.render(host_ns), [cv2.IMWRITE_JPEG_QUALITY, 60])
-    decoded = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
-    assert read_strip(decoded) == host_ns
-
-
 def test_a_frame_rendered_for_a_known_tool_leaves_the_world_alone(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     tool = scene.tool()
 
@@ -94,7 +86,7 @@ def test_a_frame_rendered_for_a_known_tool_leaves_the_world_alone(scene: Scene, 
         raise AssertionError("the world was moved on from the rendering thread")
 
     monkeypatch.setattr(World, "tool", nobody_may_ask)
-    scene.render(0, tool)
+    scene.render(tool)
 
 
 class Loop:

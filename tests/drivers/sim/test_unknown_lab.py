@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -20,7 +19,7 @@ from brushloop.drivers.geometry import from_wire
 from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.sim.kinematics import forward, inverted, matrix_of, pose_of
 from brushloop.drivers.sim.lab import ARCS_PORT, UnknownLab
-from brushloop.drivers.sim.lab_facts import CORNERS, corner, draw, in_picture, truth
+from brushloop.drivers.sim.lab_facts import CORNERS, corner, draw, in_picture
 from brushloop.drivers.sim.serve import LabRefused, live_control
 from brushloop.drivers.sim.world import tool_of
 
@@ -100,11 +99,6 @@ def test_what_is_seen_names_no_truth(lab: UnknownLab):
         assert f"{hidden:.1f}" not in words
 
 
-def test_the_truth_is_json_with_what_a_first_day_finds():
-    known = json.loads(json.dumps(truth(draw(1))))
-    assert {"tool", "config", "corners_mm", "park_mm", "camera"} <= set(known)
-
-
 @pytest.mark.parametrize(
     ("request_", "words"),
     [
@@ -131,21 +125,13 @@ def run(*arguments: str) -> str:
     [
         (("--unknown", "3", "--trap", "loud"), r"--trap is 'loud', allowed: swapped-corner, .*cable-pulled"),
         (("--unknown", "3", "--write-rig", "rig.toml"), "--unknown: can only be combined with --trap"),
-        (("--trap", "force-sign"), "--trap and --truth: need --unknown SEED"),
+        (("--trap", "force-sign"), "--trap: needs --unknown SEED"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(arguments: tuple[str, ...], words: str):
     with pytest.raises(LabRefused, match=words) as refused:
         run("sim", *arguments)
     assert refused.value.exit_code == 2
-
-
-def test_another_file_is_not_overwritten_by_the_truth(tmp_path: Path):
-    mine = tmp_path / "notes.json"
-    mine.write_text("mine")
-    with pytest.raises(LabRefused, match="it is not overwritten"):
-        run("sim", "--unknown", "3", "--truth", str(mine))
-    assert mine.read_text() == "mine"
 
 
 async def test_a_person_at_the_command_line_guides_the_arm(tmp_path: Path):
