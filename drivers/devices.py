@@ -195,8 +195,8 @@ class ForceSensor(Protocol):
         """Open the bus, start the stream and wait for the first sample."""
         ...
 
-    def latest_n(self) -> tuple[float, float, float]:
-        """The newest force in N; never blocks. Raises `Stale`."""
+    def latest(self) -> ForceSample:
+        """The newest sample; never blocks. Raises `Stale`."""
         ...
 
     def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:

@@ -138,7 +138,7 @@ class Engine:
             except DeviceError:
                 pass
             with contextlib.suppress(DeviceError):
-                force_n = math.hypot(*rig.force.latest_n()) if rig.force is not None else None
+                force_n = math.hypot(*rig.force.latest().force_n) if rig.force is not None else None
         if force_n is not None:
             self._telemetry.note_force(force_n, self._clock.now_ns())
         return replace(

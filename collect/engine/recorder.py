@@ -98,7 +98,7 @@ class ForceGuard:
         assert self._rig.force is not None
         assert self._rig.config.force is not None
         while True:
-            self._rig.force.latest_n()
+            self._rig.force.latest()
             try:
                 async with asyncio.timeout(CHECK_S):
                     await self._over.wait()

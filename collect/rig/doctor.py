@@ -129,7 +129,7 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
         identity = await sensor.connect()
         await asyncio.sleep(LISTEN_S)
         age_ms = (clock.now_ns() - sensor.latest().stamp.host_ns) / 1e6
-        force_n, health = math.hypot(*sensor.latest_n()), sensor.health()
+        force_n, health = math.hypot(*sensor.latest().force_n), sensor.health()
     finally:
         await sensor.close()
     problem = remedy = ""

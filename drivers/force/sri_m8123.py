@@ -35,7 +35,6 @@ from brushloop.drivers.errors import (
     ConnectionLost,
     DeviceError,
     DeviceTimeout,
-    LimitExceeded,
     NotConnected,
     Stale,
     Stuck,
@@ -131,9 +130,6 @@ equal by chance, on a sensor that is slow or coarse."""
 STILL_N, STILL_NM = 0.05, 0.01
 """The largest standard deviation, in each axis, at which the sensor counts as still."""
 MIN_BIAS_ROUNDS = 10
-MAX_BIAS_S = 60.0
-MORE_BIAS_S = 1.0
-"""Extra averaging time if too few rounds arrived."""
 NO_BIAS: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -216,9 +212,6 @@ class RoundStream:
         self.collecting: list[Wrench] | None = None
         """Collects every round while an average is taken."""
         self._thread = threading.Thread(target=self._run, name="force reader", daemon=True)
-
-    def start(self) -> None:
-        """Open the bus and read it, in a thread; a failure is stored in `loss`."""
         self._thread.start()
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -360,7 +353,6 @@ class SriM8123:
 
         stream = RoundStream(self._table, self._clock, on_round)
         self._stream = stream
-        stream.start()
         try:
             async with asyncio.timeout(CONNECT_S):
                 await begun.wait()
@@ -375,10 +367,6 @@ class SriM8123:
             await self.close()
             raise
         return stream.identity
-
-    def latest_n(self) -> tuple[float, float, float]:
-        """The newest force in N, less the bias; never blocks. Raises what `latest` raises."""
-        return self.latest().force_n
 
     def latest(self) -> ForceSample:
         """The newest sample; never blocks. Raises `Stale`, `Stuck`, `ConnectionLost`, `NotConnected`."""
@@ -401,26 +389,22 @@ class SriM8123:
     async def bias(self, seconds: float) -> None:
         """Average for `seconds` with nothing touching, and subtract that from now on.
 
-        Raises `DeviceError` if the sensor was not still, `Stale` or `DeviceTimeout` if it sent too little,
-        `LimitExceeded` for a time not in (0, 60] s; the previous bias then remains.
+        Raises `DeviceError` if the sensor was not still, `Stale` or `DeviceTimeout` if it sent too little; the previous
+        bias then remains.
         """
-        if not 0.0 < seconds <= MAX_BIAS_S:
-            raise LimitExceeded(DEVICE, "bias time", seconds, 0.0, MAX_BIAS_S, "s")
         async with self._biasing:
             stream = self._require("bias")
             rounds: list[Wrench] = []
             stream.collecting = rounds
             try:
                 await asyncio.sleep(seconds)
-                if len(rounds) < MIN_BIAS_ROUNDS:  # a busy computer: too few to judge stillness
-                    await asyncio.sleep(MORE_BIAS_S)
             finally:
                 stream.collecting = None
             if self._stream is not stream:
                 raise NotConnected(DEVICE, "bias", "closed while averaging")
             self.latest()
             if len(rounds) < MIN_BIAS_ROUNDS:
-                what = f"{len(rounds)} rounds in {seconds + MORE_BIAS_S:g} s, {MIN_BIAS_ROUNDS} are needed"
+                what = f"{len(rounds)} rounds in {seconds:g} s, {MIN_BIAS_ROUNDS} are needed"
                 raise DeviceTimeout(DEVICE, "bias", what, remedy="Average for longer.")
             axes = zip(*rounds, strict=True)
             fx, fy, fz, mx, my, mz = (self._still_mean(name, axis) for name, axis in zip(AXES, axes, strict=True))

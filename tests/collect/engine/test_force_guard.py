@@ -25,8 +25,8 @@ class Cell:
     def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
         self.say = on_sample or (lambda _: None)
 
-    def latest_n(self) -> tuple[float, float, float]:
-        return 0.0, 0.0, 0.0
+    def latest(self) -> None:
+        pass
 
     async def move(self) -> None:
         self.did.append("line")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import re
 import stat
 import subprocess
@@ -18,11 +17,11 @@ import pytest
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.loopback import FaultRefused, request_of
+from brushloop.drivers.loopback import FaultRefused
 from brushloop.drivers.loopback import ask as ask_rig
 from brushloop.drivers.sim.brush.spec import SimFileError
 from brushloop.drivers.sim.config import SimConfig, Table
-from brushloop.drivers.sim.faults import KINDS, Device, Fault, FaultBoard, Phase, fault_of, phase_of
+from brushloop.drivers.sim.faults import Device, Fault, FaultBoard, Phase, fault_of, phase_of
 from brushloop.drivers.sim.rig import LoopbackRig
 from brushloop.drivers.sim.serve import MAX_LINE_BYTES, ControlServer, live_control
 from brushloop.drivers.sim.world import World
@@ -127,32 +126,17 @@ def test_a_fault_of_ink_begins_by_itself_and_strikes_the_requests_that_follow(wo
     assert strikes == [True, True, False]
 
 
-@pytest.mark.parametrize("device", [Device.INK, Device.FORCE])
-def test_clearing_ends_a_fault_that_has_begun(world: Scripted, device: Device):
-    kind = min(KINDS[device])
-    world.hang(Fault(device=device, kind=kind, count=1000))
-    world.due()
-    assert world.meet(device) is not None
-    assert world.clear() == 1
-    assert world.meet(device) is None
-
-
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
         ({"kind": "loud"}, "kind = 'loud' is not one of robot's: deaf, drop,"),
         ({"device": "coffee"}, "device: Input should be 'robot', 'telemetry'"),
-        ({"device": "camera"}, "is not one of camera's: black, frozen, stale, torn"),
         ({"nht": 3}, "nht: Extra inputs are not permitted"),
         ({"after_s": -1}, "after_s: Input should be greater than or equal to 0"),
-        ({"after_s": math.nan}, "after_s: Input should be"),
-        ({"on": "a b"}, "on: String should match pattern"),
-        ({"phase": "flying"}, "phase: Input should be 'dipping'"),
         ({"count": 1, "for_s": 1.0}, "count and for_s exclude each other"),
         ({"device": "telemetry", "on": "moveLine"}, "only the robot has methods"),
         ({"kind": "protective-stop", "count": 2}, "happens once"),
         ({"kind": "emergency-stop", "nth": 2}, "counts nothing here"),
-        ({"device": "ink", "kind": "mute", "nth": 2}, "counts nothing here"),
         ({"late_s": 1.0}, "late_s goes with kind = 'late' of robot and telemetry only"),
         ({"a\nb\x1b[31m": 1}, "Extra inputs are not permitted"),
     ],
@@ -245,8 +229,7 @@ async def ask(control: ControlServer, path: Path) -> AsyncIterator[Ask]:
 
     async def exchange(request: object) -> dict[str, Any]:
         writer.write((request if isinstance(request, bytes) else json.dumps(request).encode()) + b"\n")
-        async with asyncio.timeout(3.0):
-            return json.loads(await reader.readline())
+        return json.loads(await reader.readline())
 
     yield exchange
     writer.close()
@@ -274,17 +257,12 @@ async def test_the_state_is_what_the_world_knows(ask: Ask):
 
 @pytest.mark.parametrize(
     ("kind", "mode"),
-    [
-        ("protective-stop", SafetyMode.PROTECTIVE_STOP),
-        ("safeguard-stop", SafetyMode.SAFEGUARD_STOP),
-        ("emergency-stop", SafetyMode.ROBOT_EMERGENCY_STOP),
-    ],
+    [("protective-stop", SafetyMode.PROTECTIVE_STOP), ("emergency-stop", SafetyMode.ROBOT_EMERGENCY_STOP)],
 )
 async def test_a_person_ends_a_stop_that_was_asked_for(ask: Ask, kind: str, mode: SafetyMode):
     await ask({"do": "add", "fault": {"device": "robot", "kind": kind}})
-    async with asyncio.timeout(2.0):
-        while (await ask({"do": "state"}))["safety_mode"] != mode:
-            await asyncio.sleep(0.005)
+    while (await ask({"do": "state"}))["safety_mode"] != mode:
+        await asyncio.sleep(0.005)
     assert await ask({"do": "release"}) == {"ok": True, "was": mode.value}
     assert (await ask({"do": "state"}))["safety_mode"] == "Normal"
     assert await ask({"do": "release"}) == {"ok": True, "was": "Normal"}
@@ -292,12 +270,8 @@ async def test_a_person_ends_a_stop_that_was_asked_for(ask: Ask, kind: str, mode
 
 REFUSED: list[tuple[object, str]] = [
     (b"hello", "not JSON"),
-    (b"[" * 5000, "not JSON"),
-    (b"[]", "not a request"),
     ({"do": "explode"}, "not a request"),
     ({"do": "state", "more": 1}, "not a request"),
-    ({"do": "clear", "id": True}, "not a request"),
-    ({"do": "add"}, "not a request"),
     ({"do": "add", "fault": {}}, "Field required"),
 ]
 
@@ -384,13 +358,6 @@ def test_a_person_breaks_the_rig_and_mends_it(served: Path):
     assert refused.stderr.startswith("brushloop: kind = 'loud' is not one of robot's")
     assert refused.stderr.count("\n") == 1
     assert json.loads(brushloop("fault", served, "clear").stdout) == {"taken": 1}
-
-
-def test_the_words_of_a_command_line_become_a_request():
-    assert request_of("state", None, NOTHING) == {"do": "state"}
-    assert request_of("clear", None, NOTHING | {"id": 3}) == {"do": "clear", "id": 3}
-    wanted = {"do": "add", "fault": {"device": "robot", "kind": "mute", "on": "moveLine"}}
-    assert request_of("robot", "mute", NOTHING | {"on": "moveLine"}) == wanted
 
 
 def test_where_no_rig_answers_it_is_said_in_one_line(tmp_path: Path):

@@ -13,18 +13,10 @@ import pytest
 
 from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.mjpeg_server import _Line
-from brushloop.drivers.sim.scene import Optics, Scene, board, homography
+from brushloop.drivers.sim.scene import Scene, board, homography
 from brushloop.drivers.sim.world import World
 
 CONFIG = SimConfig(view=View(width_px=1024, height_px=768, px_per_mm=3.125))
-
-
-def test_a_shadow_takes_light_from_a_part_of_the_sheet_only() -> None:
-    lit, shaded = Optics(View(), 1).light, Optics(View(shadow=0.4), 1).light
-    ratio = shaded / lit
-    assert ratio.min() == pytest.approx(0.6, abs=0.01)
-    assert ratio.max() == pytest.approx(1.0, abs=0.01)
-    assert 0.2 < float((ratio < 0.8).mean()) < 0.8
 
 
 @pytest.fixture(scope="module")

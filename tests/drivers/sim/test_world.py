@@ -147,14 +147,6 @@ def over(table: Table, x_mm: float, y_mm: float, above_mm: float) -> Pose:
     return brush_pose(*table.to_base(x_mm, y_mm, above_mm), heading_deg=table.yaw_deg)
 
 
-def test_the_far_edge_rises_about_x_and_the_right_edge_falls_about_y() -> None:
-    table = Table(slope_deg=(1.0, 0.0))
-    assert table.surface_z_mm(0.0, 100.0) == pytest.approx(120.0 + 100.0 * math.tan(math.radians(1.0)))
-    assert table.surface_z_mm(100.0, 0.0) == 120.0
-    assert Table(slope_deg=(0.0, 1.0)).surface_z_mm(100.0, 0.0) == pytest.approx(118.2545, abs=1e-4)
-    assert np.linalg.norm(LEANING.normal) == pytest.approx(1.0)
-
-
 def test_depth_place_and_tilt_of_a_press_are_the_sheets() -> None:
     world = run([over(LEANING, 120.0, 80.0, above_mm) for above_mm in (60.0, -10.0, 60.0)], table=LEANING)
     [press] = world.presses
