@@ -360,15 +360,12 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
     page = render(
         "written.html.j2",
         **about(header),
-        names=" ".join(record.characters),
-        writings=written.writings,
-        model=plan.model,
-        cell_mm=plan.cell_mm,
+        written=written,
         tables=_tables(written.table_3),
         paper_rows=PAPER_ROWS,
-        characters=[_character(plan, character) for character in written.characters],
-        refused=written.refused,
-        cut=[stroke_id for character in written.characters for stroke_id in character.cut],
+        rounds=functools.partial(_rounds, plan),
+        ink_uri=ink_uri,
+        overlay_uri=overlay_uri,
         ssim_settings=SSIM_SETTINGS,
         picture=png_uri(picture),
         provenance=[*facts, ("compared with", record.software), ("command", command)],
@@ -423,17 +420,8 @@ def _tables(table: Sequence[Table3Row]) -> list[dict[str, Any]]:
     return out
 
 
-def _character(plan: Plan, character: Character) -> dict[str, Any]:
-    """A character as the page shows it."""
-    reference, figure = character.reference[Tone.GRAY], plan.figure(character.name)
+def _rounds(plan: Plan, character: Character) -> tuple[list[Round], list[str]]:
+    """The rounds of learning of a character, these writings last, and the phases that any of them lists."""
+    figure = plan.figure(character.name)
     rounds = [] if figure is None else [*figure.rounds, round_of(figure, character, plan.cell_mm)]
-    return {
-        "rounds": rounds,
-        "phases": [str(phase) for phase in Phase if any(phase in each.lost_percent for each in rounds)],
-        "name": character.name,
-        "reference_name": character.reference_name,
-        "reference": ink_uri(reference),
-        "simulated": ink_uri(character.simulated[Tone.GRAY]),
-        "mean": overlay_uri(character.mean_ink(), reference),
-        "captured": [(name, ink_uri(character.captured[name][Tone.GRAY])) for name in character.ranked()],
-    }
+    return rounds, [str(phase) for phase in Phase if any(phase in each.lost_percent for each in rounds)]

@@ -20,12 +20,12 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from fontTools.pens.basePen import BasePen
+from fontTools.pens.recordingPen import RecordingPen
 from fontTools.svgLib.path import parse_path as follow_svg
 from pydantic import BaseModel, Field, ValidationError
 
 from brushloop.model.characters.plan import Floats, Image, Patch, StrokePath, grid, lengths_along, resampled
-from brushloop.model.outline import Outline
+from brushloop.model.outline import Outline, through
 from brushloop.model.raster import SIZE_PX, coverage
 
 CHARACTERS = Path(__file__).parent / "data"
@@ -90,53 +90,25 @@ def parse_glyph(text: str) -> list[GlyphStroke]:
     return strokes
 
 
-class _Arcs(BasePen):
-    """Collects an outline as parabolas: a line is a straight one, a cubic curve becomes eight."""
-
-    def __init__(self) -> None:
-        super().__init__(None)
-        self.arcs: list[Floats] = []
-        self.loops = 0
-        self._begin = self._at = np.zeros(2)
-
-    def _moveTo(self, pt: tuple[float, float]) -> None:
-        self._begin = self._at = np.array(pt)
-        self.loops += 1
-
-    def _lineTo(self, pt: tuple[float, float]) -> None:
-        if not np.allclose(self._at, pt):
-            self._qCurveToOne(0.5 * (self._at + pt), pt)
-
-    def _qCurveToOne(self, pt1: Floats | tuple[float, float], pt2: tuple[float, float]) -> None:
-        self.arcs.append(np.stack((self._at, pt1, pt2)))
-        self._at = np.array(pt2)
-
-    def _curveToOne(self, pt1: tuple[float, float], pt2: tuple[float, float], pt3: tuple[float, float]) -> None:
-        t = np.linspace(0, 1, 2 * _CUBIC_PIECES + 1)[:, None]
-        p, q, r, s = self._at, np.array(pt1), np.array(pt2), np.array(pt3)
-        on = (1 - t) ** 3 * p + 3 * t * (1 - t) ** 2 * q + 3 * t**2 * (1 - t) * r + t**3 * s
-        start, middle, end = on[:-1:2], on[1::2], on[2::2]
-        self.arcs.extend(np.stack((start, 2 * middle - 0.5 * (start + end), end), axis=1))
-        self._at = s
-
-    def _closePath(self) -> None:
-        x, y = self._begin.tolist()
-        self._lineTo((x, y))
-
-    def _endPath(self) -> None:
-        self._closePath()
-
-
 def parse_path(path: str, field: str) -> Floats:
     """Parse a closed SVG path into arcs (K, 3, 2), counter-clockwise. Raises ValueError that begins with `field`."""
-    pen = _Arcs()
+    pen = RecordingPen()
     try:
         follow_svg(path, pen)
     except (ValueError, IndexError, ArithmeticError) as error:
         raise ValueError(f"{field}: is no SVG path: {str(error)[:60]}") from None
-    if pen.loops > 1 or len(pen.arcs) > MAX_SEGMENTS:
+    moves: list[tuple[str, tuple[tuple[float, float], ...]]] = pen.value
+    arcs, begin, at = list[Floats](), np.zeros(2), np.zeros(2)
+    for name, points in moves:
+        if name == "moveTo":
+            begin = at = np.array(points[0])
+            continue
+        nodes = np.array([at, *(points or (begin,))])
+        arcs += _parabolas(nodes)
+        at = nodes[-1]
+    if sum(name == "moveTo" for name, _ in moves) > 1 or len(arcs) > MAX_SEGMENTS:
         raise ValueError(f"{field}: expected one loop of at most {MAX_SEGMENTS} pieces")
-    loop = np.array(pen.arcs).reshape(-1, 3, 2)
+    loop = np.array(arcs).reshape(-1, 3, 2)
     if not np.all(np.abs(loop) <= 2 * MAX_UNITS):
         raise ValueError(f"{field}: expected coordinates of at most {MAX_UNITS:g}")
     x, y = GlyphStroke(loop, loop[:, 0]).polyline(4).T
@@ -144,6 +116,18 @@ def parse_path(path: str, field: str) -> Floats:
     if abs(area) < 1.0:
         raise ValueError(f"{field}: encloses nothing")
     return loop if area > 0 else np.ascontiguousarray(loop[::-1, ::-1])
+
+
+def _parabolas(nodes: Floats) -> list[Floats]:
+    """A line, a parabola or a cubic curve of (2, 2), (3, 2) or (4, 2) nodes as parabolas: none, one or eight."""
+    if len(nodes) == 2:
+        return [] if np.allclose(*nodes) else [np.stack((nodes[0], nodes.mean(axis=0), nodes[1]))]
+    if len(nodes) == 3:
+        return [nodes]
+    t = np.linspace(0, 1, 2 * _CUBIC_PIECES + 1)[:, None]
+    p, q, r, s = nodes
+    curve = (1 - t) ** 3 * p + 3 * t * (1 - t) ** 2 * q + 3 * t**2 * (1 - t) * r + t**3 * s
+    return list(through(curve[None])[0])
 
 
 def paths_of(strokes: Sequence[GlyphStroke], patch: Patch, step_mm: float) -> list[StrokePath]:

@@ -97,12 +97,9 @@ class Target(_Table):
         x = ANCHOR_SHARE[0] * side_mm + depth * np.tan(np.radians(tilt))
         return np.column_stack((x, np.full_like(x, ANCHOR_SHARE[1] * side_mm)))
 
-    def images(self, inputs: Floats, model: StrokeModel | None = None) -> NDArray[np.float32]:
-        """Exact coverage of (N, 2) inputs, (N, size_px, size_px), drawn by another stroke model if one is given.
-
-        May raise DomainError.
-        """
-        outline = (model or self.stroke_model).profile(*np.asarray(inputs, np.float64).T)
+    def images(self, inputs: Floats) -> NDArray[np.float32]:
+        """Exact coverage of (N, 2) inputs, (N, size_px, size_px). May raise DomainError."""
+        outline = self.stroke_model.profile(*np.asarray(inputs, np.float64).T)
         return coverage(outline, self.origin_mm(inputs, outline), size_px=self.size_px, px_mm=self.px_mm)
 
     def draw(self, count: int, seed: tuple[int, ...]) -> NDArray[np.float32]:
