@@ -80,7 +80,7 @@ class Drag:
     """(len(y_mm), len(x_mm)) from 0 to 1 on the grid of the session; None where its place there is not known."""
 
     @property
-    def only_measured(self) -> str:
+    def why_left_out(self) -> str:
         """The reason why the stroke can be measured, but neither fitted nor predicted; empty if it can."""
         if self.cut:
             return "is cut by the edge of its photograph"
@@ -103,13 +103,13 @@ class Drags:
     @property
     def left_out(self) -> list[Refused]:
         """The strokes that are not `placed`."""
-        reasons = ((drag.stroke.stroke_id, drag.only_measured) for drag in self.strokes)
+        reasons = ((drag.stroke.stroke_id, drag.why_left_out) for drag in self.strokes)
         return [*self.refused, *(refusal for refusal in reasons if refusal[1])]
 
     @cached_property
     def placed(self) -> list[Drag]:
         """The strokes that can be fitted or predicted. Raises `CalibrationError` if there is none."""
-        placed = [drag for drag in self.strokes if not drag.only_measured]
+        placed = [drag for drag in self.strokes if not drag.why_left_out]
         if not placed:
             first = ": {}: {}".format(*self.left_out[0]) if self.left_out else ""
             raise CalibrationError(str(self.session.recording.path), f"holds no stroke with a known path{first}")

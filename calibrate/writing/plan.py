@@ -82,8 +82,8 @@ def plan(request: PlanRequest, _progress: Progress = unseen) -> Written:
     request.out.mkdir(parents=True, exist_ok=True)
     draw(planned, patch.side_mm, request.out / PICTURE)
     figures = tuple(figure for figure, _ in planned)
-    whole = Plan(model=label, planned_by=by, cell_mm=patch.side_mm, software=made_by(), figures=figures)
-    protocol = write_plan(whole, request.repeats, request.out)
+    record = Plan(model=label, planned_by=by, cell_mm=patch.side_mm, software=made_by(), figures=figures)
+    protocol = write_plan(record, request.repeats, request.out)
     return Written(protocol, (*_said(planned, simulated), str(protocol), str(request.out / PICTURE)))
 
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bench import accuracy
-from bench.brushes import DATA
 from brushloop.calibrate.drags import Drag, Drags, commanded_path
 from brushloop.calibrate.drags import fit as drags
 from brushloop.calibrate.drags.fit import LAG, PREDICTED, Kept, different, fit_values, model_of, predicted
@@ -63,14 +60,6 @@ def test_lag_and_width_are_found_again() -> None:
     assert values["settle_mm"].low is None  # the depth is constant along each path
 
 
-def test_only_what_is_free_moves() -> None:
-    elsewhere = drawings(arcs(3, 5), replace(TRUTH, drift_x_mm=0.8, drift_y_mm=-0.6))
-    values = fit_values(elsewhere, TRUTH, {"drift_x_mm": 1.0, "drift_y_mm": 1.0})
-    assert {name: value.value for name, value in values.items()} == pytest.approx(
-        {"drift_x_mm": 0.8, "drift_y_mm": -0.6}, abs=0.1
-    )
-
-
 def test_what_the_model_lacks_is_learned_from_neighbours() -> None:
     """Strokes that lie the higher the more they bend: the correction knows those between the ones that it has seen."""
     moved = repeated(9, 1, [-2, -2, -1, -1, 0, 1, 1, 2, 2])
@@ -107,12 +96,3 @@ def test_the_commanded_path_is_the_curve_of_its_four_control_points() -> None:
     assert path[-1].tolist() == pytest.approx([30.0, 0.0, 0.2 * 18.0])
     assert path[:, 1].max() == pytest.approx(0.75 * 12.0, abs=0.02)
     assert path[:, 2].max() == pytest.approx(0.8 * 18.0)
-
-
-@pytest.mark.skipif(not (DATA / accuracy.BIG).is_dir(), reason="the folder of real strokes is not here")
-@pytest.mark.soak
-@pytest.mark.timeout(3000)
-def test_real_strokes_that_were_never_fitted_are_predicted() -> None:
-    means = accuracy.drags_within(20, draw=0, seed=5)
-    assert means[PREDICTED]["csim"] > means[LAG]["csim"] > 0.82
-    assert means[PREDICTED]["iou"] > 0.70

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing import recorded_figures
 from brushloop.calibrate.writing.learn import (
     FIGURES,
     MARGIN,
@@ -23,7 +20,6 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.characters.plan import Reach, grid, without_tilt
 from brushloop.model.drag import NAMES, Drawings, Footprint, inked
-from brushloop.sessions.records import Header, Source
 from tests.command import brushloop
 
 SIDE_MM = 70.0
@@ -52,18 +48,6 @@ def test_figures_become_a_footprint() -> None:
     assert FootprintArtefact.model_validate(fields | {"values": values}).footprint() == footprint
     with pytest.raises(ValueError, match="fit the session again with `brushloop write fit`"):
         FootprintArtefact.model_validate(fields | {"values": {"drift_along_mm": 0.0}})
-
-
-def test_a_drawn_figure_has_the_strokes_of_its_protocol() -> None:
-    def header(protocol: str) -> Header:
-        return Header(session_id="s", source=Source.LOOPBACK, software="test", protocol=protocol)
-
-    points = [[1.0, 2.0, 3.0, 4.0, 90.0], [5.0, 6.0, 7.0, 8.0, 90.0]]
-    protocol = {"kind": "write", "figures": [{"name": "yong", "strokes": [{"points": points}, {"points": points}]}]}
-    figures = recorded_figures(header(json.dumps(protocol)))
-    assert [path.tolist() for path in figures["yong"]] == [points, points]
-    with pytest.raises(CalibrationError, match="was not collected by a `write` protocol"):
-        recorded_figures(header('{"kind": "grid"}'))
 
 
 def test_a_file_that_is_no_footprint_is_one_line(tmp_path: Path) -> None:

@@ -111,17 +111,6 @@ def test_the_report_lists_rounds_and_what_each_phase_lost(after: Plan, tmp_path:
     assert "<td>initiation, hidden tip</td>" in page
 
 
-def test_a_correction_stays_within_reach(plan: Plan) -> None:
-    blob = np.zeros((128, 128), np.float32)
-    blob[0:20, 0:20] = 1.0
-    made = learned(session(plan, ink=blob))
-    [command], reach = made.figures[0].strokes, made.planned_by.reach
-    assert command[:, 2].min() >= reach.depth_mm[0]
-    assert command[:, 2].max() <= reach.depth_mm[1]
-    assert np.all((command[:, :2] >= 0.0) & (command[:, :2] <= SIDE_MM))
-    assert np.all(np.linalg.norm(np.diff(command[:, :3], axis=0), axis=1) >= 1.0)
-
-
 def test_a_character_that_was_not_captured_teaches_nothing(plan: Plan) -> None:
     with pytest.raises(CalibrationError, match="shows no 'bar'"):
         learned(session(plan, "other"))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.writing import PROTOCOL, PlannedBy
+from brushloop.calibrate.writing import PROTOCOL
 from brushloop.calibrate.writing.plan import PICTURE, PlanRequest, plan, pressed, read_wanted
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
@@ -27,33 +27,25 @@ PATCH = Patch()
 BAR = {"strokes": ["M 100 400 L 900 400 L 900 480 L 100 480 Z"], "medians": [[[110, 440], [890, 440]]]}
 
 
-def test_the_command_writes_a_protocol_and_a_picture(tmp_path: Path) -> None:
-    ran = brushloop("write", "plan", "子", "--out", "plan", "--steps", "3", "--repeats", "2", cwd=tmp_path)
+def test_the_command_writes_a_protocol_within_reach_and_a_picture(tmp_path: Path) -> None:
+    options = ["--steps", "2", "--repeats", "2", "--depth-range", "1", "5", "--tilt-range", "0", "6"]
+    ran = brushloop("write", "plan", "字永", "--out", "plan", *options, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert "not ink" in ran.stdout
     protocol = load_protocol(tmp_path / "plan" / PROTOCOL)
     assert isinstance(protocol, WriteConfig)
     assert protocol.repeats == 2
-    assert [figure.name for figure in protocol.figures] == ["子"]
-    assert len(protocol.figures[0].strokes) == 3
+    assert [(figure.name, len(figure.strokes)) for figure in protocol.figures] == [("字", 6), ("永", 5)]
+    for stroke in (stroke for figure in protocol.figures for stroke in figure.strokes):
+        points = np.array(stroke.points)
+        assert points[:, 2].min() >= 1.0
+        assert points[:, 2].max() <= 5.0
+        assert points[:, 3].max() <= 6.0
+        turned = np.abs(np.diff(points[:, 4]))
+        assert np.all(turned <= 12.0 * np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1) + 0.05)
     picture = cv2.imread(str(tmp_path / "plan" / PICTURE))
     assert picture is not None
     assert picture.shape[1] == 1200
-
-
-def test_every_shipped_character_becomes_a_protocol_within_reach(tmp_path: Path) -> None:
-    by = PlannedBy(depth_range_mm=(1.0, 5.0), tilt_range_deg=(0.0, 6.0))
-    written = plan(PlanRequest("字永", tmp_path / "plan", by, steps=2))
-    protocol = load_protocol(written.path)
-    assert isinstance(protocol, WriteConfig)
-    for figure in protocol.figures:
-        for stroke in figure.strokes:
-            points = np.array(stroke.points)
-            assert points[:, 2].min() >= 1.0
-            assert points[:, 2].max() <= 5.0
-            assert points[:, 3].max() <= 6.0
-            turned = np.abs(np.diff(points[:, 4]))
-            assert np.all(turned <= 12.0 * np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1) + 0.05)
 
 
 def test_refinement_raises_both_scores() -> None:

@@ -15,7 +15,6 @@ from brushloop.model.characters.plan import (
     first_lead,
     grid,
     lead,
-    phase_map,
     phases_of,
     resampled,
 )
@@ -121,12 +120,3 @@ def test_a_stroke_is_divided_into_phases() -> None:
     assert Phase.EXECUTION in phases
     back = StrokePath(np.array([[x, 0.0] for x in range(10)] + [[8.0 - x, 1.0] for x in range(8)]), np.full(18, 1.0))
     assert Phase.FOLDING in phases_of(back)
-
-
-def test_every_pixel_belongs_to_the_phase_that_is_nearest() -> None:
-    where = phase_map([hook()], SIDE_MM, SIZE_PX)
-    order = list(Phase)
-    px = SIZE_PX / SIDE_MM
-    assert order[where[int((SIDE_MM - 36.0) * px), int(12.0 * px)]] is Phase.INITIATION_HIDDEN
-    assert order[where[int((SIDE_MM - 36.0) * px), int(23.0 * px)]] is Phase.EXECUTION
-    assert order[where[int((SIDE_MM - 21.5) * px), int(29.5 * px)]] is Phase.TERMINATION_EXPOSED
