@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -18,23 +17,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.calibrate.artefact import load_artefact
-from brushloop.calibrate.compare.place import Field, brush_of
+from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import write_whole
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import student_95
-from brushloop.model.fitted import NAMES, fitted_model
 from brushloop.model.inversion import Flag, Inverter, Range
-from brushloop.model.strokes import stroke_model
 from brushloop.sessions.disk import csv_text
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, unseen
 
 PROTOCOL = "protocol-replay.toml"
-MAX_ROWS = 10_000
 COLUMNS = (
     "stroke_id", "depth_mm", "tilt_deg", "depth_sd_mm", "tilt_sd_deg", "rms", "flags",
     "commanded_depth_mm", "commanded_tilt_deg", "source",
@@ -49,8 +44,6 @@ MOST = 0.8
 """Share of that range from which on an interval is not informative."""
 USELESS = frozenset({Flag.BLANK, Flag.DID_NOT_CONVERGE, Flag.CUT})
 """Flags that exclude a stroke: it is listed with the reason and not pressed again."""
-NAMEABLE = re.compile(r"[^ /\\<>:\"|?*.~-][^ /\\<>:\"|?*]{0,99}")
-"""What a protocol takes as the name of a stroke."""
 Floats = NDArray[np.float64]
 LEAST_CONDITIONS = 3
 """With fewer other conditions, the model error is unknown."""
@@ -174,28 +167,19 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     count, refused = len(session.strokes), list[Refused]()
     most = min(count, request.presses or count)
     chosen = {session.strokes[number * count // most].stroke_id for number in range(most)}
-    presses = read_presses(session, Field(), refused, cut, unnameable, chosen=chosen, progress=progress)
+    presses = read_presses(session, Field(), refused, cut, chosen=chosen, progress=progress)
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
     recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, out)
     _write(recovered, request.repeats, request.seed)
     return recovered
 
 
-def unnameable(press: Press) -> str:
-    """Refuse a press of a name that a protocol cannot repeat."""
-    name = press.stroke.stroke_id
-    return "" if NAMEABLE.fullmatch(name) and name.isprintable() else "its name cannot stand in a protocol"
-
-
 def _inverter(request: RecoverRequest, session: OpenSession) -> tuple[Inverter, Collection[Condition]]:
     """The inverter, and the conditions that its brush was fitted to."""
-    model, least_mm, fitted = stroke_model("ccd-bsm", brush_of(session.header)), 0.0, set[Condition]()
-    if request.fit is not None:
-        artefact = load_artefact(request.fit, BrushFit)
-        press = artefact.press()
-        # A fitted brush marks nothing above its zero offset.
-        model, least_mm = fitted_model(press), 0.5 - float(press.values[NAMES.index("h0_mm")])
-        fitted = {Condition(*cell) for cell in artefact.cells}
+    model, fit = BrushFit.model_of(request.fit, session.header)
+    # A fitted brush marks nothing above its zero offset.
+    least_mm = 0.0 if fit is None else 0.5 - fit.parameters["h0_mm"]
+    fitted = set[Condition]() if fit is None else {Condition(*cell) for cell in fit.cells}
     low_mm, high_mm = request.depth_range_mm
     try:
         within = Range((max(low_mm, least_mm), high_mm), request.tilt_range_deg)
@@ -213,9 +197,6 @@ def _write(recovered: Recovered, repeats: int, seed: int) -> None:
     if not recovered.rows:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(where, f"no stroke could be recovered{why}")
-    count = len(recovered.rows) * repeats
-    if count > MAX_ROWS:
-        raise CalibrationError(where, f"{count} strokes with repeats, a protocol holds at most {MAX_ROWS}")
     recovered.out.parent.mkdir(parents=True, exist_ok=True)
     write_whole(recovered.out, csv_text(COLUMNS, recovered.csv_rows()))
     header = recovered.session.header

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from brushloop.calibrate.artefact import load_artefact, made_by
+from brushloop.calibrate.artefact import made_by
 from brushloop.calibrate.compare import MM_PER_PX
 from brushloop.calibrate.compare.place import (
     KEYS,
@@ -25,7 +25,6 @@ from brushloop.calibrate.compare.place import (
     Key,
     Pixels,
     Tone,
-    brush_of,
     simulated,
 )
 from brushloop.calibrate.errors import CalibrationError
@@ -67,7 +66,6 @@ NOT_AGAIN = "was not pressed again"
 HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), KEYS.index((Alignment.MM, Tone.GRAY))
 SHEET_ROWS = slice(32, 96)
 """Rows shown, the middle half: a press is at most half as thick as the field is high."""
-MAX_PAIRS_SHOWN = 150
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +191,7 @@ def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
     if repeated != first.header.session_id:
         what = "is not a replay" if repeated is None else f"repeats {repeated}"
         raise CalibrationError(where, f"{what}, not {first.header.session_id}")
-    model, fitted_to = _model(first.header, request.fit)
+    model, fit = BrushFit.model_of(request.fit, first.header)
     refused: list[Refused] = []
     originals, repetitions = (
         list(read_presses(session, view, refused, uncommanded, too_thin, progress=progress))
@@ -211,7 +209,7 @@ def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
         again=second.header.session_id,
         again_sha256=second.sha256,
         model=model.label,
-        in_sample=fitted_to == first.sha256,
+        in_sample=fit is not None and fit.recording_sha256 == first.sha256,
         mm_per_px=view.mm_per_px,
         pairs=len(pairs),
         goal_points=GOAL_POINTS,
@@ -286,22 +284,9 @@ def verdicts(scores: Scores) -> Iterator[Verdict]:
 def _replayed(header: Header) -> str | None:
     """The session that a replay protocol repeats; None for any other."""
     try:
-        protocol: Any = json.loads(header.protocol)
-        return str(protocol["of"]) if protocol["kind"] == "replay" else None
-    except (ValueError, KeyError, TypeError, RecursionError):
+        return json.loads(header.protocol).get("of")
+    except (ValueError, AttributeError):  # an import has none
         return None
-
-
-def _model(header: Header, fit: Path | None) -> tuple[StrokeModel, str]:
-    """The model and the digest of the recording that it was fitted to, empty for none."""
-    if fit is None:
-        from brushloop.model.strokes import stroke_model
-
-        return stroke_model("ccd-bsm", brush_of(header)), ""
-    artefact = load_artefact(fit, BrushFit)
-    from brushloop.model.fitted import fitted_model
-
-    return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact.recording_sha256
 
 
 def write_loop(
@@ -328,8 +313,7 @@ def write_loop(
         beside=(TABLE, FILE),
         tables=[(key, record.rows(key)) for key in KEYS],
         paper=TABLE_1[ROBOT_WRITING],
-        rows=[_shown(pairs[k], percent[k]) for k in worst_first[:MAX_PAIRS_SHOWN]],
-        not_shown=max(0, len(pairs) - MAX_PAIRS_SHOWN),
+        rows=[_shown(pairs[k], percent[k]) for k in worst_first],
         ssim_settings=SSIM_SETTINGS,
         provenance=[*facts, made],
     )

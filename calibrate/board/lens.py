@@ -5,7 +5,7 @@ A fit says what each photograph contributes, which ones do not fit, and what els
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -44,8 +44,6 @@ GRID_WORDS = (
 )
 LEAST_SLANT_DEG = 15.0
 """Boards seen face on determine only the ratio of focal length and distance."""
-SAME_SHARE = 0.0015
-"""Share of the image's longer side below which two corners differ only by noise: 1 px of 640."""
 DISTINCT_DEG = 5.0
 """Boards turned by less count as one orientation: parallel planes determine a focal length no better than one does."""
 ROUNDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
@@ -177,7 +175,7 @@ class LensFile(Artefact):
     dropped: dict[str, float]
     """Views left out as outliers, with their residuals."""
     unusable: dict[str, str]
-    """Photographs that show no board, or nothing new, and the reason."""
+    """Photographs that show no board, and the reason."""
     slants_deg: dict[str, float]
     """Angle of each kept board from face on."""
     guidance: tuple[str, ...]
@@ -236,12 +234,10 @@ def fit_lens(
     `board` describes the board, `photographs` are names and sha256 of all that were given. Raises `CalibrationError`
     for fewer than `LEAST_VIEWS` views that differ, and for photographs of several sizes.
     """
-    seen, left_out = distinct_views(views)
-    left_out = {**unusable, **left_out}
-    useless = [f"{name}: {why}" for name, why in left_out.items()]
+    useless = [f"{name}: {why}" for name, why in unusable.items()]
     where = f"{len(views) + len(unusable)} photographs"
-    _one_size(seen, where)
-    kept, dropped = list(seen), dict[str, float]()
+    _one_size(views, where)
+    kept, dropped = list(views), dict[str, float]()
     while True:
         if len(kept) < LEAST_VIEWS:
             out = f", dropped: {', '.join(sorted(dropped))}" if dropped else ""
@@ -273,7 +269,7 @@ def fit_lens(
         rms_px=solved.rms_px,
         residuals_px={view.name: float(r) for view, r in zip(kept, residuals, strict=True)},
         dropped=dropped,
-        unusable=left_out,
+        unusable=dict(unusable),
         slants_deg=slants,
         guidance=guidance(kept, list(slants.values()), int(ways.max()) + 1),
         warnings=tuple(warnings),
@@ -331,18 +327,6 @@ def guidance(views: Sequence[BoardView], slants_deg: Sequence[float], ways: int 
     return tuple(wanted)
 
 
-def distinct_views(views: Iterable[BoardView]) -> tuple[list[BoardView], dict[str, str]]:
-    """The views that show the board in a new place, and for every other view the one that it repeats."""
-    kept, again = list[BoardView](), dict[str, str]()
-    for view in views:
-        twin = next((one for one in kept if _same(one, view)), None)
-        if twin is None:
-            kept.append(view)
-        else:
-            again[view.name] = f"shows the board where {twin.name} does: they count once"
-    return kept, again
-
-
 def held(normals: Floats) -> Ways:
     """(n,) index of each board's orientation, from the (n, 3) unit normals of the boards."""
     first, ways = list[Floats](), list[int]()
@@ -366,11 +350,3 @@ def nominal_normals(views: Sequence[BoardView]) -> Floats:
         normal = np.cross(across, along)
         normals.append(normal / (np.linalg.norm(normal) * (-1.0 if normal[2] < 0.0 else 1.0)))
     return np.array(normals)
-
-
-def _same(one: BoardView, other: BoardView) -> bool:
-    shared, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
-    if one.size_px != other.size_px or 2 * len(shared) < min(len(one.ids), len(other.ids)):
-        return False
-    apart = np.linalg.norm(one.pixels[here] - other.pixels[there], axis=1)
-    return bool(np.median(apart) < SAME_SHARE * max(one.size_px))

@@ -14,9 +14,9 @@ from typing import Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from brushloop.calibrate.artefact import SessionFit, made_by, put_to_use
+from brushloop.calibrate.artefact import SessionFit, load_artefact, made_by, put_to_use
 from brushloop.calibrate.compare import MM_PER_PX
-from brushloop.calibrate.compare.place import Field
+from brushloop.calibrate.compare.place import Field, brush_of
 from brushloop.calibrate.fit.captures import (
     FEWEST_CELLS,
     SPREAD_MM,
@@ -52,14 +52,15 @@ from brushloop.calibrate.report import (
 )
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, is_near
 from brushloop.model.ccdbsm import DomainError
-from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress
+from brushloop.model.fitted import MODES, NAMES, TERMS, FittedPress, fitted_model
 from brushloop.model.outline import Outline
 from brushloop.model.similarity import csim
+from brushloop.model.strokes import StrokeModel, stroke_model
+from brushloop.sessions.records import Header
 from brushloop.sessions.terminal import Progress, unseen
 
 FOLDER = "brushfit"
 """Folder of a session that holds its fits."""
-MAX_CELLS = 48
 MARGIN_MM = 1.5
 SMOOTH_POINTS = 24
 
@@ -84,6 +85,17 @@ class BrushFit(SessionFit):
         """The fitted brush."""
         values = np.array([self.parameters[name] for name in NAMES])
         return FittedPress(self.radius_mm, self.length_mm, values, np.array(self.edges_mm), np.array(self.ends_mm))
+
+    @classmethod
+    def model_of(cls, fit: Path | None, header: Header) -> tuple[StrokeModel, BrushFit | None]:
+        """The model of a fit and the fit itself; without one, CCD-BSM as published for the brush of a recording.
+
+        Raises `CalibrationError`.
+        """
+        if fit is None:
+            return stroke_model("ccd-bsm", brush_of(header)), None
+        artefact = load_artefact(fit, cls)
+        return fitted_model(artefact.press(), f"CCD-BSM fitted on {artefact.session_id}"), artefact
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -185,18 +197,15 @@ def _write_page(
     """Write the page of the fit at `path` beside it; returns the page's path. Raises OSError."""
     session = captures.session
     header = session.header
-    frame = about(header)
     cells = by_cell(captures.strokes)
     published = FittedPress(captures.radius_mm, captures.length_mm)
-    step = max(1, -(-len(cells) // MAX_CELLS))
     return write_page(
         path.with_suffix(".html"),
         "fit.html.j2",
-        **frame,
+        **about(header),
         session=header.session_id,
         window=_window(captures, (press, published)),
-        cells=[_cell(cell, cells[cell], press, published, captures.grid) for cell in list(cells)[::step]],
-        left_out=len(cells) - len(range(0, len(cells), step)),
+        cells=[_cell(cell, strokes, press, published, captures.grid) for cell, strokes in cells.items()],
         verdict=list(_verdict(captures, held_out)),
         trust=[source_point(header.source), *_trust(captures, held_out)],
         chart=_chart(captures, press),

