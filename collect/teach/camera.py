@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from brushloop.calibrate.board.detect import find_board
 from brushloop.calibrate.board.lens import (
     GOOD_VIEWS,
-    distinct_views,
     fit_lens,
     guidance,
     held,
@@ -241,10 +240,9 @@ class CameraStep(Step):
 
 def still_missing(views: Sequence[BoardView]) -> tuple[str, ...]:
     """Instructions for further photographs; empty where the views suffice. At least one view."""
-    distinct, _ = distinct_views(views)
-    normals = nominal_normals(distinct)
+    normals = nominal_normals(views)
     slants_deg = np.degrees(np.arccos(np.clip(normals[:, 2], -1.0, 1.0))).tolist()
-    return guidance(distinct, slants_deg, int(held(normals).max()) + 1)
+    return guidance(views, slants_deg, int(held(normals).max()) + 1)
 
 
 def board_of(notebook: Notebook) -> BoardSpec:
