@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import inspect
 import itertools
 import os
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,11 +21,10 @@ import pytest
 from brushloop.collect import start
 from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.open_or_resume import Opening
-from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.operator import Prompt
 from brushloop.collect.rig import devices
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
+from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.camera.source import CameraTable
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import DeviceTimeout
@@ -39,7 +36,8 @@ from brushloop.drivers.sim.faults import Device
 from brushloop.drivers.sim.rig import Addresses, LoopbackRig, rig_toml
 from brushloop.drivers.sim.world import SimClock
 from tests.command import brushloop
-from tests.simulated_time import MemoryLoop, SimulatedTime, Turns
+from tests.runs import SteppedEngine, end, wait_for_end
+from tests.simulated_time import MemoryLoop, SimulatedTime
 from tests.waiting import PATIENCE_S
 
 SMALL_VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=15.0)
@@ -57,6 +55,8 @@ BENT_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125, fps=12.0, k1=-0.
 """Of a whole sheet, through a lens that distorts by ten pixels and more."""
 COARSE = SimConfig(rate=60.0, view=SMALL_VIEW, force_hz=100.0)
 """A camera too coarse to judge ink by."""
+BARE = SimConfig(rate=300.0, view=SMALL_VIEW, ink_device="none", force_sensor=False)
+"""The same, without ink device and force sensor, and fast."""
 SHARP = SimConfig(rate=60.0, view=SHARP_VIEW, table=SMALL_TABLE)
 OPTIONS = ("--out", "--config", "--protocol")
 
@@ -244,9 +244,15 @@ class WirelessRig(LoopbackRig):
             for server, port in ((self.arcs, PORTS["arcs_port"]), (self.rtde, PORTS["rtde_port"])):
                 await server.start(self.address, port)
                 stack.push_async_callback(server.stop)
+            stack.push_async_callback(self._watched)
             watching = asyncio.create_task(self.faults.watch(self.arcs.cabinet.safety_stop), name="faults")
             stack.callback(watching.cancel)
             yield await stack.enter_async_context(connected(config, clock, on_notice))
+
+    async def _watched(self) -> None:
+        """What the driver could not stop is stopped by the controller's watchdog."""
+        while self.arcs.cabinet.watchdogs:
+            await asyncio.sleep(0.1)
 
 
 class SceneCamera:
@@ -329,31 +335,12 @@ class MemoryLine:
         pass
 
 
-class SteppedEngine(Engine):
-    """An engine that stands still unless its test waits for it."""
-
-    def __init__(self, rig: RigConfig, protocol: Any, open_store: Any, clock: Any, **options: Any) -> None:
-        super().__init__(rig, protocol, open_store, clock, **options)
-        self.turns = Turns(clock)
-        self._loop: MemoryLoop | None = None
-
-    def new_event_loop(self) -> asyncio.AbstractEventLoop:
-        self._loop = MemoryLoop(self.turns.time, self.turns.idle)
-        return self._loop
-
-    def meanwhile(self, work: Coroutine[Any, Any, _R]) -> _R:
-        """Do this in the loop of the run, as somebody else beside it, while the run goes on."""
-        assert self._loop is not None
-        doing = asyncio.run_coroutine_threadsafe(work, self._loop)
-        self.turns.wait_until(doing.done, lambda: self.finished)
-        return doing.result(timeout=0.0)
-
-
 @contextlib.contextmanager
 def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     """A lab whose runs, within the block, need neither wires nor time; write its files with `coarse` or `sharp`."""
     rig = WirelessRig(config)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", 1.0)  # nobody waits for a busy machine here
         patch.setattr("brushloop.collect.engine.engine.connected", rig.connected)
         patch.setattr(Engine, "new_event_loop", staticmethod(lambda: MemoryLoop(rig.time)))
         patch.setattr(start, "HostClock", lambda: rig.time)
@@ -362,86 +349,3 @@ def wireless_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
         yield lab
         for engine in lab.engines:
             end(engine)
-
-
-def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> Snapshot:
-    """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
-    met: list[Snapshot] = []
-
-    def looked() -> bool:
-        now = engine.snapshot()
-        met.extend([now] if condition(now) else [])
-        return bool(met)
-
-    in_time = _wait(engine, looked)
-    if not met:
-        why = "the run ended" if engine.finished else "the run went on" if in_time else "time ran out"
-        pytest.fail(f"{why} while a test waited for {_source(condition)}: {engine.snapshot()}")
-    return met[0]
-
-
-def wait_for_end(engine: Engine) -> None:
-    """Wait until the run is over, and raise what ended it; stops the run and fails where it does not end in time."""
-    if not _wait(engine, lambda: False):
-        now = engine.snapshot()
-        end(engine)
-        pytest.fail(f"a test waited in vain for the end of the run; it is: {now}")
-    engine.join()
-
-
-def question(engine: Engine, words: str = "") -> Prompt:
-    """The next open question that holds these words."""
-    prompt = until(engine, lambda now: now.prompt is not None and words in now.prompt.question).prompt
-    assert prompt is not None
-    return prompt
-
-
-def answer(engine: Engine, words: str, key: str) -> None:
-    """Answer the next question that holds these words."""
-    number = question(engine, words).number
-    assert engine.answer(number, key)
-    until(engine, lambda now: now.prompt is None or now.prompt.number != number)
-
-
-def answered_alike(engine: Engine, key: str) -> list[str]:
-    """Run to the end, answering every question the same way; the questions. Raises what ended the run."""
-    questions: dict[int, str] = {}
-
-    def answering() -> bool:
-        prompt = engine.snapshot().prompt
-        if prompt is not None and prompt.number not in questions:
-            questions[prompt.number] = prompt.question
-            assert engine.answer(prompt.number, key)
-        return False
-
-    engine.start()
-    _wait(engine, answering)
-    wait_for_end(engine)
-    return list(questions.values())
-
-
-def end(engine: Engine) -> None:
-    """Stop a run that a test has left."""
-    if not engine.finished:
-        engine.stop()
-    if isinstance(engine, SteppedEngine):
-        engine.turns.end()
-
-
-def _wait(engine: Engine, met: Callable[[], bool]) -> bool:
-    """Wait until the condition is met or the run is over; False where neither comes in time."""
-    if isinstance(engine, SteppedEngine):
-        return engine.turns.wait_until(met, lambda: engine.finished)
-    deadline = time.monotonic() + PATIENCE_S
-    while not met() and not engine.finished:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
-
-
-def _source(condition: Callable[[Snapshot], bool]) -> str:
-    try:
-        return inspect.getsource(condition).strip()
-    except OSError:
-        return repr(condition)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import selectors
-import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -17,10 +16,6 @@ LATENCY_S = 2e-4
 """The same where there are sockets: a call over a network takes a few of these."""
 SETTLE_SHARE = 0.05
 """Share of a jump that is really waited for where there are sockets: a busy system may deliver a little later."""
-PATIENCE_S = 600.0
-"""Simulated time that a test waits for anything."""
-LOOK_S = 0.05
-"""Real time between two looks at whether a run is over that no longer takes turns."""
 
 _R = TypeVar("_R")
 
@@ -173,52 +168,3 @@ class MemoryTransport(asyncio.Transport):
 
     def pause_reading(self) -> None:
         raise NotImplementedError
-
-
-class Turns:
-    """A test and a run in another thread take turns: the run goes on while the test waits for it, and stands still from
-    the moment at which what the test waits for is so."""
-
-    def __init__(self, time: SimulatedTime) -> None:
-        self.time = time
-        self._turn = threading.Condition()
-        self._met: Callable[[], bool] | None = None
-        self._until_s = 0.0
-        self._error: BaseException | None = None
-        self._over = False
-
-    def idle(self) -> None:
-        """For the loop of the run, whenever all of its tasks wait: stand still while it is the test's turn."""
-        with self._turn:
-            while not self._over and (self._met is None or self._is_met(self._met)):
-                self._met = None
-                self._turn.notify_all()
-                self._turn.wait()
-
-    def end(self) -> None:
-        """For the test: from now on the run does not stand still."""
-        with self._turn:
-            self._over = True
-            self._turn.notify_all()
-
-    def wait_until(self, met: Callable[[], bool], run_is_over: Callable[[], bool]) -> bool:
-        """For the test: let the run go on until the condition is met, or the run is over.
-
-        False where neither is so after `PATIENCE_S`. Raises what the condition raises.
-        """
-        with self._turn:
-            self._met, self._until_s, self._error = met, self.time.now_s + PATIENCE_S, None
-            self._turn.notify_all()
-            while self._met is not None and not run_is_over():
-                self._turn.wait(LOOK_S)
-            self._met = None
-        if self._error is not None:
-            raise self._error
-        return self.time.now_s <= self._until_s
-
-    def _is_met(self, met: Callable[[], bool]) -> bool:
-        try:
-            return met() or self.time.now_s > self._until_s
-        except BaseException as error:
-            self._error = error
-            return True

@@ -37,7 +37,8 @@ from brushloop.model import strokes
 from brushloop.model.ccdbsm import Brush
 from brushloop.model.raster import coverage
 from brushloop.model.strokes import stroke_models
-from tests.rigs import SHARP_VIEW, SMALL_TABLE, serving, wait_for_end
+from tests.rigs import SHARP_VIEW, SMALL_TABLE, serving
+from tests.runs import wait_for_end
 from tests.waiting import PATIENCE_S
 
 RECIPES = Path(__file__).resolve().parent.parent / "examples" / "recipes"

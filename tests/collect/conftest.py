@@ -13,7 +13,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.force import sri_m8123 as stream
 from brushloop.drivers.sim.config import SimConfig
 from tests import rigs
-from tests.rigs import BENT_VIEW, COARSE, SHARP, Lab
+from tests.rigs import BARE, BENT_VIEW, COARSE, SHARP, Lab
 from tests.waiting import PATIENCE_S
 
 RPC_TIMEOUT_S = 10.0
@@ -45,6 +45,14 @@ def bent_lab(tmp_path: Path) -> Iterator[Lab]:
     """One stroke on a whole sheet, through a lens that distorts; no lens file is named yet."""
     with rigs.wireless_lab(tmp_path, SimConfig(rate=60.0, view=BENT_VIEW)) as lab:
         yield rigs.sharp(lab, latency_ms=500)
+
+
+@pytest.fixture
+def bare_lab(tmp_path: Path) -> Iterator[Lab]:
+    """One stroke by an arm and a camera alone, fast."""
+    with rigs.wireless_lab(tmp_path, BARE) as lab:
+        rigs.coarse(lab).write_protocol("[15.0]", dwell_s=1.0)
+        yield lab
 
 
 @pytest.fixture

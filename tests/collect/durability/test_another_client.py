@@ -9,7 +9,8 @@ import math
 import random
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -17,19 +18,17 @@ import pytest
 from brushloop.collect.errors import StepVoid
 from brushloop.collect.motion import Procedures
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.devices import connected
 from brushloop.collect.rig.paper import Patch, Sheet, to_base
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ArmMoved, PathDisturbed
 from brushloop.drivers.geometry import brush_pose, to_wire
-from brushloop.drivers.host import HostClock
+from brushloop.drivers.sim.config import SimConfig
 from brushloop.sessions.records import Condition
-from tests.waiting import PATIENCE_S
+from tests.rigs import COARSE, Lab, coarse, wireless_lab
+from tests.simulated_time import MemoryLoop
 
 if TYPE_CHECKING:
     from brushloop.drivers.sim.rig import LoopbackRig
-    from tests.rigs import Lab
-
 HOLD, LINE, RELEASE = (f"rob1.MotionControl.{name}" for name in ("stopMove", "moveLine", "startMove"))
 REQUESTS_IN_HOLD = 10
 """Five lines, the checks around them and the release."""
@@ -98,17 +97,17 @@ class Intruder:
 
 async def lifted(procedures: Procedures) -> None:
     """Lift and park, as a run does once the other client is gone: its last line may still be under way."""
-    async with asyncio.timeout(PATIENCE_S):
-        while True:
-            with contextlib.suppress(ArmMoved):
-                return await procedures.retreat()
+    while True:
+        with contextlib.suppress(ArmMoved):
+            return await procedures.retreat()
+        await asyncio.sleep(0.01)
 
 
 async def pressed(lab: Lab, seed: int, presses: int) -> Counter[str]:
     """What became of so many presses with another client's line in each."""
     config, seen, source = load_rig(lab.folder / "rig.toml"), Counter[str](), random.Random(seed)
     sheet, intruder = Sheet(config.paper), Intruder(lab.rig, source, MOVES_S + config.motion.least_dwell_s)
-    async with connected(config, HostClock(), lambda _: None) as rig:
+    async with lab.rig.connected(config, lab.rig.time, lambda _: None) as rig:
         await rig.robot.enable()
         procedures = Procedures(rig)
         await lifted(procedures)
@@ -134,18 +133,27 @@ async def pressed(lab: Lab, seed: int, presses: int) -> Counter[str]:
     return seen
 
 
-async def test_a_press_with_a_line_of_another_client_is_named_and_never_counts_if_it_was_dragged(lab: Lab) -> None:
-    seen = await pressed(lab, seed=1, presses=6)
+def seen_in(folder: Path, config: SimConfig, seed: int, presses: int) -> Counter[str]:
+    with (
+        wireless_lab(folder, config) as lab,
+        asyncio.Runner(loop_factory=lambda: MemoryLoop(lab.rig.time)) as runner,
+    ):
+        return runner.run(pressed(coarse(lab), seed, presses))
+
+
+def test_a_press_with_a_line_of_another_client_is_named_and_never_counts_if_it_was_dragged(tmp_path: Path) -> None:
+    seen = seen_in(tmp_path, COARSE, seed=1, presses=6)
     assert seen["accepted"] >= 5, seen
     assert (seen["dragged and counted"], seen["not named"]) == (0, 0), seen
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(2, 12))
-async def test_of_two_hundred_presses_with_another_clients_line_none_is_dragged_and_kept(
-    slow_lab: Lab, seed: int, record_property: Callable[[str, object], None]
+def test_of_two_hundred_presses_with_another_clients_line_none_is_dragged_and_kept(
+    tmp_path: Path, seed: int, record_property: Callable[[str, object], None]
 ) -> None:
-    seen = await pressed(slow_lab, seed, presses=20)
+    """Slow enough that a line does not pass between two questions of the driver."""
+    seen = seen_in(tmp_path, replace(COARSE, rate=10.0), seed, presses=20)
     record_property("seen", dict(seen))
     assert seen["accepted"] >= 15, seen
     assert (seen["dragged and counted"], seen["not named"]) == (0, 0), seen

@@ -14,7 +14,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.verify import verify_session
 from tests.collect.durability.conftest import the_session
 from tests.journal_lines import read_lines
-from tests.rigs import until, wait_for_end
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from tests.rigs import Lab

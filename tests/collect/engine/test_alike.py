@@ -20,7 +20,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic
 from tests.collect.sent import noting
 from tests.journal_lines import read_lines
-from tests.rigs import wait_for_end
+from tests.runs import wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ from brushloop.sessions.events import CaptureResult
 from brushloop.sessions.journal import replay
 from brushloop.sessions.recording import Recording
 from tests.journal_lines import read_lines
-from tests.rigs import until, wait_for_end
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from tests.collect.conftest import Collected

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from brushloop.collect.start import CollectRequest, collect, ending
-from tests.rigs import wait_for_end
+from tests.runs import wait_for_end
 
 if TYPE_CHECKING:
     from tests.rigs import Lab

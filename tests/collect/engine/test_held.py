@@ -12,7 +12,7 @@ from brushloop.collect.errors import ConfigError
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.errors import RobotNotSafe
 from tests.command import brushloop
-from tests.rigs import until, wait_for_end
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,7 @@ from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
 from brushloop.sessions.journal import RunState, replay
 from brushloop.sessions.records import Topic
-from tests.rigs import until, wait_for_end
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from pathlib import Path

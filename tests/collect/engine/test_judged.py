@@ -15,7 +15,7 @@ from brushloop.drivers.sim.brush.footprint import Flaw
 from brushloop.sessions.events import PressResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
-from tests.rigs import answered_alike, until, wait_for_end
+from tests.runs import answered_alike, until, wait_for_end
 
 if TYPE_CHECKING:
     from brushloop.calibrate.stroke import Gray

@@ -19,7 +19,7 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Topic
 from tests.calibrate.given import kept_lens
 from tests.journal_lines import read_lines
-from tests.rigs import wait_for_end
+from tests.runs import wait_for_end
 
 if TYPE_CHECKING:
     from tests.rigs import Lab

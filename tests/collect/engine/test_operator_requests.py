@@ -17,7 +17,8 @@ from brushloop.drivers.errors import DeviceTimeout
 from brushloop.sessions.events import StepResult
 from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.journal_lines import read_lines
-from tests.rigs import Lab, answer, until, wait_for_end
+from tests.rigs import Lab
+from tests.runs import answer, until, wait_for_end
 
 
 def lines(lab: Lab, event: str) -> list[dict[str, object]]:

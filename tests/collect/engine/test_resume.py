@@ -15,7 +15,8 @@ from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.sim.config import View
 from brushloop.sessions.journal import JOURNAL_NAME
 from brushloop.sessions.store import SessionStore
-from tests.rigs import SMALL_VIEW, until, wait_for_end
+from tests.rigs import SMALL_VIEW
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from tests.rigs import Lab

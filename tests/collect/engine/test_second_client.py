@@ -14,7 +14,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
 from tests.journal_lines import read_lines
-from tests.rigs import until, wait_for_end
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine

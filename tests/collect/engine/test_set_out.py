@@ -14,7 +14,7 @@ from brushloop.collect.engine.steps.context import meanwhile
 from brushloop.collect.errors import BadPicture, CollectAborted
 from brushloop.collect.motion import Procedures
 from tests.journal_lines import read_lines
-from tests.rigs import until, wait_for_end
+from tests.runs import until, wait_for_end
 
 if TYPE_CHECKING:
     from tests.rigs import Lab

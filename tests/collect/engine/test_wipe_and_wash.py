@@ -9,7 +9,7 @@ import pytest
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.motion import dip_moves, wash_moves
 from brushloop.collect.rig.config import RigConfig, load_rig
-from tests.rigs import wait_for_end
+from tests.runs import wait_for_end
 
 if TYPE_CHECKING:
     from tests.rigs import Lab

@@ -1,23 +1,22 @@
 """Ten faults in ten phases of a session: each patch has its outcome, and in every one the arm ends at rest.
 
-A run is fast up to its phase. As that begins, simulated time slows to half real speed, and the fault strikes a
-move that is under way.
+A run is fast up to its phase. As that begins, the arm slows down, and the fault strikes a move that is under way. And
+however a run ends, it says so if the brush may be down, and what to do; and says nothing of it if it is not.
 """
 
 from __future__ import annotations
 
-import time
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import Engine
-from brushloop.drivers.arcs import stopping
+from brushloop.collect.errors import describe
 from brushloop.drivers.arcs.controller import SafetyMode
-from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -31,20 +30,25 @@ from brushloop.drivers.geometry import distance
 from brushloop.drivers.sim.faults import ALWAYS, Fault, Phase
 from brushloop.sessions.journal import replay
 from brushloop.sessions.store import SessionStore
-from tests.collect.faults.conftest import CAMERA_TIMEOUT_S
 from tests.journal_lines import read_lines
-from tests.rigs import wait_for_end
-from tests.waiting import PATIENCE_S
+from tests.rigs import BARE, Lab
+from tests.runs import until, wait_for_end
 
-if TYPE_CHECKING:
-    from conftest import Stage
-
-SLOW, FAST = 0.5, 300.0
+FAST, SLOW = BARE.rate, 0.5
+"""Seconds of the arm for each second of the driver."""
 LINE, POLL = "rob1.MotionControl.moveLine", "getSafetyModeType"
 WAITING, LET_GO = f"rob1.RobotState.{POLL}", "rob1.MotionControl.startMove"
 """All lines of a press are sent before the first begins: its phases show while the driver waits."""
 STRUCK = {"on": POLL, "nth": 3}
 """In a move: the third time that the driver asks while it waits, some hundredths of a second after the start."""
+
+
+@pytest.fixture
+def lab(bare_lab: Lab) -> Lab:
+    """A phase is struck while the arm is slow: a dwell need not outlast the time between two polls."""
+    bare_lab.edit_rig("\nleast_dwell_s", "\n# least_dwell_s")
+    bare_lab.write_protocol("[15.0]", dwell_s=1.0)
+    return bare_lab
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,6 @@ FAULTS: dict[str, dict[str, Any]] = {
     "frozen camera": {"device": "camera", "kind": "frozen", "count": ALWAYS},
 }
 WAITED_OUT = ("mute", "late", "wrong id")
-RPC_TIMEOUT_S, FROZEN_TIMEOUT_S = 1.2, 3.0
-"""Where a time-out is the outcome it is short, though long enough for the machine to answer where nothing is wrong."""
 SINGLE = ("late", "wrong id", "malformed", "protective stop", "emergency stop")
 """What strikes one request of the driver's own wait; the others strike whoever asks."""
 
@@ -177,12 +179,12 @@ def fault_at(name: str, phase: str) -> Fault:
     return Fault.model_validate(fields)
 
 
-def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[Pose | None]:
+def arm_the_fault(lab: Lab, engine: Engine, name: str, phase: str) -> list[Pose | None]:
     """Hang the fault as the phase begins, and slow down where a move is to be struck.
 
     The list will hold where that move was to end.
     """
-    moment, fault, rig = PHASES[phase], fault_at(name, phase), stage.rig
+    moment, fault, rig = PHASES[phase], fault_at(name, phase), lab.rig
     methods = rig.arcs._methods
     original: Callable[[dict[str, Any]], Any] = methods[moment.method]
     targets: list[Pose | None] = []
@@ -202,7 +204,7 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
         if targets:
             return original(params)
         if moment.method != WAITING:
-            stage.gears.shift(slow)  # or a line would be over before anyone has looked at it
+            lab.rig.clock.shift(slow)  # or a line would be over before anyone has looked at it
         result = original(params)
         if now():
             targets.append(rig.world.target())
@@ -210,17 +212,17 @@ def arm_the_fault(stage: Stage, engine: Engine, name: str, phase: str) -> list[P
         if moment.method == WAITING and not targets:
             return result
         if not targets or moment.method not in (LINE, WAITING) or name == "frozen camera":
-            stage.gears.shift(FAST)
+            lab.rig.clock.shift(FAST)
         elif TABLE[name][0] is DONE or carried_out(name, phase):
             wait_s = 1.6 / slow if phase == "at depth" else 1.0 if phase in PRESSING else 0.3
-            stage.loop.call_later(wait_s, stage.gears.shift, FAST)
+            asyncio.get_running_loop().call_later(wait_s, lab.rig.clock.shift, FAST)
         return result
 
     let_go: Callable[[dict[str, Any]], Any] = methods[LET_GO]
 
     def slowly(params: dict[str, Any]) -> Any:
         if moment.method == WAITING and not targets and engine.snapshot().step.startswith(moment.step):
-            stage.gears.shift(slow)
+            lab.rig.clock.shift(slow)
         return let_go(params)
 
     methods[moment.method], methods[LET_GO] = watched, slowly
@@ -237,23 +239,14 @@ def end_of(engine: Engine) -> BaseException | None:
 
 
 @pytest.mark.parametrize(("name", "phase"), patches())
-def test_a_fault_in_a_phase_ends_as_the_table_says(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch, name: str, phase: str
-) -> None:
+def test_a_fault_in_a_phase_ends_as_the_table_says(lab: Lab, name: str, phase: str) -> None:
     expected = TABLE[name][list(PHASES).index(phase)]
-    if name in WAITED_OUT:
-        monkeypatch.setitem(RpcConnection.__init__.__kwdefaults__, "timeout_s", RPC_TIMEOUT_S)
-    elif name == "frozen camera":
-        rig = stage.folder / "rig.toml"
-        rig.write_text(rig.read_text().replace(f"timeout_s = {CAMERA_TIMEOUT_S}", f"timeout_s = {FROZEN_TIMEOUT_S}"))
-    if not expected.alarm:
-        monkeypatch.setattr(stopping, "CONFIRM_S", PATIENCE_S)  # rest is seen, however busy the machine is
-    engine = stage.engine()
-    targets = arm_the_fault(stage, engine, name, phase)
+    engine = lab.engine()
+    targets = arm_the_fault(lab, engine, name, phase)
     engine.start()
     ended = end_of(engine)
 
-    board = stage.rig.faults
+    board = lab.rig.faults
     assert any(hung.struck for hung in (*board.hanging, *board.over)), "the fault has struck"
     now = engine.snapshot()
     assert now.state is (State.DONE if expected is DONE else State.FAILED), now.error
@@ -265,35 +258,36 @@ def test_a_fault_in_a_phase_ends_as_the_table_says(
     assert not (now.rest_unknown and now.parked)
     if isinstance(ended, RobotNotSafe):
         assert ended.remedy in now.error
-        assert stage.rig.arcs.cabinet.power.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"
+        assert lab.rig.arcs.cabinet.power.safety != SafetyMode.NORMAL, "nothing is ever cleared automatically"
 
-    assert stage.at_rest
+    assert lab.at_rest
     [target] = targets
     if expected in (DONE, BLIND):
-        assert stage.rig.faults.phase() is Phase.PARKED
+        assert lab.rig.faults.phase() is Phase.PARKED
     elif carried_out(name, phase):
-        assert stage.rig.world.tool().z_mm > stage.rig.config.table.paper_z_mm + 7.0, "lifted"
+        assert lab.rig.world.tool().z_mm > lab.rig.config.table.paper_z_mm + 7.0, "lifted"
     elif target is not None and phase != "at depth":
-        assert sum(distance(stage.rig.world.tool(), target)) > 0.5, "stopped on its way"
-    assert_it_stays_at_rest(stage)
-    assert_the_session_is_whole(stage, name, phase)
+        assert sum(distance(lab.rig.world.tool(), target)) > 0.5, "stopped on its way"
+    assert_it_stays_at_rest(lab)
+    assert_the_session_is_whole(lab, name, phase)
 
 
-def assert_it_stays_at_rest(stage: Stage) -> None:
+def assert_it_stays_at_rest(lab: Lab) -> None:
     """Not when the fault is over, not when a person has ended the stop, not when requests come late."""
-    before = stage.rig.world.tool()
-    stage.rig.faults.clear()
-    stage.rig.arcs.cabinet.release()
-    stage.gears.shift(FAST)
-    stage.ask("rob1.MotionControl.startMove", "RuntimeMachine.resume", "rob1.MotionControl.getExecId")
-    time.sleep(0.1)  # half a minute of the arm's time
-    assert stage.rig.world.tool() == before
-    assert stage.at_rest
+    before = lab.rig.world.tool()
+    lab.rig.faults.clear()
+    lab.rig.arcs.cabinet.release()
+    lab.rig.clock.shift(FAST)
+    for method in (LET_GO, "RuntimeMachine.resume"):
+        lab.rig.arcs._methods[method]({})
+    lab.rig.time.pass_s(0.1)  # half a minute of the arm's time
+    assert lab.rig.world.tool() == before
+    assert lab.at_rest
 
 
-def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
+def assert_the_session_is_whole(lab: Lab, name: str, phase: str) -> None:
     outcome = TABLE[name][list(PHASES).index(phase)]
-    folders = list(stage.sessions.iterdir()) if stage.sessions.is_dir() else []
+    folders = list(lab.sessions.iterdir()) if lab.sessions.is_dir() else []
     if phase == "connecting" and outcome.device == "robot" and outcome is not UNSAFE:
         assert not folders, "an arm that was not reached begins no session"
         return
@@ -318,7 +312,7 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
         assert bool(line["patches"]) is (line["kind"] == "press")
         assert {(line["sheet"], patch) for patch in line["patches"]} <= state.used_patches, "burnt"
         assert (folder / f"{line['file']}.part").is_file(), "its evidence is kept"
-    store = SessionStore(folder, time.time_ns)
+    store = SessionStore(folder, lab.rig.time.now_ns)
     store.verify()
     store.release()
 
@@ -326,18 +320,59 @@ def assert_the_session_is_whole(stage: Stage, name: str, phase: str) -> None:
 @pytest.mark.parametrize(
     ("name", "phase"), [("drop", "travel"), pytest.param("protective stop", "lift", marks=pytest.mark.soak)]
 )
-def test_once_the_cause_is_mended_the_same_command_goes_on(stage: Stage, name: str, phase: str) -> None:
-    engine = stage.engine()
-    arm_the_fault(stage, engine, name, phase)
+def test_once_the_cause_is_mended_the_same_command_goes_on(lab: Lab, name: str, phase: str) -> None:
+    engine = lab.engine()
+    arm_the_fault(lab, engine, name, phase)
     engine.start()
     assert end_of(engine) is not None
-    stage.rig.faults.clear()
-    stage.rig.arcs.cabinet.release()
-    stage.gears.shift(FAST)
+    lab.rig.faults.clear()
+    lab.rig.arcs.cabinet.release()
+    lab.rig.clock.shift(FAST)
 
-    again = stage.engine()
+    again = lab.engine()
     again.start()
     assert end_of(again) is None
-    [folder] = stage.sessions.iterdir()
-    state = replay(folder / "journal.jsonl")
+    state = replay(lab.session / "journal.jsonl")
     assert len(state.used_patches) == 2, "the press that was cut lies on one, its repetition on another"
+
+
+DOWN = "The brush may be down"
+DEEP_RATE = 2.0
+ENDS: dict[str, Callable[[Lab, Engine], object]] = {
+    "a stop": lambda _, engine: engine.stop(),
+    "a safety stop": lambda lab, _: lab.rig.arcs.cabinet.safety_stop(),
+    "another client's stop": lambda lab, _: lab.rig.arcs.cabinet.stop(2.0, 2.0),
+}
+
+
+def said_at_the_end(engine: Engine) -> str:
+    """The last line of the run, as the command prints it and as the screen shows it."""
+    ended = end_of(engine)
+    assert isinstance(ended, Exception)
+    assert engine.snapshot().error == describe(ended)
+    return describe(ended)
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_an_end_with_the_brush_in_the_paper_says_so_and_what_to_do(lab: Lab, end: str) -> None:
+    lab.write_protocol("[15.0]", dwell_s=20.0)
+    engine, paper_z_mm = lab.engine(), lab.rig.config.table.paper_z_mm
+    engine.start()
+    until(engine, lambda now: now.step.startswith("press"))
+    lab.rig.clock.shift(DEEP_RATE)
+    until(engine, lambda _: lab.rig.world.tool().z_mm < paper_z_mm - 10.0)
+    ENDS[end](lab, engine)
+    said = said_at_the_end(engine)
+    assert DOWN in said
+    assert "mm below the height of the paper" in said
+    assert lab.rig.world.tool().z_mm < paper_z_mm
+
+
+@pytest.mark.parametrize("ends", ["park", "stop"])
+def test_a_run_that_ends_at_travel_height_does_not_speak_of_the_brush(lab: Lab, ends: str) -> None:
+    engine = lab.engine()
+    engine.start()
+    engine.pause()
+    until(engine, lambda now: now.state is State.PAUSED)
+    getattr(engine, ends)()
+    assert DOWN not in said_at_the_end(engine)

@@ -10,7 +10,7 @@ import errno
 import os
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -21,10 +21,8 @@ from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_writer import McapWriter
 from brushloop.sessions.recording import Recording
 from tests.journal_lines import read_lines
-from tests.rigs import wait_for_end
-
-if TYPE_CHECKING:
-    from conftest import Stage
+from tests.rigs import Lab
+from tests.runs import wait_for_end
 
 
 @dataclass
@@ -59,8 +57,8 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
     return disk
 
 
-def run(stage: Stage) -> tuple[BaseException | None, State]:
-    engine = stage.engine()
+def run(bare_lab: Lab) -> tuple[BaseException | None, State]:
+    engine = bare_lab.engine()
     engine.start()
     try:
         wait_for_end(engine)
@@ -69,39 +67,39 @@ def run(stage: Stage) -> tuple[BaseException | None, State]:
     return None, engine.snapshot().state
 
 
-def test_a_slow_disk_is_waited_for_and_loses_nothing(stage: Stage, disk: Disk) -> None:
+def test_a_slow_disk_is_waited_for_and_loses_nothing(bare_lab: Lab, disk: Disk) -> None:
     disk.message_s, disk.sync_s = 0.012, 0.05  # a pose comes every 0.010 s
-    assert run(stage) == (None, State.DONE)
-    [folder] = stage.sessions.iterdir()
+    assert run(bare_lab) == (None, State.DONE)
+    folder = bare_lab.session
     recorded = sum(replay(folder / "journal.jsonl").counts().values())
     assert recorded == disk.written
     assert len(list(Recording(folder).captures())) == 1
 
 
 def test_a_disk_that_does_not_keep_up_ends_the_run_and_says_so(
-    stage: Stage, disk: Disk, monkeypatch: pytest.MonkeyPatch
+    bare_lab: Lab, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A queue of five stands for the 20 000 messages that a slower disk would take minutes to fill."""
     monkeypatch.setattr("brushloop.sessions.mcap_writer.QUEUE_LIMIT", 5)
     disk.message_s = 0.1
-    error, state = run(stage)
+    error, state = run(bare_lab)
     assert isinstance(error, SessionError)
     assert "the disk does not keep up" in str(error)
     assert state is State.FAILED
-    assert_stopped_clear_of_the_paper(stage)
+    assert_stopped_clear_of_the_paper(bare_lab)
 
 
 @pytest.mark.parametrize("full_after", [0, 3, pytest.param(60, marks=pytest.mark.soak)])
 def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_on(
-    stage: Stage, disk: Disk, full_after: int
+    bare_lab: Lab, disk: Disk, full_after: int
 ) -> None:
     disk.full_after = full_after
-    error, state = run(stage)
+    error, state = run(bare_lab)
     assert isinstance(error, SessionError)
     assert "No space left on device" in str(error)
     assert state is State.FAILED
-    assert_stopped_clear_of_the_paper(stage)
-    [folder] = stage.sessions.iterdir()
+    assert_stopped_clear_of_the_paper(bare_lab)
+    folder = bare_lab.session
     events = [line["event"] for line in read_lines(folder / "journal.jsonl")]
     # Where the last message of a step does not fit, the journal has no word for its end either: begun, not done.
     assert events.count("begin") == events.count("done") + 1
@@ -110,11 +108,11 @@ def test_a_disk_that_fills_up_ends_the_run_and_with_room_the_same_command_goes_o
     assert len(list(folder.glob("*.part"))) == 1, "the evidence is kept"
 
     disk.full_after = None
-    assert run(stage) == (None, State.DONE)
+    assert run(bare_lab) == (None, State.DONE)
     assert len(list(Recording(folder).captures())) == 1
 
 
-def assert_stopped_clear_of_the_paper(stage: Stage) -> None:
-    assert stage.at_rest
-    assert stage.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
-    assert stage.rig.world.tool().z_mm >= stage.rig.config.table.paper_z_mm + 8.0
+def assert_stopped_clear_of_the_paper(bare_lab: Lab) -> None:
+    assert bare_lab.at_rest
+    assert bare_lab.rig.faults.phase() in (Phase.PARKED, Phase.RESTING)
+    assert bare_lab.rig.world.tool().z_mm >= bare_lab.rig.config.table.paper_z_mm + 8.0

@@ -18,8 +18,8 @@ from brushloop.collect.rig.paper import PaperPlane
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import StepResult
 from tests.collect.sent import not_checked, not_sent, noting
-from tests.rigs import Lab, wait_for_end
-from tests.waiting import wait_until
+from tests.rigs import Lab
+from tests.runs import answered_alike
 
 EXTRAS = """
 [ink.wipe]
@@ -84,19 +84,9 @@ def made(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> list[Made]:
 
 def run(lab: Lab, protocol: str, extra: str = EXTRAS) -> None:
     """To its end; whoever jogs says at once that the tip touches."""
-    rig = lab.folder / "rig.toml"
-    rig.write_text(rig.read_text(encoding="utf-8") + extra, encoding="utf-8")
+    lab.edit_rig("", extra)
     (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
-    engine = lab.engine(watched=True)
-    engine.start()
-
-    def answering() -> bool:
-        if (prompt := engine.snapshot().prompt) is not None:
-            engine.answer(prompt.number, "t")
-        return engine.finished
-
-    wait_until(answering, "the end of the run")
-    wait_for_end(engine)
+    answered_alike(lab.engine(watched=True), "t")
 
 
 def hold_against_the_plan(lab: Lab, made: list[Made]) -> None:

@@ -23,7 +23,7 @@ from brushloop.collect.tui.start_screen import Paths, SessionBrowser, StartScree
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
 from tests.collect.tui.screen_text import has_picture, shown
-from tests.rigs import wait_for_end
+from tests.runs import wait_for_end
 from tests.waiting import PATIENCE_S
 
 STROKES = 4

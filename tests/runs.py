@@ -1,0 +1,178 @@
+"""Runs of an engine as a test drives them: in turns with the test where time is simulated, and waits that end."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import threading
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
+
+import pytest
+
+from brushloop.collect.engine.engine import Engine
+from brushloop.collect.engine.snapshot import Snapshot
+from brushloop.collect.operator import Prompt
+from brushloop.collect.rig.config import RigConfig
+from tests import waiting
+from tests.simulated_time import MemoryLoop, SimulatedTime
+
+PATIENCE_S = 600.0
+"""Simulated time that a test waits for anything."""
+LOOK_S = 0.05
+"""Real time between two looks at whether a run is over that no longer takes turns."""
+
+_R = TypeVar("_R")
+
+
+class Turns:
+    """A test and a run in another thread take turns: the run goes on while the test waits for it, and stands still from
+    the moment at which what the test waits for is so."""
+
+    def __init__(self, time: SimulatedTime) -> None:
+        self.time = time
+        self._turn = threading.Condition()
+        self._met: Callable[[], bool] | None = None
+        self._until_s = 0.0
+        self._error: BaseException | None = None
+        self._over = False
+
+    def idle(self) -> None:
+        """For the loop of the run, whenever all of its tasks wait: stand still while it is the test's turn."""
+        with self._turn:
+            while not self._over and (self._met is None or self._is_met(self._met)):
+                self._met = None
+                self._turn.notify_all()
+                self._turn.wait()
+
+    def end(self) -> None:
+        """For the test: from now on the run does not stand still."""
+        with self._turn:
+            self._over = True
+            self._turn.notify_all()
+
+    def wait_until(self, met: Callable[[], bool], run_is_over: Callable[[], bool]) -> bool:
+        """For the test: let the run go on until the condition is met, or the run is over.
+
+        False where neither is so after `PATIENCE_S`. Raises what the condition raises.
+        """
+        with self._turn:
+            self._met, self._until_s, self._error = met, self.time.now_s + PATIENCE_S, None
+            self._turn.notify_all()
+            while self._met is not None and not run_is_over():
+                self._turn.wait(LOOK_S)
+            self._met = None
+        if self._error is not None:
+            raise self._error
+        return self.time.now_s <= self._until_s
+
+    def _is_met(self, met: Callable[[], bool]) -> bool:
+        try:
+            return met() or self.time.now_s > self._until_s
+        except BaseException as error:
+            self._error = error
+            return True
+
+
+class SteppedEngine(Engine):
+    """An engine that stands still unless its test waits for it."""
+
+    def __init__(self, rig: RigConfig, protocol: Any, open_store: Any, clock: Any, **options: Any) -> None:
+        super().__init__(rig, protocol, open_store, clock, **options)
+        self.turns = Turns(clock)
+        self._loop: MemoryLoop | None = None
+
+    def new_event_loop(self) -> asyncio.AbstractEventLoop:
+        self._loop = MemoryLoop(self.turns.time, self.turns.idle)
+        return self._loop
+
+    def meanwhile(self, work: Coroutine[Any, Any, _R]) -> _R:
+        """Do this in the loop of the run, as somebody else beside it, while the run goes on."""
+        assert self._loop is not None
+        doing = asyncio.run_coroutine_threadsafe(work, self._loop)
+        self.turns.wait_until(doing.done, lambda: self.finished)
+        return doing.result(timeout=0.0)
+
+
+def until(engine: Engine, condition: Callable[[Snapshot], bool]) -> Snapshot:
+    """The first snapshot that meets the condition; fails where it does not come in time, or the run is over."""
+    met: list[Snapshot] = []
+
+    def looked() -> bool:
+        now = engine.snapshot()
+        met.extend([now] if condition(now) else [])
+        return bool(met)
+
+    in_time = _wait(engine, looked)
+    if not met:
+        why = "the run ended" if engine.finished else "the run went on" if in_time else "time ran out"
+        pytest.fail(f"{why} while a test waited for {_source(condition)}: {engine.snapshot()}")
+    return met[0]
+
+
+def wait_for_end(engine: Engine) -> None:
+    """Wait until the run is over, and raise what ended it; stops the run and fails where it does not end in time."""
+    if not _wait(engine, lambda: False):
+        now = engine.snapshot()
+        end(engine)
+        pytest.fail(f"a test waited in vain for the end of the run; it is: {now}")
+    engine.join()
+
+
+def question(engine: Engine, words: str = "") -> Prompt:
+    """The next open question that holds these words."""
+    prompt = until(engine, lambda now: now.prompt is not None and words in now.prompt.question).prompt
+    assert prompt is not None
+    return prompt
+
+
+def answer(engine: Engine, words: str, key: str) -> None:
+    """Answer the next question that holds these words."""
+    number = question(engine, words).number
+    assert engine.answer(number, key)
+    until(engine, lambda now: now.prompt is None or now.prompt.number != number)
+
+
+def answered_alike(engine: Engine, key: str) -> list[str]:
+    """Run to the end, answering every question the same way; the questions. Raises what ended the run."""
+    questions: dict[int, str] = {}
+
+    def answering() -> bool:
+        prompt = engine.snapshot().prompt
+        if prompt is not None and prompt.number not in questions:
+            questions[prompt.number] = prompt.question
+            assert engine.answer(prompt.number, key)
+        return False
+
+    engine.start()
+    _wait(engine, answering)
+    wait_for_end(engine)
+    return list(questions.values())
+
+
+def end(engine: Engine) -> None:
+    """Stop a run that a test has left."""
+    if not engine.finished:
+        engine.stop()
+    if isinstance(engine, SteppedEngine):
+        engine.turns.end()
+
+
+def _wait(engine: Engine, met: Callable[[], bool]) -> bool:
+    """Wait until the condition is met or the run is over; False where neither comes in time."""
+    if isinstance(engine, SteppedEngine):
+        return engine.turns.wait_until(met, lambda: engine.finished)
+    deadline = time.monotonic() + waiting.PATIENCE_S
+    while not met() and not engine.finished:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def _source(condition: Callable[[Snapshot], bool]) -> str:
+    try:
+        return inspect.getsource(condition).strip()
+    except OSError:
+        return repr(condition)
