@@ -16,7 +16,7 @@ import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 
-from brushloop.calibrate.validate.report import load_report, table_1
+from brushloop.calibrate.validate.tables import load_report, table_1
 from brushloop.sessions.journal import replay
 from brushloop.sessions.recording import Recording
 from tests.journal_lines import read_lines

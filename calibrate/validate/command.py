@@ -22,11 +22,12 @@ from brushloop.calibrate.remote import URL, local_path
 from brushloop.calibrate.report import framed, png_uri, write_files
 from brushloop.calibrate.scores import scores_csv, write_parquet
 from brushloop.calibrate.session import open_session as open_recording
+from brushloop.calibrate.validate.figures import Curve, read_curve
 from brushloop.calibrate.validate.findings import terminal_lines
 from brushloop.calibrate.validate.models import FittedSession
-from brushloop.calibrate.validate.page import Curve, page_of, pages_beside, read_curve
-from brushloop.calibrate.validate.report import Report, check_gates, parse_gate, report_of, summary_csv
+from brushloop.calibrate.validate.page import page_of, pages_beside
 from brushloop.calibrate.validate.run import Outcome, Refused, Request, validate_presses
+from brushloop.calibrate.validate.tables import Report, check_gates, parse_gate, report_of, summary_csv
 from brushloop.calibrate.work import cluster, threads
 from brushloop.calibrate.writing.compare import FILE as WRITTEN_FILE
 from brushloop.calibrate.writing.compare import PICTURE, WrittenRecord, read_written

@@ -19,7 +19,7 @@ from rich.table import Table
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.scores import MEASURES
 from brushloop.calibrate.stats import Paired, holm, paired
-from brushloop.calibrate.validate.report import Report, load_report
+from brushloop.calibrate.validate.tables import Report, load_report
 from brushloop.sessions.disk import as_text, file_sha256
 
 SIGNIFICANT = 0.05

@@ -15,7 +15,7 @@ from brushloop.calibrate.report import Point, brush_and_size, source_note, sourc
 from brushloop.calibrate.scores import Stat
 from brushloop.calibrate.stats import CEILING, NEAR_POINTS, Interval, Summary, is_near
 from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT, HELD_OUT, PRESSES
-from brushloop.calibrate.validate.report import (
+from brushloop.calibrate.validate.tables import (
     NORMAL,
     STRICT,
     Report,

@@ -20,8 +20,9 @@ from brushloop.model.ccdbsm import Brush, DomainError, ccdbsm
 from brushloop.model.generator import SHIPPED_GENERATOR, TrainError
 from brushloop.model.generator.config import MAX_WEIGHTS, PRESETS, Layers, Target, preset
 from brushloop.model.generator.data import sets, sha256
+from brushloop.model.generator.network import Generator, covered, squared_error
 from brushloop.model.generator.stroke import load_generator, read_generator, traced
-from brushloop.model.generator.train import Generator, covered, likeness, squared_error
+from brushloop.model.generator.train import likeness
 from brushloop.model.raster import centred_origin, coverage
 
 MOST_BYTES = 10_000_000

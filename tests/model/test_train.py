@@ -19,8 +19,9 @@ from brushloop.model.generator import TrainError
 from brushloop.model.generator import train as training
 from brushloop.model.generator.config import TrainConfig, checked, load_config
 from brushloop.model.generator.data import load_captures, save_captures, split
+from brushloop.model.generator.network import Generator
 from brushloop.model.generator.stroke import load_generator, read_generator
-from brushloop.model.generator.train import Generator, new_network, run_training
+from brushloop.model.generator.train import new_network, run_training
 
 TOML = """
 training_images = 96

@@ -12,7 +12,7 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import FOLDER, BrushFit, FitRequest, fit_presses
 from brushloop.calibrate.session import open_session
-from brushloop.calibrate.validate.report import load_report
+from brushloop.calibrate.validate.tables import load_report
 from brushloop.model.fitted import NAME, NAMES
 from tests.photographed import imported_presses
 

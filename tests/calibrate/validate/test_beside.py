@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import TABLE_1
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.validate.report import NORMAL, STRICT, Report, load_report, table_1, table_3
+from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report, load_report, table_1, table_3
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Source
 from tests.calibrate.records import loop_record, table_of, written_record

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from brushloop.__main__ import app
 from brushloop.calibrate.session import OpenSession
-from brushloop.calibrate.validate.report import NORMAL, load_report
+from brushloop.calibrate.validate.tables import NORMAL, load_report
 from brushloop.calibrate.validate.tuning import align_captures
 from brushloop.model.generator import SHIPPED_GENERATOR
 from brushloop.model.generator.data import load_captures

@@ -25,7 +25,7 @@ from brushloop.calibrate.validate.diff import compare
 from brushloop.calibrate.validate.findings import trust
 from brushloop.calibrate.validate.models import BEZIER_REFITTED, FITTED_HELD_OUT
 from brushloop.calibrate.validate.page import provenance
-from brushloop.calibrate.validate.report import Collected, GateMissed, Report, check_gates, collected_in, load_report
+from brushloop.calibrate.validate.tables import Collected, GateMissed, Report, check_gates, collected_in, load_report
 from brushloop.sessions.events import CaptureResult, Condition, DipResult, Remark, ZeroTouchResult
 from brushloop.sessions.events import Press as Pressed
 from brushloop.sessions.recording import Recording, add_remark

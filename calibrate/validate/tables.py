@@ -1,4 +1,4 @@
-"""The report as data: what was validated with what, the statistics of every model, and the queries on them.
+"""Tables 1 to 3, and the report as data: what was validated with what, and the statistics of every model.
 
 Terminal, page, summary.csv, gates and comparisons are made of it. A gate is a score that must be reached, as
 `csim_avg>=0.90` or `ccd-bsm-heldout:mm:binary:csim_avg>=0.93`.
