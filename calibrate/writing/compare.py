@@ -79,12 +79,11 @@ NORMAL_SIDE_PX = 100
 
 @dataclass(frozen=True)
 class Character:
-    """One character: the image asked for, the model's image of the plan, and what was written."""
+    """One character: its figure of the plan, the image asked for, and what was written."""
 
-    name: str
+    figure: Figure
     reference_name: str
-    reference: Ink
-    simulated: Ink
+    reference: Image
     captured: dict[str, Ink]
     """Ink by stroke id."""
     cut: tuple[str, ...] = ()
@@ -101,11 +100,12 @@ class Character:
         `PLANNED` has one row, since no writing is involved; a writing alone has NaN for another one.
         """
         inks = list(self.captured.values())
+        reference, simulated = as_ink(self.reference), as_ink(self.figure.simulated)
         scores: dict[tuple[str, Key], Floats] = {}
         for key in KEYS:
-            scores[SIMULATED, key] = np.array([compare_ink(ink, self.simulated, key) for ink in inks])
-            scores[REFERENCE, key] = np.array([compare_ink(self.reference, ink, key) for ink in inks])
-            scores[PLANNED, key] = np.array([compare_ink(self.reference, self.simulated, key)])
+            scores[SIMULATED, key] = np.array([compare_ink(ink, simulated, key) for ink in inks])
+            scores[REFERENCE, key] = np.array([compare_ink(reference, ink, key) for ink in inks])
+            scores[PLANNED, key] = np.array([compare_ink(reference, simulated, key)])
             scores[ANOTHER, key] = pair_means(
                 len(inks), lambda k, others, key=key: np.array([compare_ink(inks[k], inks[j], key) for j in others])
             )
@@ -181,7 +181,7 @@ class WritingComparison:
             csim, ssim = (summarise(percent) for percent in 100.0 * character.scores[pair, key].T)
             if csim is not None and ssim is not None:
                 how = dict(zip(("alignment", "tone", "polarity"), key, strict=True))
-                about_it = {"character": character.name, "reference": character.reference_name, "pair": pair}
+                about_it = {"character": character.figure.name, "reference": character.reference_name, "pair": pair}
                 rows.append(Table3Row.model_validate(about_it | how | {"csim": csim, "ssim": ssim}))
         return tuple(rows)
 
@@ -241,8 +241,7 @@ def compare_written(
         if captured := writings.get(figure.name):
             name, image = references.get(figure.name) or (figure.source, figure.wanted)
             at_the_edge = tuple(stroke_id for stroke_id in captured if stroke_id in cut)
-            images = as_ink(image), as_ink(figure.simulated)
-            characters.append(Character(figure.name, name, *images, captured, at_the_edge))
+            characters.append(Character(figure, name, image, captured, at_the_edge))
     if not characters:
         why = f": {refused[0][0]}: {refused[0][1]}" if refused else ""
         raise CalibrationError(str(session.recording.path), f"no character can be compared{why}")
@@ -308,9 +307,10 @@ def _small(image: Image) -> Image:
     return cast("Image", cv2.resize(image, (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_AREA))
 
 
-def round_of(figure: Figure, character: Character, side_mm: float) -> Round:
+def round_of(character: Character, side_mm: float) -> Round:
     """What the writings of a figure show on average; phases for characters only."""
-    wanted, writings = figure.wanted, character.captured.values()
+    figure, writings = character.figure, character.captured.values()
+    wanted = figure.wanted
     csim = float(np.mean([compare_ink(as_ink(wanted), ink, HEADLINE)[0] for ink in writings]))
     lost: dict[str, float] = {}
     if figure.medians:
@@ -363,7 +363,7 @@ def write_written(written: WritingComparison, folder: Path, command: str) -> Pat
         written=written,
         tables=_tables(written.table_3),
         paper_rows=PAPER_ROWS,
-        rounds=functools.partial(_rounds, plan),
+        rounds=[_rounds(character, plan.cell_mm) for character in written.characters],
         ink_uri=ink_uri,
         overlay_uri=overlay_uri,
         ssim_settings=SSIM_SETTINGS,
@@ -383,7 +383,7 @@ def scores_csv(written: WritingComparison) -> str:
             names = [""] if pair == PLANNED else character.captured
             for stroke_id, (csim, ssim) in zip(names, scores.tolist(), strict=True):
                 if np.isfinite(csim):
-                    rows.append((character.name, stroke_id, pair, *key, f"{csim:.6f}", f"{ssim:.6f}", source))
+                    rows.append((character.figure.name, stroke_id, pair, *key, f"{csim:.6f}", f"{ssim:.6f}", source))
     return csv_text(head, rows)
 
 
@@ -396,11 +396,10 @@ def draw(written: WritingComparison, path: Path) -> None:
     title = f"{header.session_id} ({header.source})"
     figure, rows = picture_grid(count, 5, (13.0, 0.5 + 2.9 * count), title)
     for character, axes in zip(written.characters, rows, strict=True):
-        names = character.ranked()
-        reference = character.reference[Tone.GRAY]
+        names, reference = character.ranked(), character.reference
         parts: tuple[tuple[str, Image], ...] = (
-            (f"reference {code_points(character.name)}", reference),
-            ("simulated", character.simulated[Tone.GRAY]),
+            (f"reference {code_points(character.figure.name)}", reference),
+            ("simulated", character.figure.simulated),
             (f"captured, best of {len(names)}", character.captured[names[0]][Tone.GRAY]),
             ("captured, worst", character.captured[names[-1]][Tone.GRAY]),
             ("blue: mean of all captured; orange: reference", overlay(reference, character.mean_ink())),
@@ -420,8 +419,7 @@ def _tables(table: Sequence[Table3Row]) -> list[dict[str, Any]]:
     return out
 
 
-def _rounds(plan: Plan, character: Character) -> tuple[list[Round], list[str]]:
+def _rounds(character: Character, side_mm: float) -> tuple[list[Round], list[str]]:
     """The rounds of learning of a character, these writings last, and the phases that any of them lists."""
-    figure = plan.figure(character.name)
-    rounds = [] if figure is None else [*figure.rounds, round_of(figure, character, plan.cell_mm)]
+    rounds = [*character.figure.rounds, round_of(character, side_mm)]
     return rounds, [str(phase) for phase in Phase if any(phase in each.lost_percent for each in rounds)]

@@ -246,7 +246,7 @@ def learn(request: LearnRequest, progress: Progress = unseen) -> Written:
 
 def learned(written: WritingComparison) -> Plan:
     """The next plan of the characters that were captured. Raises `CalibrationError`."""
-    plan, writings = written.plan, {character.name: character for character in written.characters}
+    plan, writings = written.plan, {character.figure.name: character for character in written.characters}
     if absent := [figure.name for figure in plan.figures if figure.name not in writings]:
         where = str(written.session.recording.path)
         raise CalibrationError(where, f"shows no {absent[0]!r}: nothing is learned for it")
@@ -255,7 +255,7 @@ def learned(written: WritingComparison) -> Plan:
     footprint = fit_footprint(drawings, None if known is None else Footprint(known))
     figures: list[Figure] = []
     for figure, captured in zip(plan.figures, ink, strict=True):
-        after = _after(figure, round_of(figure, writings[figure.name], plan.cell_mm))
+        after = _after(figure, round_of(writings[figure.name], plan.cell_mm))
         if not after.settled:
             after = _corrected(after, captured, footprint, plan.planned_by.reach, plan.cell_mm)
         figures.append(after)

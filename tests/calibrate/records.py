@@ -12,6 +12,7 @@ from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, tabl
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.stroke.preprocess import Measured
+from brushloop.calibrate.writing import Figure
 from brushloop.calibrate.writing.compare import KEYS as WRITTEN_KEYS
 from brushloop.calibrate.writing.compare import PAIRS, PLANNED, Character, Table3Row, WritingComparison, WrittenRecord
 from brushloop.sessions.records import Source, Stroke
@@ -57,8 +58,9 @@ def loop_record(original: str, original_sha256: str, source: Source = Source.LOO
 
 def table_of(character: str = "字", reference: str = "a font") -> tuple[Table3Row, ...]:
     """Table 3 of one character, written twice: CSIM .8 and .9, where paper counts .99."""
-    ink = dict.fromkeys(Tone, np.zeros((128, 128), np.float32))
-    written = Character(character, reference, ink, ink, {"x-r0": ink, "x-r1": ink})
+    ink = np.zeros((128, 128), np.float32)
+    figure = Figure(name=character, source=reference)
+    written = Character(figure, reference, ink, {f"x-r{k}": dict.fromkeys(Tone, ink) for k in range(2)})
     twice = np.array([[0.8, 0.7], [0.9, 0.8]])
     # Takes the place of what would be computed from the images.
     written.__dict__["scores"] = {

@@ -106,14 +106,8 @@ def _written(folder: Path) -> str:
     cross[60:68, 30:100] = cross[30:100, 60:68] = 1.0
     ink = dict.fromkeys(Tone, cross)
     strokes = [np.array([[1.0, 2.0, 3.0, 4.0, 0.0], [5.0, 6.0, 7.0, 8.0, 9.0]])]
-    figure = Figure(
-        name="字",
-        source="a font",
-        commanded=as_points(strokes),
-        wanted=cross,
-        simulated=cross,
-    )
-    one = Character("字", "a font", ink, ink, {"zi-r01": ink, "zi-r02": ink})
+    figure = Figure(name="字", source="a font", commanded=as_points(strokes), wanted=cross, simulated=cross)
+    character = Character(figure, "a font", cross, {"zi-r01": ink, "zi-r02": ink})
     session = SimpleNamespace(
         header=Header(session_id="write-01", source=Source.LOOPBACK, software="test", brush=TWIN),
         recording=SimpleNamespace(path=folder),
@@ -121,8 +115,8 @@ def _written(folder: Path) -> str:
         calibration=CALIBRATION,
     )
     plan = Plan(model="CCD-BSM", planned_by=PlannedBy(), cell_mm=60.0, software="test", figures=(figure,))
-    made = WritingComparison(session, plan, [one])
-    return write_written(made, folder / "written", "brushloop write").read_text(encoding="utf-8")
+    written = WritingComparison(session, plan, [character])
+    return write_written(written, folder / "written", "brushloop write").read_text(encoding="utf-8")
 
 
 def _pressed(folder: Path) -> Path:

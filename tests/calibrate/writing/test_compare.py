@@ -53,7 +53,8 @@ def test_size_normalised_forgives_place_and_size_and_mm_does_not() -> None:
 
 def character(writings: int = 3) -> Character:
     captured = {f"x-r{k + 1:02d}": as_ink(cross(k)) for k in range(writings)}
-    return Character("x", "font of the test", as_ink(cross()), as_ink(cross(width=10)), captured)
+    figure = Figure(name="x", source="font of the test", simulated=cross(width=10))
+    return Character(figure, figure.source, cross(), captured)
 
 
 def test_table_3_has_a_row_for_each_comparison_and_survives_the_disk(tmp_path: Path) -> None:

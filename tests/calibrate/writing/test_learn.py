@@ -60,11 +60,12 @@ def came_out(plan: Plan) -> np.ndarray:
 
 def session(plan: Plan, name: str = "bar", ink: np.ndarray | None = None) -> WritingComparison:
     seen = came_out(plan) if ink is None else ink
-    one = Character(name, "test", as_ink(WANTED), as_ink(seen), {f"{name}-r01": as_ink(seen)})
+    figure = plan.figures[0].model_copy(update={"name": name})
+    character = Character(figure, "test", WANTED, {f"{name}-r01": as_ink(seen)})
     header = Header(session_id="s", source=Source.LOOPBACK, software="test")
     recording = SimpleNamespace(path=Path("s.mcap"))
     opened = SimpleNamespace(header=header, recording=recording, sha256="", calibration=CALIBRATION)
-    return WritingComparison(opened, plan, [one])
+    return WritingComparison(opened, plan, [character])
 
 
 @pytest.fixture(scope="module")
@@ -131,9 +132,8 @@ def drawn_disc(half_mm: float) -> np.ndarray:
 
 
 def test_what_is_lost_is_listed_by_phase(plan: Plan) -> None:
-    [figure] = plan.figures
     cut = WANTED.copy()
     cut[:, :40] = 0.0  # the first 3 mm of the stroke and its rounding are missing
-    lost = round_of(figure, session(plan, ink=cut).characters[0], SIDE_MM).lost_percent
+    lost = round_of(session(plan, ink=cut).characters[0], SIDE_MM).lost_percent
     assert max(lost, key=lambda phase: lost[phase]) == "initiation, hidden tip"
     assert lost["termination, hidden tip"] == 0.0
