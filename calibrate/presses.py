@@ -29,7 +29,7 @@ from brushloop.calibrate.stroke.preprocess import Measured, Prepared, measure, p
 from brushloop.calibrate.stroke.rectify import cut_out, on_raster, on_window, rectify_by, rescale
 from brushloop.calibrate.work import Arrays, Scheduler, key_of, threads
 from brushloop.sessions.errors import SessionDamaged
-from brushloop.sessions.recording import Capture
+from brushloop.sessions.recording import Capture, bad_stills
 from brushloop.sessions.records import Condition, Header, Stroke
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -99,7 +99,7 @@ def read_presses(
 
     Raises `SessionDamaged` for a recording that cannot be read; a photograph that cannot is refused.
     """
-    store, bad = session.store, session.recording.marked_bad()
+    store, bad = session.store, bad_stills(session.recording.path.parent)
     wanted = [k for k, stroke in enumerate(session.strokes) if chosen is None or stroke.stroke_id in chosen]
     keys = {k: key_of("press", session.sha256, session.calibration_digest, view, k) for k in wanted}
 

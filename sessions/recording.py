@@ -91,7 +91,7 @@ class Recording:
 
     def captures(self) -> Iterator[Capture]:
         """Strokes with their stills, in order of capture. Raises `SessionDamaged`."""
-        bad = self.marked_bad()
+        bad = bad_stills(self.path.parent)
         latest: deque[tuple[int, bytes]] = deque(maxlen=STILLS_KEPT)
         for _schema, channel, message in self.messages(Topic.STILL, Topic.STROKE):
             if channel.topic == Topic.STILL:
@@ -102,11 +102,6 @@ class Recording:
                 what = f"stroke {stroke.stroke_id} names still {stroke.still}, which is not there"
                 raise SessionDamaged(self.path, what)
             yield Capture(stroke, still, f"{self.path} stroke {stroke.stroke_id}", bad.get(stroke.still, ""))
-
-    def marked_bad(self) -> dict[int, str]:
-        """Reasons why captures were marked bad, by number of the still. Raises `SessionDamaged`."""
-        latest = remarks_of(self.path.parent).values()
-        return {one.still: f"was marked bad{f': {one.note}' if one.note else ''}" for one in latest if one.bad}
 
     def stills_of(self, kind: str) -> Iterator[tuple[int, bytes]]:
         """Time in ns and encoded still, in order, of those taken in steps of this kind (`board`)."""
@@ -202,3 +197,9 @@ def remarks_of(folder: Path) -> dict[int, Remark]:
     path = folder / REMARKS_NAME
     remarks = undamaged(path).events if path.is_file() else []
     return {remark.still: remark for remark in remarks if isinstance(remark, Remark)}
+
+
+def bad_stills(folder: Path) -> dict[int, str]:
+    """Why captures of a session were marked bad, by number of the still. Raises `SessionDamaged`."""
+    remarks = (remark for remark in remarks_of(folder).values() if remark.bad)
+    return {remark.still: f"was marked bad{f': {remark.note}' if remark.note else ''}" for remark in remarks}

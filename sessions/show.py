@@ -20,7 +20,7 @@ from brushloop.sessions.disk import check_folder
 from brushloop.sessions.errors import InputError, SessionError
 from brushloop.sessions.events import CaptureResult, step_words
 from brushloop.sessions.journal import JOURNAL_NAME, KILLED, RunState, read_header, replay
-from brushloop.sessions.recording import Recording, check_path, merged_file, remarks_of
+from brushloop.sessions.recording import Recording, bad_stills, check_path, merged_file
 from brushloop.sessions.records import Header, Topic
 
 DEVICES = ("robot", "robot_firmware", "camera", "lens", "brush", "ink", "paper")
@@ -79,7 +79,7 @@ def _of_journal(folder: Path) -> Details:
     for sheet, patch in sorted(state.used_patches):
         shown.sheets.setdefault(sheet + 1, []).append(patch)
     shown.sheets.setdefault(state.sheet + 1, [])
-    bad = {remark.still for remark in remarks_of(folder).values() if remark.bad}
+    bad = bad_stills(folder)
     kept = [capture for capture in state.results(CaptureResult) if capture.kept]
     pressed = [capture.press.condition for capture in kept if capture.still not in bad]
     shown.strokes, shown.marked_bad = len(pressed), len(kept) - len(pressed)

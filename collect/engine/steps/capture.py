@@ -32,7 +32,7 @@ from brushloop.drivers.devices import Frame
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions import records
 from brushloop.sessions.events import Again, BoardResult, CaptureResult, Press, ReviewResult
-from brushloop.sessions.recording import remarks_of
+from brushloop.sessions.recording import bad_stills
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
@@ -90,12 +90,11 @@ def _cut_out(run: RunContext, image: Gray, patch: Patch) -> Gray:
 def marked_bad(run: RunContext) -> list[str]:
     """Strokes that count, are marked bad, and were not listed by a REVIEW step yet, in the order in which they were
     made. Raises `SessionDamaged`."""
-    remarks = remarks_of(run.store.folder)
-    if not remarks:
+    bad = bad_stills(run.store.folder)
+    if not bad:
         return []
     state = run.store.state
     listed = {again.stroke_id for review in state.results(ReviewResult) for again in review.again}
-    bad = {remark.still for remark in remarks.values() if remark.bad}
     captures = state.results(CaptureResult)
     counted = [capture.press.stroke_id for capture in captures if capture.kept and capture.still in bad]
     return [name for name in counted if name not in listed]
