@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import Lens, fit_lens, unknown_lens
+from brushloop.calibrate.board.lens import unknown_lens
 from brushloop.calibrate.board.pix2len import Plane, fit_plane, paper_mm
 from brushloop.calibrate.stroke import PX_PER_MM, Params
 from brushloop.calibrate.stroke.preprocess import prepare
 from brushloop.calibrate.stroke.rectify import rectify_by
-from brushloop.drivers.sim.config import Table
-from brushloop.drivers.sim.scene import Optics
 from tests.calibrate.simulated_rigs import (
     BRUSHES,
     CAMERAS,
     Shot,
-    board_of,
     boards,
     heading_free_window,
-    lens_views,
     sheet,
     true_mask,
     true_scale,
@@ -81,22 +77,6 @@ def test_the_interval_of_pix2len_holds_the_truth_as_often_as_it_says(seed: int) 
     every = [one for rig in range(len(CAMERAS)) for one in draws(rig, 40, seed)]
     assert max(abs(error) for error, _ in every) <= WORST
     assert 0.93 <= np.mean([held for _, held in every]) <= 0.97
-
-
-@soak
-@half_an_hour
-@pytest.mark.parametrize("rig", range(len(CAMERAS)))
-def test_slanted_boards_give_back_the_lens(rig: int) -> None:
-    view, board = CAMERAS[rig], board_of(Table())
-    seen = [find_board(image, board, f"{k}") for k, image in enumerate(lens_views(rig, 12))]
-    fitted = fit_lens(seen, "a board", {}, {})
-    assert fitted.rms_px < 0.2
-    assert fitted.lens.matrix[0] == pytest.approx(view.width_px, rel=1e-3)
-    # Where it matters: pixels of the corners of the image, straightened.
-    corners = np.array([[20.0, 20.0], [view.width_px - 20.0, 20.0], [view.width_px / 2, view.height_px - 20.0]])
-    optics = Optics(view, 1)
-    truth = Lens.of_opencv(optics.camera_matrix, np.append(optics.distortion, 0.0), fitted.lens.size_px)
-    assert fitted.lens.undistorted(corners) == pytest.approx(truth.undistorted(corners), abs=1.0)
 
 
 @soak

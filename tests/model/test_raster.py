@@ -98,15 +98,6 @@ def test_arcs_of_any_span_and_shear_come_out_right(weight: float) -> None:
     assert_whole(outline, coverage(outline, (0.0, 25.6)), PX_MM)
 
 
-@given(presses, st.floats(-180, 180), st.sampled_from(sorted(MODELS)))
-@settings(deadline=None, max_examples=40)
-def test_the_ink_of_a_whole_mark_is_its_area(press: tuple[float, float], heading_deg: float, name: str) -> None:
-    outline = MODELS[name].profile(*press)
-    side = 2.4 * (outline.x_max_mm - outline.x_min_mm + outline.width_mm).item()
-    image = coverage(outline, (side / 2, side / 2), heading_deg, px_mm=side / 128)
-    assert image.sum(dtype=np.float64) * (side / 128) ** 2 == pytest.approx(outline.area_mm2.item(), rel=1e-6)
-
-
 @pytest.mark.parametrize(("size_px", "px_mm"), [(128, 0.2), (64, 0.05), (200, 0.1), (2, 30.0)])
 def test_images_straight_from_presses_match_the_outline_s(size_px: int, px_mm: float) -> None:
     # Marks of any size, and others that end on pixel edges; some reach beyond the image.
@@ -123,15 +114,6 @@ def test_images_straight_from_presses_match_the_outline_s(size_px: int, px_mm: f
         assert images.max() <= 1
     with pytest.raises(ValueError, match=r"out is float64 \(150, "):
         press_images(anywhere, size_px=size_px, px_mm=px_mm, out=np.zeros(level.shape))
-
-
-def test_the_tip_points_left_and_rows_grow_downwards() -> None:
-    mark = ccdbsm(Brush(), 11.0, 5.0)
-    image = coverage(mark.outline(), (18.0, 5.1))[0]
-    rows, columns = np.nonzero(image > 1e-6)
-    assert columns.min() == int((18.0 - mark.o4o3_mm.item()) / PX_MM)
-    assert columns.max() == int((18.0 + mark.o3a_mm.item()) / PX_MM)
-    assert (rows.min() + rows.max() + 1) / 2 * PX_MM == pytest.approx(5.1)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from brushloop.calibrate.fit.captures import Grid, Pressed, grid_of
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.drivers.sim.brush.brush import Brush, BrushSpec
 from brushloop.drivers.sim.brush.spec import ALLOWED, PAPER, load_brush
-from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, mechanics, with_values
+from brushloop.twin.brush import HERE, SHAPE, SPREAD, Constant, draw, with_values
 from brushloop.twin.run import LEAST_MISPLACED_MM, Estimate, fit_twin, sound_head
 from brushloop.twin.search import (
     Solution,
@@ -74,11 +74,6 @@ def test_a_mark_has_the_area_and_the_place_of_the_press_that_it_stands_for() -> 
     assert middle_mm(ink) == pytest.approx((x.mean(), y.mean()), abs=0.03)
     assert np.subtract(middle_mm(moved), middle_mm(ink)) == pytest.approx((1.0, 2.0), abs=0.03)
     assert deeper.sum() > ink.sum()
-
-
-def test_ink_constants_and_the_spread_leave_the_mechanics_alone() -> None:
-    assert mechanics(BrushSpec(film_mm=0.8, spread_wander=0.1, seed=4)) == mechanics(BrushSpec())
-    assert mechanics(BrushSpec(friction=0.3)) != mechanics(BrushSpec())
 
 
 def test_the_quality_limits_hold_for_other_presses_of_the_brush() -> None:

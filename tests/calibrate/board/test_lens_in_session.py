@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.detect import find_board
-from brushloop.calibrate.board.lens import FITTED, Lens, fit_lens, read_lens
+from brushloop.calibrate.board.lens import Lens, fit_lens, read_lens
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.calibrated import CalibrateRequest
 from brushloop.calibrate.calibrated import calibrate_session as calibrate
@@ -135,14 +135,6 @@ def test_a_session_that_was_collected_with_a_lens_needs_no_other(
     ):
         with pytest.raises(CalibrationError, match=why):
             calibrate_session(session, given)
-
-
-def test_a_straight_camera_needs_no_lens(photographed: Photographed, tmp_path: Path) -> None:
-    straight = sheet(0, 1)
-    made = calibrate_session(collected(photographed, tmp_path / "straight", straight))
-    assert made.lens is not None
-    assert made.lens.source == FITTED
-    holds(made, straight)
 
 
 def test_the_quick_look_at_a_board_knows_a_lens_too(tmp_path: Path, shot: Shot, lens: Path) -> None:
