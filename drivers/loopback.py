@@ -99,7 +99,6 @@ TIMEOUT_S = 5.0
 GUIDING_S = 120.0
 """Longest wait for an act of the person in the lab."""
 MAX_ANSWER_BYTES = 4 * 1024 * 1024
-PLAIN = ("list", "clear", "state", "release", "fresh-sheet")
 
 
 class FaultRefused(Exception):
@@ -109,17 +108,11 @@ class FaultRefused(Exception):
 
 
 def request_of(what: str, kind: str | None, options: Mapping[str, object]) -> dict[str, Any]:
-    """The request that the words of a command line ask for. Raises `FaultRefused`."""
+    """The request that the words of a command line ask for; the rig refuses what it does not know."""
     fields = {name: value for name, value in options.items() if value is not None}
-    if what not in PLAIN:
-        if kind is None:
-            raise FaultRefused(f"{what}: give a device and a kind, or one of {', '.join(PLAIN)}")
-        fields.pop("id", None)
-        return {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
-    if kind is not None or set(fields) - ({"id"} if what == "clear" else set[str]()):
-        allowed = "no option but --id" if what == "clear" else "no options"
-        raise FaultRefused(f"{what}: takes no kind and {allowed}")
-    return {"do": what, **fields}
+    if kind is None:
+        return {"do": what, **fields}
+    return {"do": "add", "fault": {"device": what, "kind": kind, **fields}}
 
 
 def ask(path: Path, request: Mapping[str, object]) -> dict[str, Any]:

@@ -108,17 +108,12 @@ UNKNOWN_CONDITION = (
 )
 
 
-def refusal(code: int) -> tuple[str, str]:
-    """(name, remedy) of a move command's return code."""
-    known = {member.value: member.name for member in ReturnCode}
-    name = known.get(abs(code), "UNKNOWN")
-    remedies = {
-        ReturnCode.BAD_STATE: "Bring the safety mode to Normal on the pendant.",
-        ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",
-        ReturnCode.BUSY: "Another program has the arm; stop it on the pendant.",
-        ReturnCode.INVALID_ARGUMENT: "Report this as a defect: the controller refuses an argument of the driver.",
-    }
-    return name, remedies.get(ReturnCode(abs(code)), "") if abs(code) in known else ""
+REFUSAL_REMEDY = {
+    ReturnCode.BAD_STATE: "Bring the safety mode to Normal on the pendant.",
+    ReturnCode.QUEUE_FULL: "Another client is sending motion; close it.",
+    ReturnCode.BUSY: "Another program has the arm; stop it on the pendant.",
+    ReturnCode.INVALID_ARGUMENT: "Report this as a defect: the controller refuses an argument of the driver.",
+}
 
 
 class WrongOperationalMode(MotionError):
@@ -308,6 +303,7 @@ def accepted(op: str, code: object) -> None:
     if code == NOT_RUNNING:
         raise NotPowered(DEVICE, op)
     if code not in (ReturnCode.OK, ReturnCode.REQUEST_IGNORED):
-        name, remedy = refusal(code)
+        known = next((member for member in ReturnCode if member == abs(code)), None)
         error = QueueFull if code == ReturnCode.QUEUE_FULL else MotionRefused
+        name, remedy = ("UNKNOWN", "") if known is None else (known.name, REFUSAL_REMEDY.get(known, ""))
         raise error(DEVICE, op, code, name, remedy)

@@ -1,4 +1,4 @@
-"""Cameras behind OpenCV: a device, a stream, a file, or a folder of images."""
+"""Cameras behind OpenCV: a device, a stream, or a video file."""
 
 from brushloop.drivers.camera.opencv import OpenCvCamera
 from brushloop.drivers.camera.source import CameraTable, Locked, found_settings

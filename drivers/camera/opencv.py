@@ -16,7 +16,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
-from brushloop.drivers.camera.source import DEVICE, CameraTable, CaptureSource, FolderSource, open_source
+from brushloop.drivers.camera.source import DEVICE, CameraTable, CaptureSource
 from brushloop.drivers.devices import Frame, Identity, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, NotConnected
 from brushloop.drivers.host import Clock
@@ -271,7 +271,7 @@ class _Grabber:
             while not self._closing.is_set():
                 opening_ns = self._clock.now_ns()
                 try:
-                    source = open_source(self._table)
+                    source = CaptureSource(self._table)
                 except ConnectionLost:
                     if lost_ns is None:
                         raise
@@ -296,7 +296,7 @@ class _Grabber:
             self._fail(DeviceError(DEVICE, "read", f"the grabber failed: {error!r}"))
             raise
 
-    def _read_all(self, source: CaptureSource | FolderSource, opening_ns: int) -> None:
+    def _read_all(self, source: CaptureSource, opening_ns: int) -> None:
         """Read until the source ends; only valid frames are kept."""
         import cv2
 

@@ -1,11 +1,10 @@
-"""Where frames come from: OpenCV's capture, or a folder of images, behind one protocol; and the table of both."""
+"""The table of a camera, and the capture of OpenCV that it names, with its settings locked."""
 
 from __future__ import annotations
 
 import http.client
 import os
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 from urllib.parse import urlsplit
 
@@ -53,7 +52,7 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
 
     kind: Literal["opencv"]
     source: str = Field(min_length=1)
-    """Stream URL, file, folder of images, or device number as text."""
+    """Stream URL, video file, or device number as text."""
     latency_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 250.0
     """Approximate time from exposure to arrival, used by `doctor` and the live picture. A run measures it."""
     max_delay_ms: Annotated[float, Field(ge=50.0, le=10_000.0)] = 1500.0
@@ -66,18 +65,8 @@ class CameraTable(BaseModel, frozen=True, extra="forbid"):
     locked: Locked = Locked()
 
 
-FOLDER_FPS = 10.0
-"""Rate at which the images of a folder are shown."""
-IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 SETTING_TOLERANCE = 0.01
 """Relative difference up to which a setting that is read back counts as applied."""
-
-
-def open_source(table: CameraTable) -> FolderSource | CaptureSource:
-    """Open what `table.source` names. Raises `ConnectionLost`, or `DeviceError` for settings that have no effect."""
-    if Path(table.source).is_dir():
-        return FolderSource(table)
-    return CaptureSource(table)
 
 
 def says_loopback(url: str) -> bool:
@@ -93,41 +82,6 @@ def says_loopback(url: str) -> bool:
         return False
     finally:
         connection.close()
-
-
-class FolderSource:
-    """The images of a folder in order of name, at a steady rate; the last one is repeated without end.
-
-    It has the attributes of `CaptureSource`. Recorded frames may end, identical ones are not a fault, and they show no
-    ink of this session: they count as simulated.
-    """
-
-    def __init__(self, table: CameraTable) -> None:
-        folder = Path(table.source)
-        self._paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-        if not self._paths:
-            raise ConnectionLost(DEVICE, "open", f"{folder} holds no PNG or JPEG images")
-        self.live = False
-        self.independent = False
-        self.simulated = True
-        self.settings: dict[str, float] = {}
-        self._period_s = 1.0 / FOLDER_FPS
-        self._shown = 0
-
-    def read(self) -> NDArray[np.uint8] | None:
-        """The next image after one period. Raises `DeviceError` naming one that cannot be read."""
-        import cv2
-
-        time.sleep(self._period_s)
-        path = self._paths[min(self._shown, len(self._paths) - 1)]
-        self._shown += 1
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image is None:  # pyright: ignore[reportUnnecessaryComparison]
-            raise DeviceError(DEVICE, "read", f"{path} is not an image")
-        return cast("NDArray[np.uint8]", image)
-
-    def release(self) -> None:
-        """Do nothing: a folder has nothing to release."""
 
 
 class CaptureSource:

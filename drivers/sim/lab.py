@@ -1,4 +1,4 @@
-"""The unknown lab as a whole: the loopback rig on an address and on the ports of a real one, and a person in it.
+"""The unknown lab as a whole: the loopback rig on the ports of a real one, and a person with hands on its arm.
 
 | request, with `"do": "hand"` | what the person does |
 |---|---|
@@ -16,68 +16,254 @@ Every answer has `says`, what the person would say; `bring` has `reached` too.
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import itertools
+import math
 import os
-import socket
+import zlib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.force.sri_m8123 import LOOPBACK_CHANNEL
+from brushloop.drivers.geometry import of_vector, product, turned, unit, vector
 from brushloop.drivers.server import LoopbackServer
+from brushloop.drivers.sim.cabinet import Cabinet
 from brushloop.drivers.sim.config import View
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.lab_facts import PICTURE_PX, Trap, draw, trapped
+from brushloop.drivers.sim.kinematics import Joints, inverse, inverted, matrix_of
+from brushloop.drivers.sim.lab_facts import (
+    LIFT_MM,
+    PICTURE_PX,
+    PIN_TILT_DEG,
+    PRESS_SHARE,
+    Facts,
+    Place,
+    Seen,
+    Trap,
+    azimuth_deg,
+    board_size_mm,
+    corner,
+    draw,
+    held,
+    over_sheet,
+    trapped,
+)
 from brushloop.drivers.sim.mjpeg_server import MjpegServer
-from brushloop.drivers.sim.person import TOUCHED, Person
 from brushloop.drivers.sim.rig import LoopbackRig
-from brushloop.drivers.sim.scene import Wall
+from brushloop.drivers.sim.scene import Held, Wall
 
-PRESS_SHARE = 0.45
-"""Deepest press, as a share of the free length, that the maker of the brush allows."""
+TOUCHED = ("pin", "board-corner", "sheet-corner", "well-rim", "wash-rim")
+"""Things that the tip touches; it is brought to the others by eye."""
+BY_EYE_MM = 1.0
+"""Standard deviation of a tip that is brought near a thing by eye, along each axis."""
+SEEN_SIGMAS = 2.5
+"""Errors beyond this many standard deviations are seen and corrected by the person."""
+UPRIGHT_DEG = 1.0
+"""Standard deviation of a brush that is held upright by eye, about either axis."""
+SQUARE_DEG = 0.15
+"""The same for a brush that is held upright against a set square."""
+DIP_ABOVE_BOTTOM_MM = 2.5
+UPRIGHT_ABOVE_MM = 70.0
+SPEED_RAD_S, ACC_RAD_S2 = 0.35, 1.0
+LOOK_S = 0.005
+PUSH_N, PUSH_S = 2.0, 1.0
+PUSHES = ((0.0, 0.0, -PUSH_N), (PUSH_N, 0.0, 0.0), (0.0, PUSH_N, 0.0))
+"""Forces in the brush's frame, N: along the brush toward the flange, then along its x and y."""
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """Labels, plugs and print of one lab."""
+class Grip:
+    """How the board is held: its slant and the side toward which it slants, its turn in the picture, its place."""
 
-    host: str
-    """Address on the pendant's network page."""
-    streams: tuple[str, ...]
-    """Addresses on the stickers of the cameras."""
-    can: tuple[str, int, str]
-    """Host, port and bus of the CAN gateway with the force sensor."""
-    ink: tuple[str, str] | None
-    """Kind and serial line of the device at the well; None where a person pours."""
-    squares: tuple[int, int]
-    square_mm: float
-    marker_mm: float
-    dictionary: str
-    radius_mm: float
-    length_mm: float
-    max_depth_mm: float
+    slant_deg: float = 0.0
+    toward_deg: float = 0.0
+    turn_deg: float = 0.0
+    aside: tuple[float, float] = (0.0, 0.0)
+    """Right and down, in shares of the picture's width and height."""
 
-    def lines(self) -> list[str]:
-        """For a person to read."""
-        host, port, bus = self.can
-        ink = "none, a person pours" if self.ink is None else f"{self.ink[0]} on {self.ink[1]}"
-        return [
-            "an unknown lab; simulated: nothing measured in it is a result on paper",
-            f"robot     the pendant shows the address {self.host}",
-            *(f"camera    {stream}" for stream in self.streams),
-            f"force     SRI M8123 on the gateway {host}:{port}/{bus}",
-            f"ink       {ink}",
-            f"print     ChArUco, {self.squares[0]} x {self.squares[1]} squares of {self.square_mm:g} mm, "
-            f"markers of {self.marker_mm:g} mm, {self.dictionary}",
-            f"brush     radius R = {self.radius_mm:g} mm, length L = {self.length_mm:g} mm, "
-            f"press at most {self.max_depth_mm:g} mm",
-        ]
+
+GRIPS = (
+    Grip(3.0),
+    *(Grip(28.0, toward) for toward in (270.0, 90.0, 0.0, 180.0)),
+    Grip(22.0, 45.0, 0.0, (-0.17, -0.17)),
+    Grip(22.0, 135.0, 0.0, (0.17, -0.17)),
+    Grip(22.0, 225.0, 0.0, (0.17, 0.17)),
+    Grip(22.0, 315.0, 0.0, (-0.17, 0.17)),
+    Grip(25.0, 60.0, 90.0),
+)
+"""How a person is asked to hold it: flat, slanted to each side, in the four corners, and turned by a quarter."""
+
+
+class Person:
+    """A person with hands on the arm of one controller.
+
+    An error of the hand depends on the seed, the thing, and how often it was asked for.
+    """
+
+    def __init__(self, cabinet: Cabinet, facts: Facts) -> None:
+        self.facts = facts
+        """The lab as it is now."""
+        self._cabinet = cabinet
+        self._world = cabinet.world
+        self._asked: Counter[str] = Counter()
+
+    def aim(self, to: str, index: int, name: str) -> Pose:
+        """Pose of the tip for a thing. Raises ValueError for one that the lab does not have."""
+        rng, place = self._drawn(to, index, name), self._place(to, name)
+        wrist_deg = azimuth_deg(place) + float(rng.normal(0.0, 5.0))
+        tilt_deg, toward_deg = 0.0, 0.0
+        if to == "pin":
+            # The brush leans to each of four sides in turn; in every second round the sides lie between those of the
+            # first, and from round to round the wrist turns.
+            tilt_deg = PIN_TILT_DEG + float(rng.uniform(-4, 0))
+            toward_deg = 90.0 * index + 45.0 * (index // 4 % 2) + float(rng.uniform(-8, 8))
+            wrist_deg += (0.0, 70.0, -70.0)[index // 4 % 3]
+        elif to == "upright":
+            wrist_deg += (0.0, 100.0, -100.0, 50.0, -50.0)[index % 5]
+        error_mm = _error_mm(rng, self.facts.hand_mm if to in TOUCHED else BY_EYE_MM)
+        x, y, z = (a + b for a, b in zip(place, error_mm, strict=True))
+        aimed = held((x, y, z), wrist_deg=wrist_deg, tilt_deg=tilt_deg, toward_deg=toward_deg)
+        about_x, about_y = np.radians(rng.normal(0.0, SQUARE_DEG if to == "upright" else UPRIGHT_DEG, 2)).tolist()
+        return Pose(x, y, z, *product(of_vector((about_x, about_y, 0.0)), aimed.quaternion))
+
+    def grip(self, index: int) -> Held:
+        """How the board is held before the camera: each time at another slant and in another part of the picture."""
+        rng = self._drawn("hold-board", index, "")
+        view, table = self.facts.config.view, self.facts.config.table
+        grip = GRIPS[index % len(GRIPS)]
+        size_x_mm, size_y_mm = board_size_mm(table)
+        high = view.height_px / view.width_px
+        longest = max(size_x_mm, size_y_mm / high) if abs(grip.turn_deg) < 45.0 else max(size_y_mm, size_x_mm / high)
+        across_mm = longest / float(rng.uniform(0.85, 0.95))
+        toward = math.radians(grip.toward_deg + float(rng.uniform(-15, 15)))
+        slant = math.radians(grip.slant_deg + float(rng.uniform(-3, 3)))
+        turn = math.radians(grip.turn_deg + float(rng.normal(0.0, 4.0)))
+        slanted = of_vector((slant * math.cos(toward), slant * math.sin(toward), 0.0))
+        rx, ry, rz = (math.degrees(v) for v in vector(product(slanted, of_vector((0.0, 0.0, turn)))))
+        x, y = grip.aside
+        return Held((rx, ry, rz), (x * across_mm, y * across_mm * high, view.focal * across_mm))
+
+    def measure(self, what: str) -> str:
+        """A length as the person writes it down. Raises ValueError for one that nobody can measure."""
+        config = self.facts.config
+        lengths_mm = {
+            "square": round(config.table.board_square_mm, 2),
+            "marker": round(config.table.board_marker_mm, 2),
+            "tool": round(config.tool_mm),
+        }
+        if what not in lengths_mm:
+            raise ValueError(f"to = {what!r} is not one of {', '.join(lengths_mm)}")
+        in_metres = self.facts.trap is Trap.TCP_IN_METRES and what == "tool"
+        return f"{lengths_mm[what] / 1e3 if in_metres else lengths_mm[what]:g}"
+
+    def _place(self, to: str, name: str) -> Place:
+        facts, table = self.facts, self.facts.config.table
+        match to:
+            case "pin":
+                return facts.pin_mm
+            case "board-corner" | "sheet-corner":
+                return corner(table, to.removesuffix("-corner"), self._meant(name))
+            case "well":
+                return table.to_base(*table.well_mm, DIP_ABOVE_BOTTOM_MM)
+            case "well-rim" | "wash-rim":
+                x, y = table.well_mm if to == "well-rim" else facts.wash_mm
+                return table.to_base(x, y + table.well_radius_mm, table.well_depth_mm)
+            case "wash-pot":
+                return table.to_base(*facts.wash_mm, DIP_ABOVE_BOTTOM_MM)
+            case "park" if facts.trap is Trap.PARK_IN_PICTURE:
+                return over_sheet(table, facts.park_mm[2] - table.paper_z_mm)
+            case "park":
+                return facts.park_mm
+            case "clear-view":
+                return facts.clear_mm
+            case "upright":
+                return over_sheet(table, UPRIGHT_ABOVE_MM)
+            case _:
+                raise ValueError(f"to = {to!r}: there is no such thing in this lab")
+
+    def _meant(self, name: str) -> str:
+        """The corner that the person takes for the one that was asked for."""
+        words, swapped = " ".join(name.replace("-", " ").replace("_", " ").split()), self.facts.swapped
+        return swapped[1 - swapped.index(words)] if swapped is not None and words in swapped else words
+
+    def _drawn(self, to: str, index: int, name: str) -> np.random.Generator:
+        key = f"{to} {index} {name}"
+        self._asked[key] += 1
+        return np.random.default_rng([self.facts.seed, 31, zlib.crc32(key.encode()), self._asked[key]])
+
+    async def push(self, index: int) -> None:
+        """Push the tip for `PUSH_S`, in the direction of this index of `PUSHES`."""
+        self._world.push_n = turned(unit(self._world.tool().quaternion), PUSHES[index % len(PUSHES)])
+        try:
+            await asyncio.sleep(PUSH_S)
+        finally:
+            self._world.push_n = (0.0, 0.0, 0.0)
+
+    async def take_hold(self) -> str | None:
+        """Power the arm at the pendant; return why it cannot be guided."""
+        world, power = self._world, self._cabinet.power
+        if power.safety not in MOVING_ALLOWED:
+            return f"The pendant shows {power.safety.value}: that has to be ended first."
+        if world.target() is not None or world.motion.held:
+            return "The arm moves by itself; I keep my hands off."
+        while power.mode != RobotMode.RUNNING:
+            power.power_on()
+            power.start_up()
+            await asyncio.sleep(LOOK_S)
+        return None
+
+    async def guide(self, aim: Pose, *, along_brush: bool = False) -> float:
+        """Lift, swing over, lower; return by how many mm the aim was missed because it is out of reach.
+
+        The last stretch leads down, or along the brush; a place that the arm does not reach is passed over.
+        """
+        reached = self._world.tool()
+        near = self._world.motion.joints(self._world.clock.now_s())
+        above = _withdrawn(aim) if along_brush else replace(aim, z_mm=aim.z_mm + LIFT_MM)
+        way: list[Joints] = []
+        for pose in (_withdrawn(reached), above, aim):
+            joints = inverse(matrix_of(pose) @ inverted(self._world.motion.tool), near)
+            if joints is not None:
+                way.append(joints)
+                near, reached = joints, pose
+        await self._move(way)
+        return math.dist(reached.position_mm, aim.position_mm)
+
+    async def _move(self, way: list[Joints]) -> None:
+        world, motion = self._world, self._world.motion
+        world.hand_guided = True
+        try:
+            for joints in way:
+                motion.add_joints(joints, SPEED_RAD_S, ACC_RAD_S2, world.clock.now_s(), 0.0)
+            while world.target() is not None:
+                await asyncio.sleep(LOOK_S)
+        finally:
+            world.hand_guided = False
+
+
+def _error_mm(rng: np.random.Generator, spread_mm: float) -> list[float]:
+    """Normal error along each axis; drawn again while it is larger than what a person would see and correct."""
+    while True:
+        error_mm = rng.normal(0.0, spread_mm, 3)
+        if np.abs(error_mm).max() <= SEEN_SIGMAS * spread_mm:
+            return error_mm.tolist()
+
+
+def _withdrawn(tip: Pose) -> Pose:
+    """The tip drawn back along the brush."""
+    back_mm = turned(unit(tip.quaternion), (0.0, 0.0, -LIFT_MM))
+    x, y, z = (a + b for a, b in zip(tip.position_mm, back_mm, strict=True))
+    return Pose(x, y, z, *tip.quaternion)
 
 
 ARCS_PORT, RTDE_PORT, CAN_PORT = 30004, 30010, 29536
 CAMERA_PORTS = (8080, 8081)
-PORTS = (ARCS_PORT, RTDE_PORT, CAN_PORT, *CAMERA_PORTS, AUBOPE_PORT)
 ROOM_FPS = 5.0
 MOST_ROUNDS = 3.0
 """The sensor's rounds come faster with simulated time, up to this many times: what one process can send and read."""
@@ -86,7 +272,8 @@ THINGS = (
     *("park", "clear-view", "hold-board", "push-sensor"),
 )
 ADDRESSES = 200
-"""How many labs of one seed can be open at once on a machine."""
+"""Labs of one seed that can be open at once on a machine."""
+_labs = itertools.count()
 
 
 class OlderSoftware(LoopbackServer):
@@ -106,7 +293,7 @@ class UnknownLab:
     ) -> None:
         clean = draw(seed, rate, picture_px)
         self.facts, self._mended = (clean, clean) if trap is None else trapped(clean, trap)
-        self.host = _free_address(seed)
+        self.host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + next(_labs)) % ADDRESSES}"
         config = replace(
             self.facts.config,
             arcs_port=ARCS_PORT,
@@ -234,22 +421,3 @@ class UnknownLab:
             await self.rig.arcs.start(self.host, ARCS_PORT)
             await self.rig.rtde.start(self.host, RTDE_PORT)
         return f"I have seen to it: {was.trap.value}."
-
-
-def _free_address(seed: int) -> str:
-    """A loopback address on which nobody uses a port of ours. Raises OSError where there is none.
-
-    Each process begins its search elsewhere: two that probed one address at the same moment would both find it free.
-    """
-    for tried in range(ADDRESSES):
-        host = f"127.16.{seed % 250 + 1}.{10 + (os.getpid() + tried) % ADDRESSES}"
-        with contextlib.ExitStack() as probes:
-            try:
-                for port in PORTS:
-                    probe = probes.enter_context(socket.socket())
-                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                    probe.bind((host, port))
-            except OSError:
-                continue
-            return host
-    raise OSError(f"no loopback address for the lab of seed {seed}: ports {', '.join(map(str, PORTS))} are in use")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from brushloop.drivers.force.simulator import ForceBoard
@@ -17,6 +18,16 @@ def fail_rounds(board: ForceBoard, *faults: str) -> None:
     """Apply these faults to the board's next rounds, one each."""
     coming = iter(faults)
     board.next_fault = lambda: next(coming, None)
+
+
+@dataclass
+class SetClock:
+    """A clock that a test sets."""
+
+    s: float = 0.0
+
+    def now_ns(self) -> int:
+        return round(1e9 * self.s)
 
 
 class PatientClock:

@@ -27,7 +27,7 @@ from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.ink.pump import ModbusPump, ModbusPumpConfig, exception, write_register
 from brushloop.drivers.ink.simulator import PtyLine, PumpFirmware, StationFirmware
 from brushloop.drivers.ink.station import InkStation, InkStationConfig, seal
-from tests.drivers.failing import PatientClock, fail_requests, heard, scripted
+from tests.drivers.failing import PatientClock, SetClock, fail_requests, heard, scripted
 from tests.waiting import until
 
 
@@ -211,27 +211,20 @@ async def test_closing_ends_an_exchange_that_waits_and_a_cancelled_one_does_not_
     assert await station.level() == 0.5
 
 
-class StillClock:
-    ns = 0
-
-    def now_ns(self) -> int:
-        return self.ns
-
-
 async def test_the_limit_per_minute_slides_and_counts_what_was_not_confirmed(
     station_line: PtyLine, well: StationFirmware, clock: PatientClock
 ):
-    minute = StillClock()
+    minute = SetClock()
     station = station_at(station_line.path, minute)
     await station.connect()
     await station.dose(2.0)
-    minute.ns = 30 * 10**9
+    minute.s = 30.0
     fail_requests(station_line, clock, "deaf", "deaf")
     with pytest.raises(DeviceTimeout):
         await station.dose(2.0)
     with pytest.raises(LimitExceeded, match=r"dose per minute = 5\.500"):
         await station.dose(1.5)
-    minute.ns = 60 * 10**9
+    minute.s = 60.0
     await station.dose(1.5)
     with pytest.raises(LimitExceeded):
         await station.dose(2.0)
@@ -254,17 +247,6 @@ async def test_a_well_is_filled_up_to_its_level_and_a_dose_that_does_not_arrive_
         await station.replenish(dips=2)
     well.well.ml = 19.0  # somebody poured
     assert (await station.replenish(dips=3)).dosed_ml == filled.dosed_ml + 2.0, "the lost dose was given as well"
-
-
-async def test_a_station_refuses_what_it_cannot_do(well: StationFirmware, station: InkStation):
-    well.lid_open = False
-    with pytest.raises(InkRefused, match="Open the lid"):
-        await station.dose(1.0)
-    well.lid_open = True
-    well.well.ml = 19.5
-    with pytest.raises(InkRefused, match="overflow"):
-        await station.dose(1.0)
-    assert well.reservoir_ml == 100.0
 
 
 # ---------------------------------------------------------------- the pump

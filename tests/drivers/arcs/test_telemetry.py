@@ -7,7 +7,6 @@ import itertools
 import math
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass
 from typing import Any
 
 import cbor2
@@ -31,7 +30,7 @@ from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
-from tests.drivers.failing import mute
+from tests.drivers.failing import SetClock, mute
 from tests.simulated_time import LoopClock
 from tests.waiting import until
 
@@ -261,16 +260,6 @@ async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(rtde: RtdeServer,
 
 
 Path = Callable[[float], Pose]
-
-
-@dataclass
-class SetClock:
-    """A clock that a test sets."""
-
-    s: float = 0.0
-
-    def now_ns(self) -> int:
-        return round(1e9 * self.s)
 
 
 def press(t_s: float) -> Pose:
