@@ -173,7 +173,7 @@ def go_wrong(robot: Any) -> None:
 
 def main(port: int, rtde_port: int) -> None:
     rpc = sdk.RpcClient()
-    rpc.setRequestTimeout(1000)
+    rpc.setRequestTimeout(60_000)  # ms: a busy machine takes its time
     SEEN["connect"] = rpc.connect("127.0.0.1", port)
     SEEN["login"] = [rpc.login("aubo", "123456"), rpc.hasLogined()]
     SEEN["names"] = rpc.getRobotNames()

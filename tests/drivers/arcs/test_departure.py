@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import math
-from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
@@ -20,8 +18,7 @@ from brushloop.drivers.arcs.controller import (
 )
 from brushloop.drivers.arcs.motion import until_settled
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import TOOL_OFFSET, ArcsTable, require_same
-from brushloop.drivers.arcs.wire import RpcConnection
+from brushloop.drivers.arcs.settings import TOOL_OFFSET, require_same
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import (
     ArmMoved,
@@ -34,39 +31,15 @@ from brushloop.drivers.errors import (
     SettingsChanged,
 )
 from brushloop.drivers.geometry import brush_pose, distance, from_wire, lean
-from brushloop.drivers.limits import Limits
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.kinematics import forward, pose_of
-from brushloop.drivers.sim.rig import HOST
-from tests.simulated_time import LoopClock
+from tests.drivers.arcs.conftest import MakeArm
 from tests.waiting import until
 
 NEAR, BEYOND = brush_pose(260.0, -220.0, 250.0), brush_pose(900.0, 0.0, 250.0)
 ABOVE, LOW = brush_pose(300.0, -200.0, 200.0), brush_pose(300.0, -200.0, 130.0)
 ELSEWHERE = brush_pose(340.0, -180.0, 100.0, tilt_deg=10.0)
 QUICK = {"speed_mm_s": 200.0, "acc_mm_s2": 800.0}
-MakeArm = Callable[..., AuboArcs]
-
-
-@pytest.fixture
-def notices() -> list[str]:
-    return []
-
-
-@pytest.fixture
-async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> AsyncIterator[MakeArm]:
-    """An arm that is not connected, by its options; its box is as wide as the room."""
-    arms: list[AuboArcs] = []
-    wide = dataclasses.replace(limits, x_mm=(-2000.0, 2000.0))
-
-    def make(**options: Any) -> AuboArcs:
-        whole = {"kind": "aubo-arcs", "host": HOST, "port": cabinet.port, "tcp_offset_mm": (0.0, 0.0, 180.0), **options}
-        arms.append(AuboArcs(ArcsTable.model_validate(whole), wide, LoopClock(), notices.append))
-        return arms[-1]
-
-    yield make
-    for arm in arms:
-        await arm.close()
 
 
 async def enabled(make: MakeArm, **options: Any) -> AuboArcs:
@@ -230,16 +203,6 @@ async def test_an_arm_that_cannot_be_stopped_is_left_to_the_watchdog(
 
 
 # ---------------------------------------------------------------- what another client does meanwhile
-
-
-@pytest.fixture
-async def other(cabinet: ArcsServer) -> AsyncIterator[Controller]:
-    """A second client of the same cabinet."""
-    client = Controller(RpcConnection(HOST, cabinet.port))
-    client.robot = "rob1"
-    await client.connection.open()
-    yield client
-    await client.connection.close()
 
 
 async def send(client: Controller, target: Pose) -> None:

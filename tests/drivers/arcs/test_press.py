@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from brushloop.drivers.arcs.controller import Controller
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.devices import Pose, QueuedLine
 from brushloop.drivers.errors import (
     ConnectionLost,
@@ -25,7 +24,6 @@ from brushloop.drivers.errors import (
 from brushloop.drivers.geometry import brush_pose, distance
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
-from brushloop.drivers.sim.rig import HOST
 from tests.drivers.failing import mute
 
 X_MM, Y_MM = 250.0, -230.0
@@ -262,16 +260,6 @@ async def test_a_safety_stop_that_can_be_read_ends_the_press_at_once(arm: AuboAr
 
 
 # ---------------------------------------------------------------- another client
-
-
-@pytest.fixture
-async def other(cabinet: ArcsServer) -> AsyncIterator[Controller]:
-    """A second client of the same cabinet."""
-    client = Controller(RpcConnection(HOST, cabinet.port))
-    client.robot = "rob1"
-    await client.connection.open()
-    yield client
-    await client.connection.close()
 
 
 @pytest.fixture

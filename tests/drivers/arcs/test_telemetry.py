@@ -13,7 +13,6 @@ import cbor2
 import pytest
 
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.arcs.settings import ArcsTable
 from brushloop.drivers.arcs.telemetry import (
     PING,
     LagMeter,
@@ -25,19 +24,17 @@ from brushloop.drivers.arcs.wire import FrameDecoder, encode
 from brushloop.drivers.devices import Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.errors import ConnectionLost, DeviceTimeout, ProtocolViolation, Stale
 from brushloop.drivers.geometry import brush_pose, distance
-from brushloop.drivers.limits import Limits
 from brushloop.drivers.server import LoopbackServer
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.faults import ALWAYS, Device, Fault
 from brushloop.drivers.sim.rig import HOST
+from tests.drivers.arcs.conftest import MakeArm
 from tests.drivers.failing import SetClock, mute
-from tests.simulated_time import LoopClock
 from tests.waiting import until
 
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 POSE = ["R1_actual_TCP_pose"]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-MakeArm = Callable[[int | None], AuboArcs]
 
 
 def test_a_topic_is_the_one_that_the_makers_client_sends():
@@ -135,27 +132,6 @@ async def rtde(cabinet: ArcsServer) -> AsyncIterator[RtdeServer]:
     await server.stop()
 
 
-@pytest.fixture
-def notices() -> list[str]:
-    return []
-
-
-@pytest.fixture
-async def make_arm(cabinet: ArcsServer, limits: Limits, notices: list[str]) -> AsyncIterator[MakeArm]:
-    arms: list[AuboArcs] = []
-
-    def make(rtde_port: int | None) -> AuboArcs:
-        table = ArcsTable(
-            kind="aubo-arcs", host=HOST, port=cabinet.port, tcp_offset_mm=(0.0, 0.0, 180.0), rtde_port=rtde_port
-        )
-        arms.append(AuboArcs(table, limits, LoopClock(), notices.append))
-        return arms[-1]
-
-    yield make
-    for arm in arms:
-        await arm.close()
-
-
 async def samples_of(arm: AuboArcs, seconds: float) -> list[PoseSample]:
     samples: list[PoseSample] = []
     arm.listen(samples.append)
@@ -167,7 +143,7 @@ async def samples_of(arm: AuboArcs, seconds: float) -> list[PoseSample]:
 async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
     rtde: RtdeServer, make_arm: MakeArm, notices: list[str], cabinet: ArcsServer
 ):
-    arm = make_arm(rtde.port)
+    arm = make_arm(rtde_port=rtde.port)
     identity = await arm.connect()
     assert identity.firmware == "interface 24000, telemetry by RTDE"
     await arm.enable()
@@ -187,7 +163,7 @@ async def test_poses_are_pushed_at_the_frequency_that_was_asked_for(
 async def test_the_lag_of_pushed_poses_is_measured_while_the_arm_moves(
     rtde: RtdeServer, make_arm: MakeArm, late_s: float
 ):
-    arm = make_arm(rtde.port)
+    arm = make_arm(rtde_port=rtde.port)
     await arm.connect()
     await arm.enable()
     assert arm.pose_lag_ms() is None
@@ -204,7 +180,7 @@ async def test_a_port_that_is_closed_or_silent_is_reported_and_poses_are_polled(
 ):
     mute(rtde)
     for port in (unused_tcp_port, rtde.port):
-        arm = make_arm(port)
+        arm = make_arm(rtde_port=port)
         assert (await arm.connect()).firmware == "interface 24000, telemetry by polling"
         assert len(await samples_of(arm, 0.2)) >= 3
     assert len(notices) == 2
@@ -212,7 +188,7 @@ async def test_a_port_that_is_closed_or_silent_is_reported_and_poses_are_polled(
 
 
 async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
-    arm = make_arm(rtde.port)
+    arm = make_arm(rtde_port=rtde.port)
     await arm.connect()
     mute(rtde)
     await asyncio.sleep(0.7)
@@ -228,7 +204,7 @@ async def test_a_silence_that_ends_is_bridged_by_asking(rtde: RtdeServer, make_a
 async def test_a_stream_that_ends_later_is_reported_and_poses_go_on(
     rtde: RtdeServer, make_arm: MakeArm, notices: list[str], fault: str
 ):
-    arm = make_arm(rtde.port)
+    arm = make_arm(rtde_port=rtde.port)
     await arm.connect()
     if fault == "mute":
         mute(rtde)
@@ -241,7 +217,7 @@ async def test_a_stream_that_ends_later_is_reported_and_poses_go_on(
 
 
 async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, make_arm: MakeArm, cabinet: ArcsServer):
-    arm = make_arm(rtde.port)
+    arm = make_arm(rtde_port=rtde.port)
     await arm.connect()
     mute(rtde)
     mute(cabinet)
@@ -253,7 +229,7 @@ async def test_where_both_ways_are_silent_the_pose_goes_stale(rtde: RtdeServer, 
 
 async def test_a_pose_that_is_none_ends_the_stream_not_the_arm(rtde: RtdeServer, make_arm: MakeArm, notices: list[str]):
     rtde._outputs["R1_actual_TCP_pose"] = (1021, lambda: [None] * 6)
-    arm = make_arm(rtde.port)
+    arm = make_arm(rtde_port=rtde.port)
     assert (await arm.connect()).firmware.endswith("polling")
     assert len(notices) == 1
     arm.latest()
