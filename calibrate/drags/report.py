@@ -44,11 +44,6 @@ from brushloop.sessions.terminal import Progress, unseen
 MEASURED = "measured.csv"
 MAX_THUMBNAILS = 60
 MAX_WORST = 12
-LIMITS = (
-    "These strokes travel along the paper, and the radius and bundle length of their brush are not known. CCD-BSM "
-    "describes one vertical press, so its length, outline, CSIM and SSIM cannot be compared with these strokes and "
-    "are not given. What can be compared is how the width grows with depth."
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +157,6 @@ def write_drags(validation: DragValidation, folder: Path, command: str) -> Path:
         note=source_note(header.source, header.brush),
         provenance=[*facts, ("validated with", made_by()), ("command", command)],
         drags=drags,
-        limits=LIMITS,
         sentences=list(fit_sentences(drags)),
         plot=_plot(drags) if drags.strokes else "",
         thumbnails=[(drag.stroke.stroke_id, image_uri(drag.thumbnail)) for drag in drags.strokes[::step]],

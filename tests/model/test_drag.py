@@ -53,11 +53,3 @@ def test_lifting_below_no_width_leaves_no_ink() -> None:
     middle = away(model, path, np.array([15.0]), Y_MM)
     assert middle.max() < 0.0
     assert away(model, path, np.array([2.0]), np.array([0.0])).item() > 0.0
-
-
-def test_a_batch_is_its_members() -> None:
-    model = DragModel()
-    paths = [line(10.0, nodes=5), line(30.0, 8.0)]
-    together = lagging(paths, model.vector()).distances(X_MM, Y_MM)
-    for one, path in zip(together, paths, strict=True):
-        assert np.array_equal(one, away(model, path, X_MM, Y_MM))

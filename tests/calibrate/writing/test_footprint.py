@@ -20,7 +20,6 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.model.characters.plan import Reach, grid, without_tilt
 from brushloop.model.drag import NAMES, Drawings, Footprint, inked
-from tests.command import brushloop
 
 SIDE_MM = 70.0
 
@@ -48,11 +47,3 @@ def test_figures_become_a_footprint() -> None:
     assert FootprintArtefact.model_validate(fields | {"values": values}).footprint() == footprint
     with pytest.raises(ValueError, match="fit the session again with `brushloop write fit`"):
         FootprintArtefact.model_validate(fields | {"values": {"drift_along_mm": 0.0}})
-
-
-def test_a_file_that_is_no_footprint_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "0123456789abcdef.json").write_text("{}", encoding="utf-8")
-    ran = brushloop("write", "plan", "子", "--footprint", "0123456789abcdef.json", cwd=tmp_path)
-    assert ran.returncode == 2
-    assert "0123456789abcdef.json" in ran.stderr
-    assert not (tmp_path / "write-plan").exists()
