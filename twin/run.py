@@ -226,13 +226,11 @@ def _predicted(
     """Yield the cells `held` as predicted by the twin solution without them, and by a Bezier refitted to the others."""
     drawn = draw(target.brush(there), place_at(there.point), held, target.grid, VOTES, FIRST_SEED).mean(axis=1)
     others = [press for cell, group in cells.items() if cell not in held for press in group]
-    bezier = None
-    with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-        bezier = refit_bezier(others, target.grid)
+    bezier = refit_bezier(others, target.grid)
     for cell, image in zip(held, drawn, strict=True):
         images: dict[str, Images] = {TWIN: image}
         if bezier is not None:
-            images[BEZIER] = image_of(bezier.outline(*cell), target.grid)
+            images[BEZIER] = image_of(bezier(*cell), target.grid)
         yield cells[cell], images
 
 

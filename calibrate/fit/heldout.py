@@ -18,7 +18,7 @@ from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import FittedPress
 from brushloop.model.outline import Outline, as_batch
-from brushloop.model.strokes import Plane, fit_plane
+from brushloop.model.strokes import fit_plane
 from brushloop.model.strokes.peers import bezier
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
@@ -27,7 +27,7 @@ BEZIER_SIZES = ("left_mm", "right_mm", "belly_mm", "shoulder")
 FITTED, BEZIER, UNCALIBRATED = "fitted", "refitted Bezier", "uncalibrated"
 Images = NDArray[np.floating]
 Draw = Callable[[float, float], Outline]
-"""The mark of a press by depth and tilt."""
+"""The mark of a press by depth and tilt, x from the point of touch."""
 MAX_FOLDS = 15
 """Most folds: the paper's grid leaves out one cell at a time, a larger grid several."""
 PER_CELL = 3
@@ -127,8 +127,8 @@ def leave_cell_out(
     predicted: list[Predicted] = []
     for (fold, others), refitted in zip(left_out, presses, strict=True):
         outlines: dict[str, Draw] = {FITTED: refitted.outline, UNCALIBRATED: published.outline}
-        with contextlib.suppress(ValueError):  # the other cells are too few to fit a plane
-            outlines[BEZIER] = refit_bezier(others, grid).outline
+        if (of_others := refit_bezier(others, grid)) is not None:
+            outlines[BEZIER] = of_others
         for cell in fold:
             images: dict[str, Images] = {}
             for name, outline in outlines.items():
@@ -163,19 +163,6 @@ def held_out_scores(predicted: Sequence[Predicted], models: Sequence[str]) -> li
     return rows
 
 
-@dataclass(frozen=True, slots=True)
-class RefittedBezier:
-    """The paper's Bezier baseline: ends, belly and shoulder as planes in (H, H alpha)."""
-
-    plane: Plane
-
-    def outline(self, depth_mm: float, tilt_deg: float) -> Outline:
-        """The stroke, x from the point of touch."""
-        left, right, belly, shoulder = self.plane.at(depth_mm, tilt_deg).values()
-        right, belly, shoulder = max(right, left + 0.2), max(belly, 0.1), min(max(shoulder, 0.0), 1.0)
-        return bezier(*as_batch(-left, right, belly, shoulder))
-
-
 def image_of(mark: Outline, grid: Grid) -> Images:
     """Coverage (len(y_mm), len(x_mm)) of a mark with one upper and one lower edge, sampled at `FINE` places a column.
 
@@ -192,14 +179,17 @@ def image_of(mark: Outline, grid: Grid) -> Images:
     return inside.reshape(len(grid.y_mm), -1, FINE).mean(axis=2) / grid.px_mm
 
 
-def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
-    """Measure each stroke's ends, width and area, and regress. Raises ValueError for too few cells to fit a plane."""
+def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> Draw | None:
+    """The paper's Bezier baseline: ends, belly and shoulder of the strokes as planes in (H, H alpha).
+
+    None where a stroke holds no ink, or the cells are too few for a plane.
+    """
     rows: list[tuple[float, float, float, float]] = []
     for stroke in strokes:
         ink = stroke.ink > 0.5
         columns = np.flatnonzero(ink.any(axis=0))
         if not len(columns):
-            raise ValueError("a stroke without ink cannot be measured")
+            return None
         left = float(grid.x_mm[columns[0]]) - 0.5 * grid.px_mm
         right = float(grid.x_mm[columns[-1]]) + 0.5 * grid.px_mm
         width = float(stroke.ink.sum(axis=0).max()) * grid.px_mm
@@ -207,7 +197,17 @@ def refit_bezier(strokes: Sequence[Pressed], grid: Grid) -> RefittedBezier:
         area = float(stroke.ink.sum()) * grid.px_mm**2
         rows.append((left, right, width, float(np.clip(4.0 - 5.0 * area / (width * (right - left)), 0.0, 1.0))))
     height, tilt = [s.depth_mm for s in strokes], [s.tilt_deg for s in strokes]
-    return RefittedBezier(fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True))))
+    try:
+        plane = fit_plane(height, tilt, dict(zip(BEZIER_SIZES, np.array(rows).T, strict=True)))
+    except ValueError:
+        return None
+
+    def outline(depth_mm: float, tilt_deg: float) -> Outline:
+        left, right, belly, shoulder = plane.at(depth_mm, tilt_deg).values()
+        right, belly, shoulder = max(right, left + 0.2), max(belly, 0.1), min(max(shoulder, 0.0), 1.0)
+        return bezier(*as_batch(-left, right, belly, shoulder))
+
+    return outline
 
 
 def _binary(image: Images) -> Floats:

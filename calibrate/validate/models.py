@@ -13,13 +13,12 @@ from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.brush import BrushFit
-from brushloop.calibrate.fit.heldout import RefittedBezier
+from brushloop.calibrate.fit.heldout import Draw
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.work import Store, key_of
 from brushloop.model.ccdbsm import DomainError
 from brushloop.model.fitted import NAME as FITTED
-from brushloop.model.fitted import FittedPress
 from brushloop.model.outline import Outline
 from brushloop.sessions.disk import file_sha256
 from brushloop.sessions.records import Condition
@@ -171,14 +170,14 @@ def known_models(session: FittedSession, generators: Sequence[Path], *, ablation
     return in_order(models)
 
 
-def held_out(info: ModelInfo, fits: Mapping[Condition, FittedPress | RefittedBezier | None]) -> Model:
+def held_out(info: ModelInfo, outlines: Mapping[Condition, Draw | None]) -> Model:
     """A model that was fitted without the cell that it predicts; None where the other cells are too few."""
 
     def mark(at: Condition) -> Mark:
-        fit = fits.get(at)
-        if fit is None:
+        outline = outlines.get(at)
+        if outline is None:
             raise DomainError("depth_mm", at.depth_mm, "other cells", "the other cells do not determine this press")
-        return fit.outline(at.depth_mm, at.tilt_deg), 0.0
+        return outline(at.depth_mm, at.tilt_deg), 0.0
 
     return Model(info, mark)
 

@@ -25,7 +25,7 @@ from brushloop.calibrate.compare.place import (
 )
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.fit.captures import Pressed, grid_of, pressed
-from brushloop.calibrate.fit.heldout import MAX_FOLDS, Refit, RefittedBezier, leave_out, refit_bezier, refits
+from brushloop.calibrate.fit.heldout import MAX_FOLDS, Draw, Refit, leave_out, refit_bezier, refits
 from brushloop.calibrate.presses import Press, read_presses, too_thin, uncommanded
 from brushloop.calibrate.scores import Scores, similarities
 from brushloop.calibrate.stats import others_of
@@ -43,7 +43,6 @@ from brushloop.calibrate.validate.models import (
     predicted,
 )
 from brushloop.calibrate.work import Arrays, Scheduler, key_of
-from brushloop.model.fitted import FittedPress
 from brushloop.sessions.records import Condition
 from brushloop.sessions.terminal import Progress, counted, unseen
 
@@ -170,7 +169,7 @@ def _held_out(
         if fits:
             yield held_out(BRUSH_LEFT_OUT, fits)
         if left_out:
-            beziers = {cell: _bezier(others, view) for fold, others in left_out for cell in fold}
+            beziers = {cell: refit_bezier(others, grid_of(view)) for fold, others in left_out for cell in fold}
             yield held_out(BEZIER_LEFT_OUT, beziers)
 
 
@@ -189,23 +188,15 @@ def _left_out(presses: Sequence[Press], most: int) -> LeftOut:
 
 def _refitted(
     session: FittedSession, left_out: LeftOut, view: Field, scheduler: Scheduler, progress: Progress
-) -> dict[Condition, FittedPress]:
-    """The brush fitted without each cell; empty for a session that was not fitted."""
+) -> dict[Condition, Draw]:
+    """The marks of the brush fitted without each cell; empty for a session that was not fitted."""
     if session.fit is None:
         return {}
     start, grid = session.fit.press(), grid_of(view)
     jobs = [Refit(others, grid, start.radius_mm, start.length_mm, start=start.values) for _, others in left_out]
     what = f"{session.header.session_id}: cells left out in turn"
     fits = refits(jobs, session.store, scheduler, what, progress)
-    return {cell: fit for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
-
-
-def _bezier(strokes: Sequence[Pressed], view: Field) -> RefittedBezier | None:
-    """A refitted Bezier; None if the cells are too few to fit a plane."""
-    try:
-        return refit_bezier(strokes, grid_of(view))
-    except ValueError:
-        return None
+    return {cell: fit.outline for (fold, _), fit in zip(left_out, fits, strict=True) for cell in fold}
 
 
 ScoreJob = tuple[Pixels, tuple[Sequence[Pixels], ...]]
@@ -263,7 +254,7 @@ def _similarity_by_strokes(
     fits = refits(jobs, session.store, scheduler, "fits from few strokes")
     values: dict[tuple[int, str], list[tuple[float, float]]] = {}
     for (_, others), few, fit in zip(trials, fitted, fits, strict=True):
-        for label, model in (("CCD-BSM", fit), ("Bézier", _bezier(few, view))):
+        for label, model in (("CCD-BSM", fit.outline), ("Bézier", refit_bezier(few, grid))):
             if model is not None:
                 values.setdefault((len(few), label), []).extend(_on_others(model, others, view))
     for (count, label), of_model in sorted(values.items()):
@@ -271,12 +262,10 @@ def _similarity_by_strokes(
         yield Step(name, count, label, csim, ssim, len(of_model))
 
 
-def _on_others(
-    model: FittedPress | RefittedBezier, presses: Sequence[Press], view: Field
-) -> Iterator[tuple[float, float]]:
+def _on_others(outline: Draw, presses: Sequence[Press], view: Field) -> Iterator[tuple[float, float]]:
     """Yield CSIM and SSIM in millimetres, binary, of each press."""
     conditions = {press.condition for press in presses}
-    images = {at: images_of(model.outline(at.depth_mm, at.tilt_deg), 0.0, view) for at in conditions}
+    images = {at: images_of(outline(at.depth_mm, at.tilt_deg), 0.0, view) for at in conditions}
     for press in presses:
         seen, drawn = (stack[MM_BINARY] / 255.0 for stack in (press.images, images[press.condition]))
         yield similarity(seen, drawn, Alignment.MM)
