@@ -231,7 +231,7 @@ def loop(
         armed=arm,
         on_screen=_on_screen(tui),
     )
-    run_loop(request, say)
+    run_loop(request)
 
 
 def write(
@@ -273,7 +273,7 @@ def write(
         armed=arm,
         on_screen=_on_screen(tui),
     )
-    Writing(request, say).run()
+    Writing(request).run()
 
 
 def _on_screen(tui: bool | None) -> bool:

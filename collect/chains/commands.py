@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-from brushloop.calibrate.artefact import artefacts
-from brushloop.collect.errors import ConfigError
+from brushloop.calibrate.artefact import current
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.start import CollectRequest, collect
+from brushloop.collect.start import Collected, CollectRequest, collect
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.terminal import show_work
-
-Say = Callable[[str], None]
-GIVEN_UP = 3
-"""Exit code of a collection that finished but left strokes out."""
+from brushloop.sessions.terminal import say, show_work
 
 
 def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
@@ -28,54 +22,48 @@ def finished_session(root: Path, config: Path, protocol: Path) -> Path | None:
         return None
     rig, wanted = load_rig(config), load_protocol(protocol).model_dump_json()
     material = (rig.brush.name, rig.ink.name, rig.paper.name)
-    found: list[Path] = []
+    sessions: list[Path] = []
     for folder in root.iterdir():
         try:
             header = Recording(folder).header
             if header.protocol == wanted and (header.brush, header.ink, header.paper) == material:
-                found.append(folder)
+                sessions.append(folder)
         except SessionError:
             continue  # open, damaged, or no session
-    return max(found, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
+    return max(sessions, key=lambda path: (path / f"{path.name}.mcap").stat().st_mtime_ns, default=None)
 
 
-def collected(say: Say, request: CollectRequest) -> int:
-    """Collect a session, or go on with it; return the exit code, `GIVEN_UP` if strokes were left out."""
+def collected(request: CollectRequest) -> Collected:
+    """Collect a session, or go on with it. Raises `ConfigError` and what ended the collection."""
     say(f"$ brushloop collect --config {request.config} --protocol {request.protocol} --out {request.out}")
-    return GIVEN_UP if collect(request).given_up else 0
+    return collect(request)
 
 
-def collected_session(say: Say, request: CollectRequest) -> Path:
+def collected_session(request: CollectRequest) -> Path:
     """The finished and calibrated session that is asked for; collected and calibrated if missing.
 
     Raises `ConfigError` and what ended the collection.
     """
-    wanted = request.out, request.config, request.protocol
-    session = finished_session(*wanted)
-    if session is None:
-        collected(say, request)
-        session = finished_session(*wanted)
-    if session is None:
-        raise ConfigError(
-            request.out, "", f"holds no finished session of {request.protocol}, although collection ended"
-        )
-    calibrated(say, session)
+    session = finished_session(request.out, request.config, request.protocol) or collected(request).folder
+    calibrated(session)
     return session
 
 
-def calibrated(say: Say, session: Path) -> None:
+def calibrated(session: Path) -> None:
     """Calibrate a session that was not calibrated yet. Raises `CalibrationError`, `SessionError`."""
     from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session  # slow to import
 
-    if not artefacts(session):
+    if current(session) is None:
         say(f"calibrate {session}")
         show_work(calibrate_session, CalibrateRequest(session))
 
 
-def fitted(say: Say, session: Path) -> None:
-    """Fit the brush of a session that has no fit yet. Raises `CalibrationError`, `SessionError`."""
+def fitted(session: Path) -> Path:
+    """The brush fit in use of a session, made if there is none. Raises `CalibrationError`, `SessionError`."""
     from brushloop.calibrate.fit.brush import FOLDER, FitRequest, fit_presses  # slow to import
 
-    if not artefacts(session, FOLDER):
+    fit = current(session, FOLDER)
+    if fit is None:
         say(f"fit {session}")
-        show_work(fit_presses, FitRequest(session))
+        fit = show_work(fit_presses, FitRequest(session)).path
+    return fit

@@ -13,17 +13,16 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from brushloop.calibrate.artefact import current
 from brushloop.calibrate.files import read_bounded, write_whole
-from brushloop.collect.chains.commands import Say, calibrated, collected_session, fitted
+from brushloop.collect.chains.commands import calibrated, collected_session, fitted
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
-from brushloop.collect.rig.config import RigConfig, load_rig
+from brushloop.collect.rig.config import load_rig
 from brushloop.collect.rig.config_file import read_text
 from brushloop.collect.start import CollectRequest
 from brushloop.sessions.recording import Recording
-from brushloop.sessions.records import BareName, Header
-from brushloop.sessions.terminal import show_work
+from brushloop.sessions.records import BareName
+from brushloop.sessions.terminal import say, show_work
 
 SETTINGS, RECOVERED, PROTOCOL, PAGE = "settings.json", "recovered.csv", "protocol-replay.toml", "loop.html"
 FITS = "brushfit"
@@ -52,17 +51,21 @@ class LoopRequest:
     on_screen: bool = False
 
 
-def run_loop(request: LoopRequest, say: Say) -> Path:
+def run_loop(request: LoopRequest) -> Path:
     """Run the unfinished stages; return the report's path. Raises `ConfigError`, `SessionError`, `CollectAborted`."""
     recording = Recording(request.session)
     folder, root = recording.path.parent, recording.path.parent.parent
     rig = load_rig(request.config)
-    _check_rig(request.config, rig, recording.header)
+    header = recording.header
+    if not header.source.imported and header.brush != rig.brush.name:
+        # Another brush makes other marks: refused before anything moves.
+        was = f"{rig.brush.name!r}: the original was pressed with {header.brush!r}"
+        raise ConfigError(request.config, "brush.name", was)
     if not (request.out / PROTOCOL).exists():
         check_fresh_sheet(root, request.sheet)  # now, not after minutes of fitting
-    fit = _fit(request, recording, say)
+    fit = _fit(request, recording)
     settings = Settings(
-        original=recording.header.session_id,
+        original=header.session_id,
         original_sha256=recording.sha256,
         fit=fit.stem,
         depth_range_mm=(LEAST_HEIGHT_MM, rig.brush.max_depth_mm),
@@ -72,11 +75,11 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
         seed=request.seed,
     )
     keep_settings(settings, request.out)
-    protocol = _recover(request, folder, fit, settings, say)
+    protocol = _recover(request, folder, fit, settings)
     wanted = CollectRequest(
         request.config, protocol, root, sheet=request.sheet, armed=request.armed, on_screen=request.on_screen
     )
-    again = collected_session(say, wanted)
+    again = collected_session(wanted)
 
     from brushloop.calibrate.loop import CompareRequest, compare  # slow to import
 
@@ -85,28 +88,18 @@ def run_loop(request: LoopRequest, say: Say) -> Path:
     return show_work(compare, CompareRequest(folder, again, request.out, command, fit)).path
 
 
-def _check_rig(path: Path, rig: RigConfig, header: Header) -> None:
-    """Refuse a rig with another brush, whose marks would differ, before anything moves."""
-    if not header.source.imported and header.brush != rig.brush.name:
-        raise ConfigError(path, "brush.name", f"{rig.brush.name!r}: the original was pressed with {header.brush!r}")
-
-
-def _fit(request: LoopRequest, recording: Recording, say: Say) -> Path:
+def _fit(request: LoopRequest, recording: Recording) -> Path:
     folder = recording.path.parent
     if not recording.header.source.imported:
-        calibrated(say, folder)
+        calibrated(folder)
     if request.fit is not None:
         return request.fit
     if (begun := begun_with(request.out)) is not None:
         return folder / FITS / f"{begun.fit}.json"  # even if another fit was made since
-    fitted(say, folder)
-    fit = current(folder, FITS)
-    if fit is None:
-        raise ConfigError(folder, "", "was not fitted")
-    return fit
+    return fitted(folder)
 
 
-def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings, say: Say) -> Path:
+def _recover(request: LoopRequest, folder: Path, fit: Path, settings: Settings) -> Path:
     """Recover depth and tilt; the protocol is written last, so where it exists this stage is done."""
     protocol = request.out / PROTOCOL
     if not protocol.exists():

@@ -11,14 +11,14 @@ from pathlib import Path
 
 from brushloop.calibrate.artefact import current
 from brushloop.calibrate.writing import PROTOCOL, PlannedBy, load_plan
-from brushloop.collect.chains.commands import Say, collected_session, finished_session
+from brushloop.collect.chains.commands import collected_session, finished_session
 from brushloop.collect.engine.open_or_resume import check_fresh_sheet
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.protocols.kinds import WriteConfig
 from brushloop.collect.rig.config import load_rig
 from brushloop.collect.start import CollectRequest
-from brushloop.sessions.terminal import show_work
+from brushloop.sessions.terminal import say, show_work
 
 PAGE = "written.html"
 FOOTPRINT = "footprint"
@@ -57,9 +57,8 @@ class WritingRequest:
 class Writing:
     """One run of the chain in this process."""
 
-    def __init__(self, request: WritingRequest, say: Say) -> None:
+    def __init__(self, request: WritingRequest) -> None:
         self._request = request
-        self._say = say
         self._sheet = request.sheet
 
     def run(self) -> Path:
@@ -72,100 +71,96 @@ class Writing:
         for number in range(1, request.learn + 1):
             plan = self._learn(plan, number)
             if all(figure.settled for figure in load_plan(plan).figures):
-                self._say("No character gained by the last round: the best plans are written.")
+                say("No character gained by the last round: the best plans are written.")
                 break
-        _check_plan(plan / PROTOCOL, request, request.count)
-        session = self._written(plan / PROTOCOL)
+        session = self._written(plan, request.count)
         return self._compare(session, plan, request.out, request.references)
 
     def _first_plan(self) -> Path:
         request, plan = self._request, self._request.out / "plan"
-        if not (plan / PROTOCOL).exists():
-            if not (request.out / "practice" / PROTOCOL).exists():
-                check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
-            brush = load_rig(request.config).brush
+        if (plan / PROTOCOL).exists():
+            return plan
+        if not (request.out / "practice" / PROTOCOL).exists():
+            check_fresh_sheet(request.sessions, request.sheet)  # now, not after planning
+        brush = load_rig(request.config).brush
 
-            from brushloop.calibrate.writing import plan as planning  # slow to import
+        from brushloop.calibrate.writing import plan as planning  # slow to import
 
-            wanted = planning.PlanRequest(
-                request.what,
-                plan,
-                PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm, speed_mm_s=request.speed_mm_s),
-                data=request.data,
-                footprint=self._footprint() if request.practice else None,
-                cell_mm=request.cell_mm,
-                repeats=self._repeats(1),
-            )
-            self._say(f"write plan {request.what} --out {plan}")
-            show_work(planning.plan, wanted)
+        wanted = planning.PlanRequest(
+            request.what,
+            plan,
+            PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm, speed_mm_s=request.speed_mm_s),
+            data=request.data,
+            footprint=self._footprint() if request.practice else None,
+            cell_mm=request.cell_mm,
+            repeats=self._repeats(1),
+        )
+        say(f"write plan {request.what} --out {plan}")
+        show_work(planning.plan, wanted)
         return plan
 
     def _footprint(self) -> Path:
         """Write the practice sheet and fit the footprint of the brush to it, if that is not done; return its file."""
         from brushloop.calibrate.writing import learn  # slow to import
 
-        request, folder = self._request, self._request.out / "practice"
+        folder = self._request.out / "practice"
         if not (folder / PROTOCOL).exists():
-            brush = load_rig(request.config).brush
-            self._say(f"write practice --out {folder}")
+            brush = load_rig(self._request.config).brush
+            say(f"write practice --out {folder}")
             by = PlannedBy(radius_mm=brush.radius_mm, length_mm=brush.length_mm)
             show_work(learn.practice, learn.PracticeRequest(folder, by))
-        session = self._written(folder / PROTOCOL)
-        found = current(session, FOOTPRINT)
-        if found is None:
-            self._say(f"write fit {session}")
-            found = show_work(learn.fit, session).path
-        return found
+        session = self._collected(folder / PROTOCOL)
+        footprint = current(session, FOOTPRINT)
+        if footprint is None:
+            say(f"write fit {session}")
+            footprint = show_work(learn.fit, session).path
+        return footprint
 
     def _learn(self, plan: Path, number: int) -> Path:
         """Write one round and learn from it; return the folder of the next plan."""
         after = self._request.out / f"plan-{number}"
-        if not (after / PROTOCOL).exists():
-            _check_plan(plan / PROTOCOL, self._request, self._repeats(number))
-            session = self._written(plan / PROTOCOL)
-            self._compare(session, plan, self._request.out / f"round-{number}")
-            from brushloop.calibrate.writing import learn  # slow to import
+        if (after / PROTOCOL).exists():
+            return after
+        session = self._written(plan, self._repeats(number))
+        self._compare(session, plan, self._request.out / f"round-{number}")
 
-            self._say(f"write learn {session} --plan {plan} --out {after}")
-            repeats, settled = self._repeats(number + 1), self._request.count
-            wanted = learn.LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled)
-            show_work(learn.learn, wanted)
+        from brushloop.calibrate.writing import learn  # slow to import
+
+        say(f"write learn {session} --plan {plan} --out {after}")
+        repeats, settled = self._repeats(number + 1), self._request.count
+        show_work(learn.learn, learn.LearnRequest(session, plan, after, repeats=repeats, settled_repeats=settled))
         return after
 
     def _repeats(self, number: int) -> int:
         """How often each character is written in round `number`, from 1; the last round is the one that counts."""
         return self._request.count if number > self._request.learn else self._request.learn_count
 
-    def _written(self, protocol: Path) -> Path:
-        """The finished and calibrated session of a plan."""
+    def _written(self, plan: Path, repeats: int) -> Path:
+        """The session of a plan. Raises `ConfigError` if the plan is for other characters or another count."""
+        path, what = plan / PROTOCOL, self._request.what
+        protocol = load_protocol(path)
+        assert isinstance(protocol, WriteConfig)
+        names = "".join(figure.name for figure in protocol.figures)
+        if not what.lower().endswith((".csv", ".json")) and names != what:
+            raise ConfigError(path, "figures", f"plans {names}, not {what}: use another --out")
+        if protocol.repeats != repeats:
+            raise ConfigError(path, "repeats", f"plans {protocol.repeats} writings, not {repeats}: use another --out")
+        return self._collected(path)
+
+    def _collected(self, protocol: Path) -> Path:
+        """The finished and calibrated session of a protocol."""
         request, sheet = self._request, None
         if self._sheet is not None and finished_session(request.sessions, request.config, protocol) is None:
             sheet, self._sheet = self._sheet, None  # used up: the next session asks again
         wanted = CollectRequest(
-            request.config,
-            protocol,
-            request.sessions,
-            sheet=sheet,
-            armed=request.armed,
-            on_screen=request.on_screen,
+            request.config, protocol, request.sessions, sheet=sheet, armed=request.armed, on_screen=request.on_screen
         )
-        return collected_session(self._say, wanted)
+        return collected_session(wanted)
 
     def _compare(self, session: Path, plan: Path, out: Path, references: tuple[str, ...] = ()) -> Path:
         from brushloop.calibrate.writing import compare  # slow to import
 
-        given = "".join(f" --reference {reference}" for reference in references)
-        line = f"brushloop write compare {session} --plan {plan} --out {out}{given}"
-        self._say(f"$ {line}")
+        options = "".join(f" --reference {reference}" for reference in references)
+        line = f"brushloop write compare {session} --plan {plan} --out {out}{options}"
+        say(f"$ {line}")
         return show_work(compare.compare, compare.CompareRequest(session, plan, out, line, references)).path
-
-
-def _check_plan(path: Path, request: WritingRequest, repeats: int) -> None:
-    """Raise `ConfigError` if the plan on disk is for other characters or another count."""
-    plan = load_protocol(path)
-    assert isinstance(plan, WriteConfig)
-    names = "".join(figure.name for figure in plan.figures)
-    if not request.what.lower().endswith((".csv", ".json")) and names != request.what:
-        raise ConfigError(path, "figures", f"plans {names}, not {request.what}: use another --out")
-    if plan.repeats != repeats:
-        raise ConfigError(path, "repeats", f"plans {plan.repeats} writings, not {repeats}: use another --out")

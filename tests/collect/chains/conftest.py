@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from tests.waiting import wait_until
+from brushloop.drivers.loopback import LoopbackRig, simulate
 
 
 def brushloop(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -25,19 +23,21 @@ class Bench:
     """A rig that serves, and a folder for everything."""
 
     folder: Path
-    process: subprocess.Popen[bytes]
-    run: Callable[..., subprocess.CompletedProcess[str]] = field(default=brushloop)
+    simulated: LoopbackRig
+
+    def run(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
+        return brushloop(*words)
 
     @property
     def rig(self) -> Path:
-        return self.folder / "rig.toml"
+        return self.simulated.config
 
     @property
     def sessions(self) -> Path:
         return self.folder / "sessions"
 
     def fresh_sheet(self) -> None:
-        self.process.send_signal(signal.SIGUSR1)
+        self.simulated.fresh_sheet()
 
     def collect(self, protocol: str) -> Path:
         """One session of a protocol; returns its folder."""
@@ -51,18 +51,7 @@ class Bench:
 
 
 @pytest.fixture
-def at_rate() -> float:
-    """Simulated seconds per real second."""
-    return 30.0
-
-
-@pytest.fixture
-def bench(tmp_path: Path, at_rate: float) -> Iterator[Bench]:
+def bench(tmp_path: Path) -> Iterator[Bench]:
     """`brushloop sim`, seed 1, its camera as sharp and as slow as it comes."""
-    command = [sys.executable, "-m", "brushloop", "sim", "--write-rig", str(tmp_path / "rig.toml")]
-    with ExitStack() as stack:
-        log = stack.enter_context((tmp_path / "rig.log").open("wb"))
-        process = stack.enter_context(subprocess.Popen([*command, "--rate", str(at_rate)], stdout=log, stderr=log))
-        stack.callback(process.terminate)
-        wait_until(lambda: b"Ctrl-C ends" in (tmp_path / "rig.log").read_bytes(), "the rig", process=process)
-        yield Bench(tmp_path, process)
+    with simulate(tmp_path) as rig:
+        yield Bench(tmp_path, rig)
