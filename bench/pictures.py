@@ -37,7 +37,7 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.capture_screen import CaptureScreen
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.collect.tui.start_screen import Paths, SessionBrowser, StartScreen
+from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.teach_app import ScreenGuide, TeachApp
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.brush.footprint import Flaw
@@ -101,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _screens() -> None:
     rig = LoopbackRig(SimConfig(rate=RATE, view=View(fps=3.0)))
     with _serving(rig):
-        app = OperatorApp(browser=SessionBrowser(Paths(), engine_for))
+        app = OperatorApp(browser=SessionBrowser(engine_for))
         try:
             asyncio.run(_tour(app, rig))
         finally:

@@ -76,23 +76,24 @@ def collect(
         preview=preview,
         live=LiveView(live_port) if live else None,
     )
-    given_up = start.collect(request).given_up
-    if given_up:
-        say(f"finished; {given_up} strokes failed every time and were left out", err=True)
+    left_out = start.collect(request).left_out
+    if left_out:
+        say(f"finished; {left_out} strokes failed every time and were left out", err=True)
         raise typer.Exit(3)
 
 
 def browse() -> None:
     """Open the start screen: `brushloop` without arguments. The screen appears before the engine is imported."""
-    from brushloop.collect.tui.app import run_browser
-    from brushloop.collect.tui.start_screen import Paths, SessionBrowser
+    from brushloop.collect.tui.app import OperatorApp, run_app
+    from brushloop.collect.tui.pictures import Pictures
+    from brushloop.collect.tui.start_screen import SessionBrowser
 
     def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
         from brushloop.collect import start
 
         return start.engine_for(opening, watched=watched, guided=guided, preview=preview)
 
-    run_browser(SessionBrowser(Paths(), engine_for))
+    run_app(OperatorApp(browser=SessionBrowser(engine_for), pictures=Pictures("auto")))
 
 
 @app.command()
@@ -235,7 +236,7 @@ def loop(
 
 
 def write(
-    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv or .json trajectory.")],
+    what: Annotated[str, typer.Argument(help="Characters (字 子 永 are shipped), or a .csv trajectory.")],
     config: Rig,
     out: Annotated[Path, typer.Option(help="Folder for the plan and the report.")] = Path("written"),
     sessions: Annotated[Path, typer.Option(help="Folder that holds sessions.")] = Path("sessions"),

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,7 +16,7 @@ from brushloop.collect.headless import run_headless
 from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
-from brushloop.sessions.terminal import plain
+from brushloop.sessions.terminal import say
 
 if TYPE_CHECKING:
     from brushloop.collect.tui.pictures import Preview
@@ -53,7 +51,7 @@ class Collected(NamedTuple):
     """A finished session, and how many strokes it left out."""
 
     folder: Path
-    given_up: int
+    left_out: int
 
 
 def engine_for(
@@ -91,25 +89,23 @@ def collect(request: CollectRequest) -> Collected:
     opening = Opening.load(
         request.out, request.config, request.protocol, new=request.new, sheet=request.sheet, armed=request.armed
     )
-    make = partial(
-        engine_for,
-        watched=request.on_screen,
-        live=request.live,
-        guided=request.guided,
-        preview=request.on_screen and request.preview != "off",
-    )
-    engine = make(opening)
 
-    def again(session_id: str) -> Engine:
-        return make(replace(opening, new=False, resume=session_id))
+    def make(resume: str | None = None) -> Engine:
+        return engine_for(
+            opening if resume is None else replace(opening, new=False, resume=resume),
+            watched=request.on_screen,
+            live=request.live,
+            guided=request.guided,
+            preview=request.on_screen and request.preview != "off",
+        )
 
-    with contextlib.ExitStack() as stack:
+    engine = make()
+    with nullcontext() if request.live is None else closing(request.live):
         if request.live is not None:
             request.live.start()
-            stack.callback(request.live.close)
-        now = _run(engine, request.preview, again, on_screen=request.on_screen).snapshot()
+        now = _run(engine, request.preview, make, on_screen=request.on_screen).snapshot()
     folder = Path(now.folder)
-    _say(ending(folder, opening.protocol.kind))
+    say(*ending(folder, opening.protocol.kind))
     return Collected(folder, now.given_up)
 
 
@@ -128,38 +124,29 @@ def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_sc
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=depth_mm)
-        _run(
-            engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine),
-            "auto",
-            None,
-            on_screen=on_screen,
-        )
-    _say("dry run done; nothing was kept\n")
+        engine = engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine)
+        _run(engine, "auto", None, on_screen=on_screen)
+    say("dry run done; nothing was kept")
 
 
-def ending(folder: Path, kind: str) -> str:
+def ending(folder: Path, kind: str) -> list[str]:
     """Lines that name the recording of a finished session and the next command; `kind` is its protocol's kind."""
     lines = [f"recorded: {folder / folder.name}.mcap"]
     if kind in PRESSES:
         # It may have been calibrated on the screen already.
         command = "validate" if (folder / "calibration").is_dir() else "calibrate"
         lines.append(f"next:     brushloop {command} {folder}")
-    return "".join(f"{line}\n" for line in lines)
+    return lines
 
 
 def _run(engine: Engine, preview: Preview, again: Callable[[str], Engine] | None, *, on_screen: bool) -> Engine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
-    if on_screen:
-        from brushloop.collect.tui.app import run_screen
+    if not on_screen:
+        run_headless(engine)
+        return engine
+    from brushloop.collect.tui.app import OperatorApp, run_app
+    from brushloop.collect.tui.pictures import Pictures
 
-        return run_screen(engine, preview, again)
-    run_headless(engine)
-    return engine
-
-
-def _say(text: str) -> None:
-    try:
-        sys.stdout.write(plain(text, keep="\n"))
-        sys.stdout.flush()
-    except OSError:
-        sys.stdout = None  # the reader is gone; Python would write again at exit and change the exit code
+    app = OperatorApp(engine, again=again, pictures=Pictures(preview))
+    run_app(app)
+    return app.engine or engine

@@ -7,27 +7,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 import time
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from textual import events, work
-from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
-from textual.screen import Screen
 
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
 from brushloop.collect.headless import REFRESH_S, obey, stop_signals
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.tui.pictures import Pictures, Preview
-from brushloop.collect.tui.question_screens import LEAVE, NOT_PARKED, UNSEEN, YES, AskScreen
-from brushloop.collect.tui.run_screen import RUN_BINDINGS, RunScreen, live_content
+from brushloop.collect.tui.capture_screen import CaptureScreen
+from brushloop.collect.tui.pictures import Pictures
+from brushloop.collect.tui.question_screens import YES, AskScreen, yes_or_no
+from brushloop.collect.tui.run_screen import RunScreen, live_content
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import HELP_KEY, plain
@@ -37,6 +34,16 @@ from brushloop.sessions.recording import mark_bad_or_good
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
 
+LEAVE = yes_or_no(
+    "A run is in progress. Finish its step, park the arm, and leave?", "park the arm and leave", "let the run continue"
+)
+NOT_PARKED = yes_or_no(
+    "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
+    "The next run begins by lifting it. Leave it as it is?",
+    "leave it as it is",
+    "stay",
+)
+UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it is", "stay")
 COMMANDS = {"f": ("sessions", "verify"), "c": ("calibrate",), "t": ("fit",), "w": ("validate",)}
 """What can be done with a session on which no run is in progress, in the order in which it is done."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
@@ -73,25 +80,24 @@ class OperatorApp(PlainApp):
         """
         super().__init__()
         self.engine = engine
+        self.leaving = False
+        """Whether the app is to end soon, whatever the state; may be set by any thread."""
         self._pictures = pictures or Pictures()
         self._browser = browser
-        self._again = again if browser is None else partial(browser.engine, preview=self._pictures.camera_shown)
+        self._again = again if browser is None else browser.engine
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
         self._main: RunScreen | None = None
         self._now_s = now_s
-        self._leave = threading.Event()
         self._leave_when_over = False
         self._deaf_until_s = 0.0
 
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
-        if self._browser is not None:
-            engine, preview = self._browser.engine, self._pictures.camera_shown
-            root = self._browser.paths.root
+        if (browser := self._browser) is not None:
             start = StartScreen(
-                self._browser,
-                lambda session_id: self._begin(partial(engine, session_id, preview=preview)),
-                lambda session_id: self._review(root / session_id),
+                browser,
+                lambda session_id: self._begin(partial(browser.engine, session_id)),
+                lambda session_id: self._review(browser.root / session_id),
                 self.run_command,
             )
             self.push_screen(start)
@@ -127,16 +133,6 @@ class OperatorApp(PlainApp):
                 return now is not None and bool(now.folder)
             case _:
                 return super().check_action(action, parameters)
-
-    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """List the keys of a run by name, then the colours."""
-        for binding in RUN_BINDINGS if self._now is not None else ():
-            action = binding.action.removeprefix("app.")
-            if action != binding.action and self.check_action(action.partition("(")[0], ()):
-                yield SystemCommand(
-                    binding.description, binding.tooltip, partial(self.call_later, self.run_action, action)
-                )
-        yield from super().get_system_commands(screen)
 
     def action_stop(self) -> None:
         """Stop the arm at once and show that, even if another screen covers the run."""
@@ -178,10 +174,10 @@ class OperatorApp(PlainApp):
 
     def action_enlarge(self) -> None:
         """Show the last capture large."""
-        if self._now is not None and self._now.last is not None and self.screen is self._main:
-            from brushloop.collect.tui.capture_screen import CaptureScreen, of_last
-
-            self.push_screen(CaptureScreen(of_last(self._now.last), self._pictures))
+        if self._now is not None and (last := self._now.last) is not None and self.screen is self._main:
+            model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
+            checks = () if last.verdict is None else last.verdict.checks
+            self.push_screen(CaptureScreen(last, checks, model, self._pictures))
 
     def action_review(self) -> None:
         """Look through the captures of the run that is shown."""
@@ -189,8 +185,7 @@ class OperatorApp(PlainApp):
             self._review(Path(self._now.folder))
 
     def _review(self, folder: Path) -> None:
-        from brushloop.collect.tui.captures import Review
-        from brushloop.collect.tui.review_screen import ReviewScreen
+        from brushloop.collect.tui.review_screen import Review, ReviewScreen  # slow to import
 
         try:
             review = Review(folder)
@@ -210,15 +205,6 @@ class OperatorApp(PlainApp):
         """Resume the session of a run that ended before its time: the engine asks first."""
         if self._now is not None and self._again is not None and self.screen is self._main:
             self._begin(partial(self._again, Path(self._now.folder).name))
-
-    @property
-    def leaving(self) -> bool:
-        """True once `leave` was called."""
-        return self._leave.is_set()
-
-    def leave(self) -> None:
-        """End the app soon, whatever the state; from any thread."""
-        self._leave.set()
 
     async def action_quit(self) -> None:
         """Leave; ask first if the arm is not parked."""
@@ -261,8 +247,17 @@ class OperatorApp(PlainApp):
     @work(exclusive=True, group="begin")
     async def _begin(self, make: Callable[[], Engine]) -> None:
         """Wait for the end of the run before; read and check the files off the screen's loop; start the run."""
+        before = self.engine
+
+        def prepare() -> Engine:
+            if before is not None:
+                # Session and devices must be free; how that run ended was shown.
+                with contextlib.suppress(Exception):
+                    before.join()
+            return make()
+
         try:
-            engine = await asyncio.to_thread(_after, self.engine, make)
+            engine = await asyncio.to_thread(prepare)
         except (ConfigError, SessionError, OSError) as error:
             if isinstance(self.screen, StartScreen):
                 self.screen.show_trouble(str(error))
@@ -278,7 +273,6 @@ class OperatorApp(PlainApp):
         self._show_run()
 
     def _show_run(self) -> None:
-        """Show the run screen."""
         if self._main is None:
             self._main = RunScreen(self._pictures, resumable=self._again is not None)
             self.push_screen(self._main)
@@ -347,67 +341,39 @@ def _what_keys_depend_on(now: Snapshot) -> tuple[bool, ...]:
     return state in FINAL, state in CAN_RESUME, state in CAN_BEGIN_AGAIN, now.last is None, bool(now.folder)
 
 
-def _after(before: Engine | None, make: Callable[[], Engine]) -> Engine:
-    """Make an engine once the one before has let go of session and devices; how that one ended was shown."""
-    if before is not None:
-        with contextlib.suppress(Exception):
-            before.join()
-    return make()
-
-
 class ScreenCrashed(Exception):
     """The screen crashed and has printed the error; the arm was stopped."""
 
 
-def run_screen(engine: Engine, preview: Preview = "auto", again: Callable[[str], Engine] | None = None) -> Engine:
-    """Run under the screen until the operator leaves; raises what ended the run.
+def run_app(app: OperatorApp) -> None:
+    """Start the app's engine, if it has one, and show the app until the operator leaves.
 
-    `again` makes the engine that resumes a session after a stop. Returns the engine that ran last.
+    A signal ends the run as without a screen, then the app. Raises what ended the last run, and `ScreenCrashed`.
     """
-    app = OperatorApp(engine, again=again, pictures=Pictures(preview))
-    with _signals(app):
-        engine.start()
-        _run(app)
-        assert app.engine is not None
-        app.engine.join()
-        return app.engine
-
-
-def run_browser(browser: SessionBrowser) -> None:
-    """Show the start screen, and run what is started from it; raises what ended the last run."""
-    app = OperatorApp(browser=browser, pictures=Pictures("auto"))
-    with _signals(app):
-        _run(app)
-        if app.engine is not None:
-            app.engine.join()
-
-
-def _run(app: OperatorApp) -> None:
-    intact = False
-    try:
-        app.run()
-        # A screen that ended because its terminal was lost did not crash.
-        intact = app.leaving or not app.return_code
-    finally:
-        engine = app.engine
-        if engine is not None:
-            # However the screen ended, nobody watches the arm from here on. An arm that is already parking continues.
-            if not engine.finished and not app.leaving:
-                engine.stop()
-            if not intact:
-                # The engine's thread dies with the process: let it bring the arm to rest and close the session first.
-                with contextlib.suppress(CollectAborted):
-                    engine.join()
-    if not intact:
-        raise ScreenCrashed("the screen crashed; the arm was stopped")
-
-
-def _signals(app: OperatorApp) -> AbstractContextManager[None]:
-    """On a signal end the run as without a screen, then the screen."""
 
     def on_signal(number: int) -> None:
         if app.engine is not None:
             obey(app.engine, number)
-        app.leave()
+        app.leaving = True
 
-    return stop_signals(on_signal)
+    intact = False
+    with stop_signals(on_signal):
+        if app.engine is not None:
+            app.engine.start()
+        try:
+            app.run()
+            # A screen that ended because its terminal was lost did not crash.
+            intact = app.leaving or not app.return_code
+        finally:
+            engine = app.engine
+            # However the screen ended, nobody watches the arm from here on. An arm that is already parking continues.
+            if engine is not None and not engine.finished and not app.leaving:
+                engine.stop()
+            if engine is not None and not intact:
+                # The engine's thread dies with the process: let it bring the arm to rest and close the session first.
+                with contextlib.suppress(CollectAborted):
+                    engine.join()
+        if not intact:
+            raise ScreenCrashed("the screen crashed; the arm was stopped")
+        if engine is not None:
+            engine.join()

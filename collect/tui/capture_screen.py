@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 from textual.app import ComposeResult
@@ -22,10 +22,9 @@ if TYPE_CHECKING:
     from brushloop.collect.engine.last_capture import LastCapture
     from brushloop.collect.quality.checks import Check
     from brushloop.sessions import records
-    from brushloop.sessions.events import Press
 
-    AnyCheck = Check | records.Check
-    """A check of a capture, from the running engine or from a recording."""
+    Checks = Sequence[Check | records.Check]
+    """Checks of a capture, from the running engine or from a recording."""
 
 WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
 """Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
@@ -33,40 +32,7 @@ OVERLAY_PX = 384
 LINE_PX = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LargeCapture:
-    """One capture, for the large view."""
-
-    press: Press
-    photo: NDArray[np.uint8] | None
-    binary: NDArray[np.bool_] | None
-    predicted: NDArray[np.bool_] | None
-    """Mark that a model predicts on the field of `binary`; None without one."""
-    model: str
-    """Which model that is, or why there is none."""
-    csim: float | None
-    checks: tuple[AnyCheck, ...]
-
-    def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """The pictures there are, by name, in the order in which they are shown."""
-        both = self.binary is not None and self.predicted is not None
-        named = {
-            "photograph": self.photo,
-            "binarised": binary_picture(self.binary),
-            "overlay": over_photograph(self.photo, self.predicted) if both and self.photo is not None else None,
-            "difference": difference(self.binary, self.predicted) if both else None,
-        }
-        return {name: picture for name, picture in named.items() if picture is not None}
-
-
-def of_last(last: LastCapture) -> LargeCapture:
-    """The newest capture of a run, with CCD-BSM as published."""
-    model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
-    checks = () if last.verdict is None else last.verdict.checks
-    return LargeCapture(last.press, last.photo, last.binary, last.model, model, last.likeness, checks)
-
-
-def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """The edge of the predicted mark on the photograph of the same field."""
     import cv2
     import numpy as np
@@ -77,7 +43,7 @@ def over_photograph(photo: NDArray[np.uint8], predicted: NDArray[np.bool_] | Non
     return np.asarray(cv2.drawContours(picture, edges, -1, PREDICTED, LINE_PX), np.uint8)
 
 
-def difference(captured: NDArray[np.bool_] | None, predicted: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Where both have ink, only the capture has it, and only the prediction has it."""
     import numpy as np
 
@@ -85,7 +51,7 @@ def difference(captured: NDArray[np.bool_] | None, predicted: NDArray[np.bool_] 
     return colours[2 * np.asarray(captured, np.uint8) + np.asarray(predicted, np.uint8)]
 
 
-def checks_content(checks: tuple[AnyCheck, ...]) -> Content:
+def checks_content(checks: Checks) -> Content:
     """A line for each check with value and limit, those missed first, with what to do about them."""
     lines: list[Content] = []
     for check in sorted(checks, key=lambda check: check.passed):
@@ -103,7 +69,7 @@ def _number(value: float | None) -> str:
     return f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
 
 
-def _limit(check: AnyCheck) -> str:
+def _limit(check: Check | records.Check) -> str:
     """`≤ 0.25 mm`, or nothing for a check without a limit."""
     if check.score is None or check.threshold is None:
         return ""
@@ -129,10 +95,19 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         *(Binding(str(number), f"choose({number - 1})", "Picture", show=False) for number in range(1, 5)),
     ]
 
-    def __init__(self, capture: LargeCapture, pictures: Pictures) -> None:
+    def __init__(self, capture: LastCapture, checks: Checks, model: str, pictures: Pictures) -> None:
+        """`model` says what predicts the mark of this capture, or why nothing does."""
         super().__init__()
-        self._capture = capture
-        self._images = capture.pictures()
+        self._capture, self._checks, self._model = capture, checks, model
+        photo, binary, predicted = capture.photo, capture.binary, capture.model
+        self._images: dict[str, NDArray[np.uint8]] = {}
+        if photo is not None:
+            self._images["photograph"] = photo
+        if (picture := binary_picture(binary)) is not None:
+            self._images["binarised"] = picture
+        if photo is not None and binary is not None and predicted is not None:
+            self._images["overlay"] = over_photograph(photo, predicted)
+            self._images["difference"] = difference(binary, predicted)
         self._at = len(self._images) - 1  # the last picture says most
         self._names, self._picture = Line("large-names"), pictures.make("large-picture")
 
@@ -141,7 +116,7 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         title, words = Line("large-title"), Line("large-words")
         press = self._capture.press
         title.show(f"{one_line(press.stroke_id)}   {condition_text(press.condition)}")
-        words.show(words_content(self._capture))
+        words.show(self._words())
         yield title
         with Horizontal():
             with Vertical(id="large-pictures"):
@@ -172,13 +147,12 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
             self._names.show(Content("  ").join(names))
             self._picture.show(list(self._images.values())[at])
 
-
-def words_content(capture: LargeCapture) -> Content:
-    """The checks, then what is compared."""
-    lines = [checks_content(capture.checks), Content(""), Content.styled(plain(capture.model), "bold")]
-    if capture.csim is not None:
-        lines.append(labelled("CSIM", f"{100.0 * capture.csim:.1f} % in mm"))
-    if capture.predicted is not None and capture.binary is not None:
-        for colour, what in ((BOTH, "both"), (CAPTURED, "captured only"), (PREDICTED, "predicted only")):
-            lines.append(Content.assemble(("██", "rgb({},{},{})".format(*colour)), f" {what}"))
-    return Content("\n").join(lines)
+    def _words(self) -> Content:
+        """The checks, then what is compared."""
+        lines = [checks_content(self._checks), Content(""), Content.styled(plain(self._model), "bold")]
+        if (csim := self._capture.likeness) is not None:
+            lines.append(labelled("CSIM", f"{100.0 * csim:.1f} % in mm"))
+        if "difference" in self._images:
+            for colour, what in ((BOTH, "both"), (CAPTURED, "captured only"), (PREDICTED, "predicted only")):
+                lines.append(Content.assemble(("██", "rgb({},{},{})".format(*colour)), f" {what}"))
+        return Content("\n").join(lines)

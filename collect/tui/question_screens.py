@@ -1,4 +1,4 @@
-"""Questions to the operator, with their answers on keys: the engine's, and the screen's own.
+"""Questions to the operator, with their answers on keys or typed: the engine's, and the screen's own.
 
 The stop keys work over all of them.
 """
@@ -14,9 +14,8 @@ from textual.binding import Binding, BindingType
 from textual.containers import Vertical
 from textual.content import Content
 from textual.screen import ModalScreen
-from textual.widgets import Footer, Static
+from textual.widgets import Footer, Input, Static
 
-from brushloop.collect.errors import NOT_AT_REST
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.widgets import HELP_KEY, STOP, Line, app_of, plain
@@ -29,20 +28,9 @@ def yes_or_no(question: str, yes: str, no: str) -> Prompt:
     return Prompt(question, (Choice(YES, yes), Choice(NO, no)), NO)
 
 
-LEAVE = yes_or_no(
-    "A run is in progress. Finish its step, park the arm, and leave?", "park the arm and leave", "let the run continue"
-)
-NOT_PARKED = yes_or_no(
-    "The arm is not parked: it rests where it was stopped, perhaps with the brush down. "
-    "The next run begins by lifting it. Leave it as it is?",
-    "leave it as it is",
-    "stay",
-)
-UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it is", "stay")
-
-
 class AskScreen(ModalScreen[str]):
-    """One question. The engine's stays until the engine has its answer; the screen's own ends with the key."""
+    """One question. The engine's stays until the engine has its answer; the screen's own ends with the key, or with the
+    typed line. Escape ends it with None."""
 
     DEFAULT_CSS = """
     AskScreen { align: center middle; }
@@ -57,7 +45,7 @@ class AskScreen(ModalScreen[str]):
     BINDINGS: ClassVar[list[BindingType]] = [
         STOP,
         Binding("q", "leave", "Leave: park the arm, answer nothing"),
-        Binding("escape", "refuse", "Back"),
+        Binding("escape", "dismiss", "Back"),
         HELP_KEY,
     ]
 
@@ -77,22 +65,24 @@ class AskScreen(ModalScreen[str]):
         return self._answer is None
 
     def compose(self) -> ComposeResult:
-        """Lay out the question, its picture, and a line for each answer."""
+        """Lay out the question, its picture, and a line for each answer or for the one that is typed."""
         with Vertical():
             yield Static(question_content(self.prompt), id="question", markup=False)
             if self.prompt.image is not None:
                 picture = self._pictures.make("cause")
                 picture.show(self.prompt.image)
                 yield picture
+            if self.prompt.read is not None:
+                yield Input(self.prompt.default, id="answer", compact=True, select_on_focus=False)
             if not self.own:
                 yield self._live
                 yield Static("Waits until it is answered; the arm does not move meanwhile.", markup=False)
-        yield Footer(compact=True, show_command_palette=False)
+        yield Footer(compact=True)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Escape answers only the screen's own questions, and q leaves only the engine's."""
-        if action in ("refuse", "leave"):
-            return self.own is (action == "refuse")
+        """Escape ends only the screen's own questions, and q leaves only the engine's."""
+        if action in ("dismiss", "leave"):
+            return self.own is (action == "dismiss")
         return super().check_action(action, parameters)
 
     def on_key(self, event: events.Key) -> None:
@@ -101,13 +91,13 @@ class AskScreen(ModalScreen[str]):
             event.stop()
             (self._answer or self.dismiss)(str(event.character))
 
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Answer with the typed line."""
+        self.dismiss(event.value)
+
     async def action_leave(self) -> None:
         """Leave the run, whatever is asked."""
         await app_of(self).action_quit()
-
-    def action_refuse(self) -> None:
-        """Answer what changes nothing."""
-        self.dismiss(self.prompt.default)
 
     def show(self, live: Content) -> None:
         """Show where the arm is and what it feels: a person who jogs, or turns the lens, watches that."""

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from textual import work
 from textual.app import ComposeResult
@@ -14,11 +17,22 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.screen import Screen
-from textual.widgets import Footer, Input, OptionList
+from textual.widgets import Footer, OptionList
 
+from brushloop.calibrate.artefact import current, load_artefact
+from brushloop.calibrate.board.pix2len import Plane, see_board
+from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.fit.brush import BrushFit
+from brushloop.calibrate.session import board_of, lens_in_use
+from brushloop.calibrate.stats import odd_waits, waits_of
+from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of
+from brushloop.collect.operator import Prompt
+from brushloop.collect.rig.paper import Patch
 from brushloop.collect.tui.capture_screen import CaptureScreen
-from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
 from brushloop.collect.tui.pictures import Pictures, binary_picture
+from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
     SOFTWARE_STOP,
@@ -32,13 +46,162 @@ from brushloop.collect.tui.widgets import (
     plain,
     trouble,
 )
-from brushloop.sessions.errors import SessionError
-from brushloop.sessions.events import Remark
-from brushloop.sessions.recording import add_remark, merged_file
-from brushloop.sessions.records import Condition
+from brushloop.model.similarity import csim
+from brushloop.sessions.disk import check_folder
+from brushloop.sessions.errors import InputError, SessionDamaged, SessionError
+from brushloop.sessions.events import CaptureResult, Press, Remark
+from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.messages import decode_gray, decode_still
+from brushloop.sessions.recording import add_remark, merged_file, remarks_of
+from brushloop.sessions.records import Check, Condition, Quality, Stroke, Topic
 
-AFTER_THE_RUN = ("note", "finish")
-"""Actions of the review that wait until no run is in progress: in a note, `s` is a letter."""
+if TYPE_CHECKING:
+    from brushloop.calibrate.board.lens import Lens
+
+NO_FIT = "no fit yet: run `brushloop fit`"
+Alike = tuple[float, int] | None
+"""Mean CSIM of every pair of presses of one condition, and their number; None for fewer than two."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReviewCapture:
+    """One capture of a session."""
+
+    result: CaptureResult
+    file: str
+    remark: Remark | None
+    unlike: str = ""
+    """How its time from dip to touch differs from that of the session's other strokes; empty if it does not differ."""
+
+    @property
+    def press(self) -> Press:
+        """The press in it."""
+        return self.result.press
+
+    @property
+    def counts(self) -> bool:
+        """Whether it counts: kept by the run, and not marked bad afterwards."""
+        return self.result.kept and not self.marked_bad
+
+    @property
+    def marked_bad(self) -> bool:
+        """Whether a person marked it bad."""
+        return self.remark is not None and self.remark.bad
+
+    @property
+    def note(self) -> str:
+        """What a person wrote about it."""
+        return "" if self.remark is None else self.remark.note
+
+
+class Review:
+    """One session's folder, open or closed; reads it and writes nothing."""
+
+    not_compared: str = ""
+    """Why photographs are shown whole and presses are not compared; empty where board and lens are known."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises `SessionDamaged`, and `InputError` if the session was not collected here or holds links."""
+        self.folder = folder
+        if not (folder / JOURNAL_NAME).is_file():
+            raise InputError(folder, f"holds no {JOURNAL_NAME}: imported photographs are compared with `validate`")
+        check_folder(folder)
+        self._plane: Plane | None = None
+        self._pictures: dict[int, LastCapture] = {}
+        self._checks: dict[int, tuple[Check, ...]] = {}
+        self._board: BoardSpec | None = None
+        self._lens: Lens | None = None
+        try:
+            # As the session recorded them: lens files lie beside the rig's own rig.toml, not beside its snapshot here.
+            self._lens = lens_in_use(folder)
+            self._board = board_of(folder)
+        except CalibrationError as error:
+            self.not_compared = str(error)
+        self.read()
+
+    def read(self) -> None:
+        """Read the journal and the remarks again."""
+        state, remarks = replay(self.folder / JOURNAL_NAME), remarks_of(self.folder)
+        self.open = state.is_open
+        odd = odd_waits(waits_of(state))
+        captures = [
+            ReviewCapture(result, step.file, remarks.get(result.still), odd.get(result.still, ""))
+            for step in state.files.values()
+            if isinstance(result := step.result, CaptureResult)
+        ]
+        captures.sort(key=lambda c: (c.press.condition, c.press.stroke_id, c.result.still))
+        self.captures = tuple(captures)
+
+    def pictures(self, capture: ReviewCapture) -> LastCapture:
+        """A capture with its pictures, made once: the whole photograph where the board is not seen.
+
+        Takes a tenth of a second: call it off a screen's loop. Raises `SessionDamaged` if the still is missing.
+        """
+        still = capture.result.still
+        if still not in self._pictures:
+            self._pictures[still] = self._make_pictures(capture)
+        return self._pictures[still]
+
+    def repeatability(self, condition: Condition) -> Alike:
+        """How alike the counted presses of one condition are.
+
+        CSIM is that of the validation, on the binarised 128 x 128 images in the millimetre alignment.
+        """
+        binaries = [
+            pictures.binary.astype("float32")
+            for capture in self.captures
+            if capture.press.condition == condition and capture.counts
+            if (pictures := self.pictures(capture)).binary is not None
+        ]
+        if len(binaries) < 2:
+            return None
+        return statistics.fmean(csim(a, b) for a, b in itertools.combinations(binaries, 2)), len(binaries)
+
+    def predicted(self, capture: ReviewCapture) -> tuple[LastCapture, tuple[Check, ...], str]:
+        """A capture with the mark that the session's fitted brush predicts, its checks, and which fit that is.
+
+        Call it off a screen's loop. Raises `SessionDamaged` as `pictures` does.
+        """
+        pictures, model = self.pictures(capture), NO_FIT
+        try:
+            if (path := current(self.folder, FITS)) is not None:
+                fit = load_artefact(path, BrushFit)
+                pictures = replace(pictures, model=mark_of(fit.press(), capture.press.condition))
+                model = f"CCD-BSM fitted to {fit.strokes} strokes of {fit.session_id}"
+        except CalibrationError as error:
+            model = str(error)
+        return pictures, self._checks.get(capture.result.still, ()), model
+
+    def _make_pictures(self, capture: ReviewCapture) -> LastCapture:
+        path, result = self.folder / capture.file, capture.result
+        path = path if path.is_file() else merged_file(self.folder)
+        image, stroke = None, None
+        for _schema, channel, message in McapFile(path).sound().messages([Topic.STILL, Topic.STROKE, Topic.QUALITY]):
+            if message.sequence != result.still:
+                continue
+            if channel.topic == Topic.STILL:
+                image = decode_gray(decode_still(message.data, path), str(path))
+            elif channel.topic == Topic.QUALITY:
+                self._checks[result.still] = Quality.model_validate_json(message.data).checks
+            else:
+                stroke = Stroke.model_validate_json(message.data)
+        if image is None:
+            raise SessionDamaged(path, f"holds no still {result.still}")
+        whole = LastCapture(result.press, result.still, result.kept, None, image)
+        if stroke is None or stroke.cell_mm is None or self._board is None:
+            return whole  # a take that does not count has no stroke record
+        if self._lens is not None:
+            if image.shape[::-1] != self._lens.size_px:
+                return whole  # the lens was calibrated for another size
+            image = self._lens.undistort(image)
+        try:
+            self._plane = see_board(image, self._board)
+        except CalibrationError:
+            if self._plane is None:
+                return whole
+        photo, binary = pictures_of(image, self._plane, Patch(0, *stroke.cell_mm))
+        return replace(whole, photo=photo, binary=binary)
 
 
 class ReviewScreen(Screen[None]):
@@ -51,12 +214,10 @@ class ReviewScreen(Screen[None]):
     ReviewScreen #shown { width: 1fr; padding: 0 1; border-left: solid $foreground 40%; }
     ReviewScreen #words { height: auto; }
     ReviewScreen #review-photo { margin-right: 1; }
-    ReviewScreen #note-line { height: 1; border: none; padding: 0 1; display: none; }
-    ReviewScreen.-noting #note-line { display: block; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         STOP,
-        Binding("escape", "back", "Back"),
+        Binding("escape", "app.pop_screen", "Back"),
         Binding("b", "mark", "Bad / good"),
         Binding("o", "note", "Note"),
         Binding("f", "finish", "Finish"),
@@ -72,14 +233,11 @@ class ReviewScreen(Screen[None]):
         self._review = review
         self._made_by = pictures
         self._finish, self._at_work = finish, at_work
-        self._rows: tuple[ReviewCapture, ...] = ()
         self._capture: ReviewCapture | None = None
-        self._pictures: CapturePictures | None = None
-        self._alike: dict[Condition, tuple[float, int] | None] = {}
+        self._alike: dict[Condition, Alike] = {}
         self._title, self._words = Line("review-title"), Line("words")
         self._options = Rows("captures")
         self._photo, self._binary = pictures.make("review-photo"), pictures.make("review-binary")
-        self._note = Input(placeholder="note, enter keeps it, escape leaves it", id="note-line", compact=True)
 
     def compose(self) -> ComposeResult:
         """Lay out the list, the pictures, the keys."""
@@ -91,7 +249,6 @@ class ReviewScreen(Screen[None]):
                 with Horizontal():
                     yield self._photo
                     yield self._binary
-        yield self._note
         yield Footer(compact=True)
 
     def on_mount(self) -> None:
@@ -99,38 +256,27 @@ class ReviewScreen(Screen[None]):
         self._list(0)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Whether a key does something now."""
-        if action in AFTER_THE_RUN:
+        """Notes and commands wait until no run is in progress."""
+        if action in ("note", "finish"):
             return not self._at_work()
         return super().check_action(action, parameters)
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         """Show the capture under the cursor."""
-        self._capture, self._pictures = self._rows[event.option_index], None
+        self._capture = self._review.captures[event.option_index]
         self._show_words()
         self._load(self._capture)
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Show the capture under the cursor large, beside what the fitted brush predicts."""
-        self._enlarge(self._rows[event.option_index])
-
     @work(exclusive=True, group="large")
-    async def _enlarge(self, capture: ReviewCapture) -> None:
+    async def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        """Show the capture under the cursor large, beside what the fitted brush predicts."""
         try:
-            large = await asyncio.to_thread(self._review.large, capture)
+            large = await asyncio.to_thread(self._review.predicted, self._review.captures[event.option_index])
         except SessionError as error:
             self.notify(plain(str(error)), severity="error")
             return
         if self.is_active:
-            app_of(self).push_screen(CaptureScreen(large, self._made_by))
-
-    def action_back(self) -> None:
-        """Leave the note, or the screen."""
-        if self.has_class("-noting"):
-            self.remove_class("-noting")
-            self._options.focus()
-        else:
-            app_of(self).pop_screen()
+            app_of(self).push_screen(CaptureScreen(*large, self._made_by))
 
     def action_mark(self) -> None:
         """Mark the capture bad, or good again."""
@@ -138,32 +284,26 @@ class ReviewScreen(Screen[None]):
         if capture is not None and not capture.result.kept:
             self.notify(f"{capture.press.stroke_id}: the run did not count it; there is nothing to mark.")
         elif capture is not None:
-            bad = capture.counts
-            self._remark(bad=bad, note="" if capture.remark is None else capture.remark.note)
-            if bad and self._review.open:
+            self._remark(capture, bad=capture.counts, note=capture.note)
+            if capture.counts and self._review.open:
                 self.notify(f"{capture.press.stroke_id}: pressed again after the planned strokes")
 
     def action_note(self) -> None:
         """Let the operator type a note."""
-        if self._capture is not None:
-            self._note.value = "" if self._capture.remark is None else self._capture.remark.note
-            self.add_class("-noting")
-            self._note.focus()
+        if (capture := self._capture) is not None:
 
-    def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Keep the note."""
-        if self._capture is not None:
-            self._remark(bad=self._capture.remark is not None and self._capture.remark.bad, note=event.value)
-        self.action_back()
+            def answered(note: str | None) -> None:
+                if note is not None:
+                    self._remark(capture, bad=capture.marked_bad, note=note)
+
+            question = f"{capture.press.stroke_id}: a note. Enter keeps it, escape leaves it."
+            app_of(self).push_screen(AskScreen(Prompt(question, default=capture.note, read=str)), answered)
 
     def action_finish(self) -> None:
         """Show what can be done with the session."""
         self._finish(self._review.folder)
 
-    def _remark(self, *, bad: bool, note: str) -> None:
-        capture = self._capture
-        if capture is None:
-            return
+    def _remark(self, capture: ReviewCapture, *, bad: bool, note: str) -> None:
         still, stroke_id = capture.result.still, capture.press.stroke_id
         remark = Remark(t_ns=time.time_ns(), still=still, stroke_id=stroke_id, bad=bad, note=note)
         try:
@@ -176,75 +316,62 @@ class ReviewScreen(Screen[None]):
         self._list(self._options.highlighted or 0)
 
     def _list(self, at: int) -> None:
-        self._rows = tuple(
-            sorted(self._review.captures, key=lambda c: (c.press.condition, c.press.stroke_id, c.result.still))
-        )
-        good = sum(row.counts for row in self._rows)
-        state = f"open. {SOFTWARE_STOP}" if self._at_work() else "open" if self._review.open else "closed"
-        self._title.show(f"{one_line(self._review.folder.name)}: {good} of {len(self._rows)} count; {state}")
-        self._options.fill((_row_content(row) for row in self._rows), at)
-        if not self._rows:
+        review, captures = self._review, self._review.captures
+        good = sum(capture.counts for capture in captures)
+        state = f"open. {SOFTWARE_STOP}" if self._at_work() else "open" if review.open else "closed"
+        self._title.show(f"{one_line(review.folder.name)}: {good} of {len(captures)} count; {state}")
+        self._options.fill(map(_row_content, captures), at)
+        if not captures:
             self._words.show("no captures yet")
-
-    def _show_words(self) -> None:
-        if self._capture is not None:
-            self._words.show(_words(self._capture, self._pictures, self._alike, self._review))
 
     @work(exclusive=True, group="look")
     async def _load(self, capture: ReviewCapture) -> None:
         """Show its pictures, then how alike the presses of its condition are; both are made off the screen's loop."""
         try:
-            self._pictures = await asyncio.to_thread(self._review.pictures, capture)
-            self._photo.show(self._pictures.photo)
-            self._binary.show(binary_picture(self._pictures.binary))
+            pictures = await asyncio.to_thread(self._review.pictures, capture)
+            self._photo.show(pictures.photo)
+            self._binary.show(binary_picture(pictures.binary))
+            condition = capture.press.condition
+            if condition not in self._alike:
+                self._alike[condition] = await asyncio.to_thread(self._review.repeatability, condition)
             self._show_words()
-            asked = capture.press.condition
-            if asked not in self._alike:
-                self._alike[asked] = await asyncio.to_thread(self._review.repeatability, asked)
-                self._show_words()
         except SessionError as error:
             self._words.show(trouble(error))
+
+    def _show_words(self) -> None:
+        capture, review = self._capture, self._review
+        if capture is None:
+            return
+        result, press = capture.result, capture.press
+        why = "  marked bad" if capture.marked_bad else ""
+        if not result.kept:
+            why = f"  not counted by the run{f': {result.verdict}' if result.verdict else ''}"
+        file = capture.file if (review.folder / capture.file).is_file() else merged_file(review.folder).name
+        lines = [
+            Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),
+            labelled("MCAP", f"{file}  still {result.still}"),
+            labelled("Repeats", self._alike_text(press.condition)),
+        ]
+        if capture.unlike:
+            lines.append(labelled("Waited", Content.styled(f"! {capture.unlike}", "bold $text-warning")))
+        elif press.dip_to_touch_s is not None:
+            lines.append(labelled("Waited", f"{press.dip_to_touch_s:.1f} s from dip to touch"))
+        if capture.note:
+            lines.append(labelled("Note", plain(capture.note)))
+        self._words.show(Content("\n").join(lines))
+
+    def _alike_text(self, condition: Condition) -> str:
+        if self._review.not_compared:
+            return f"not compared: {plain(self._review.not_compared)}"
+        if condition not in self._alike:
+            return "comparing ..."
+        alike = self._alike[condition]
+        return "one press only" if alike is None else f"mean CSIM {alike[0]:.3f} of every pair of {alike[1]} presses"
 
 
 def _row_content(capture: ReviewCapture) -> Content:
     sign, style = ("✓", "") if capture.counts else ("!", "bold $text-warning")
-    noted = " ✎" if capture.remark is not None and capture.remark.note else ""
+    noted = " ✎" if capture.note else ""
     waited = " dip?" if capture.unlike else ""
-    return Content.assemble(
-        (sign, style), f" {one_line(capture.press.stroke_id)}{noted}", (waited, "bold $text-warning")
-    )
-
-
-def _words(
-    capture: ReviewCapture,
-    pictures: CapturePictures | None,
-    alike: dict[Condition, tuple[float, int] | None],
-    review: Review,
-) -> Content:
-    result, press = capture.result, capture.press
-    why = "" if capture.counts else "  marked bad"
-    if not result.kept:
-        why = f"  not counted by the run{f': {result.verdict}' if result.verdict else ''}"
-    file = capture.file if (review.folder / capture.file).is_file() else merged_file(review.folder).name
-    when = "" if pictures is None else f"  at {pictures.log_ns / 1e9:.3f} s"
-    lines = [
-        Content.assemble((press.stroke_id, "bold"), f"  {condition_text(press.condition)}", (why, "bold")),
-        labelled("MCAP", f"{file}  still {result.still}{when}"),
-        labelled("Repeats", _alike_text(alike, press.condition, review.not_compared)),
-    ]
-    if capture.unlike:
-        lines.append(labelled("Waited", Content.styled(f"! {capture.unlike}", "bold $text-warning")))
-    elif press.dip_to_touch_s is not None:
-        lines.append(labelled("Waited", f"{press.dip_to_touch_s:.1f} s from dip to touch"))
-    if capture.remark is not None and capture.remark.note:
-        lines.append(labelled("Note", plain(capture.remark.note)))
-    return Content("\n").join(lines)
-
-
-def _alike_text(alike: dict[Condition, tuple[float, int] | None], asked: Condition, not_compared: str) -> str:
-    if not_compared:
-        return f"not compared: {plain(not_compared)}"
-    if asked not in alike:
-        return "comparing ..."
-    pairs = alike[asked]
-    return "one press only" if pairs is None else f"mean CSIM {pairs[0]:.3f} of every pair of {pairs[1]} presses"
+    name = f" {one_line(capture.press.stroke_id)}{noted}"
+    return Content.assemble((sign, style), name, (waited, "bold $text-warning"))

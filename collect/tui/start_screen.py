@@ -6,7 +6,6 @@ Heavy imports wait until they are needed, so that the screen is up first.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,70 +17,48 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
 from textual.content import Content
 from textual.screen import Screen
-from textual.widgets import Footer, Input, OptionList
+from textual.widgets import Footer, OptionList
 
 from brushloop.collect.errors import ConfigError
+from brushloop.collect.operator import Prompt
 from brushloop.collect.tui.question_screens import YES, AskScreen, yes_or_no
-from brushloop.collect.tui.widgets import HELP_KEY, Line, Rows, app_of, labelled, one_line, plain, trouble
+from brushloop.collect.tui.widgets import HELP_KEY, Line, Rows, app_of, one_line, plain, trouble
 from brushloop.sessions.errors import SessionError
+from brushloop.sessions.terminal import text_of
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
-CHOSEN_FILES = ".files"
-"""File in the folder of sessions that names the rig and the protocol chosen last."""
-MAX_CHARS = 10_000
 SIGNS = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}
+GOES_ON = "The arm first lifts and parks; then the run continues there. No stroke is made twice."
 
 
-@dataclass(frozen=True, slots=True)
-class Paths:
-    """Paths of the rig, the protocol and the folder of sessions."""
-
-    root: Path = Path("sessions")
-    config: Path = Path("rig.toml")
-    protocol: Path = Path("protocol.toml")
-
-
-EngineFor = Callable[..., "Engine"]
-"""Makes the engine of a run, not yet started; see `collect.start.engine_for`."""
-
-
+@dataclass(slots=True)
 class SessionBrowser:
     """Reads sessions and makes engines; connects to no device."""
 
-    def __init__(self, paths: Paths, engine_for: EngineFor) -> None:
-        self._kept = paths.root / CHOSEN_FILES
-        self._engine_for = engine_for
-        with contextlib.suppress(OSError, ValueError), self._kept.open(encoding="utf-8") as stream:
-            config, protocol = stream.read(MAX_CHARS).splitlines()
-            paths = replace(paths, config=Path(config), protocol=Path(protocol))
-        self.paths = paths
-
-    def choose(self, config: str, protocol: str) -> None:
-        """Use another rig and another protocol, here and at the next start; an empty name keeps the file as it is."""
-        before, names = self.paths, [config.strip(), protocol.strip()]
-        self.paths = replace(before, config=Path(names[0] or before.config), protocol=Path(names[1] or before.protocol))
-        if self.paths != before:
-            with contextlib.suppress(OSError):  # then the choice holds until the program ends
-                self._kept.parent.mkdir(parents=True, exist_ok=True)
-                self._kept.write_text(f"{self.paths.config}\n{self.paths.protocol}\n", encoding="utf-8")
+    engine_for: Callable[..., Engine]
+    """Makes the engine of a run, not yet started; see `collect.start.engine_for`."""
+    root: Path = Path("sessions")
+    """Folder that holds sessions."""
+    config: Path = Path("rig.toml")
+    protocol: Path = Path("protocol.toml")
 
     def recent(self) -> list[Summary]:
         """The newest sessions first; empty if there is no folder yet."""
         from brushloop.sessions.show import summaries
 
-        if not self.paths.root.is_dir():
+        if not self.root.is_dir():
             return []
-        return sorted(summaries(self.paths.root), key=lambda row: row.session_id, reverse=True)[:RECENT]
+        return sorted(summaries(self.root), key=lambda row: row.session_id, reverse=True)[:RECENT]
 
     def standing(self, session_id: str) -> Details:
         """What of a session is finished, what is void and what comes next. Raises `SessionError`."""
         from brushloop.sessions.show import details
 
-        return details(self.paths.root / session_id)
+        return details(self.root / session_id)
 
     def planned(self) -> str:
         """What the protocol would do, in one line. Raises `ConfigError`."""
@@ -89,24 +66,23 @@ class SessionBrowser:
         from brushloop.collect.protocols.config import load_protocol
         from brushloop.collect.rig.config import load_rig
 
-        plan = make_plan(load_rig(self.paths.config).settled(armed=False), load_protocol(self.paths.protocol))
+        plan = make_plan(load_rig(self.config).settled(armed=False), load_protocol(self.protocol))
         sheets = "1 sheet" if plan.sheets == 1 else f"{plan.sheets} sheets"
         return f"{len(plan.placed)} strokes on {sheets}, about {plan.seconds / 60:.0f} min"
 
-    def engine(self, session_id: str | None, *, preview: bool) -> Engine:
+    def engine(self, session_id: str | None) -> Engine:
         """An engine that resumes that open session, asking about its set-up; with None, one for a new session.
 
         A session goes on with its own protocol. Connects nothing yet. Raises `ConfigError`.
         """
         from brushloop.collect.engine.open_or_resume import PROTOCOL_EFFECTIVE, Opening
 
-        root, config, protocol = self.paths.root, self.paths.config, self.paths.protocol
         if session_id is None:
-            opening = Opening.load(root, config, protocol, new=True, sheet=1)
+            opening = Opening.load(self.root, self.config, self.protocol, new=True, sheet=1)
         else:
-            opening = Opening.load(root, config, root / session_id / PROTOCOL_EFFECTIVE)
+            opening = Opening.load(self.root, self.config, self.root / session_id / PROTOCOL_EFFECTIVE)
             opening = replace(opening, resume=session_id)
-        return self._engine_for(opening, watched=True, guided=True, preview=preview)
+        return self.engine_for(opening, watched=True, guided=True, preview=True)
 
 
 class StartScreen(Screen[None]):
@@ -119,16 +95,13 @@ class StartScreen(Screen[None]):
     StartScreen #sessions { width: 42%; height: 100%; border: none; padding: 0; }
     StartScreen.-empty #sessions { display: none; }
     StartScreen #standing { width: 1fr; height: 100%; padding: 0 1; border-left: solid $foreground 40%; }
-    StartScreen #files { height: 1; }
-    StartScreen #files Line { width: auto; padding: 0 1; }
-    StartScreen #files Input { width: 1fr; height: 1; border: none; padding: 0; }
+    StartScreen #files { height: 1; padding: 0 1; }
     StartScreen #trouble { height: auto; max-height: 10; padding: 0 1; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "new", "New session"),
         Binding("d", "health", "Rig health"),
-        Binding("e", "files", "Files"),
-        Binding("escape", "list", "Keep the old files"),
+        Binding("e", "file('rig')", "Files"),
         Binding("q", "app.quit", "Leave"),
         HELP_KEY,
     ]
@@ -149,95 +122,79 @@ class StartScreen(Screen[None]):
         self._run_command = run_command
         self._rows: list[Summary] = []
         self._title, self._standing = Line("start-title"), Line("standing-text")
-        self._trouble = Line("trouble")
+        self._files, self._trouble = Line("files"), Line("trouble")
         self._options = Rows("sessions")
-        paths = browser.paths
-        self._config = Input(str(paths.config), id="config", compact=True, select_on_focus=False)
-        self._protocol = Input(str(paths.protocol), id="protocol", compact=True, select_on_focus=False)
 
     def compose(self) -> ComposeResult:
-        """Lay out sessions and standing, health, files, keys."""
+        """Lay out sessions and standing, files, trouble, keys."""
         yield self._title
         with Horizontal(id="start-body"):
             yield self._options
             with VerticalScroll(id="standing"):
                 yield self._standing
-        with Horizontal(id="files"):
-            for name, field in (("rig", self._config), ("protocol", self._protocol)):
-                label = Line(f"{name}-label")
-                label.show(name)
-                yield label
-                yield field
+        yield self._files
         yield self._trouble
         yield Footer(compact=True)
 
-    def on_mount(self) -> None:
-        """List the sessions."""
-        self.reread()
-
     def on_screen_resume(self) -> None:
-        """List the sessions again, as a run has changed them."""
-        self.reread()
-
-    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Escape has a meaning only while a file is typed."""
-        if action == "list":
-            return isinstance(self.focused, Input)
-        return super().check_action(action, parameters)
-
-    def reread(self) -> None:
-        """Read the list of sessions again and show it."""
-        self._title.show(f"brushloop   folder of the sessions: {one_line(str(self._browser.paths.root))}")
+        """List the sessions, now and whenever a run may have changed them."""
+        browser = self._browser
+        self._title.show(f"brushloop   folder of the sessions: {one_line(str(browser.root))}")
+        self._files.show(f"rig {one_line(str(browser.config))}   protocol {one_line(str(browser.protocol))}")
         try:
-            self._rows = self._browser.recent()
+            self._rows = browser.recent()
         except (SessionError, OSError) as error:
             self.show_trouble(str(error))
             return
         self._options.fill(_row_content(row) for row in self._rows)
         self.set_class(not self._rows, "-empty")
-        self._show_first_steps()
+        if not self._rows:
+            self._standing.show(first_steps_content(browser))
 
     def show_trouble(self, text: str) -> None:
         """Show what went wrong; an empty text clears it."""
         self._trouble.show(trouble(text))
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
-        """Show the state of the session under the cursor."""
+        """Show the state of the session under the cursor, as `brushloop sessions show` does."""
+        from brushloop.sessions.show import renderables
+
         try:
-            self._standing.show(_standing_content(self._browser.standing(self._rows[event.option_index].session_id)))
+            details = self._browser.standing(self._rows[event.option_index].session_id)
         except SessionError as error:
             self._standing.show(trouble(error))
+            return
+        goes_on = [GOES_ON] if details.state == "open" else []
+        columns = app_of(self).size.width - self._options.size.width - 4
+        self._standing.show(text_of([*renderables(details), *goes_on], columns))
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Resume an open session, or look through a closed one."""
         row = self._rows[event.option_index]
         self.show_trouble("")
-        if row.state == "open":
-            self._choose()
-            self._begin(row.session_id)
-        else:
-            self._look(row.session_id)
+        (self._begin if row.state == "open" else self._look)(row.session_id)
 
-    def on_input_submitted(self, _event: Input.Submitted) -> None:
-        """Go back to the list with the typed files, and clear what was shown about the previous ones."""
-        self._choose()
-        self.show_trouble("")
-        self._show_first_steps()
-        self._options.focus()
+    def action_file(self, what: str) -> None:
+        """Ask for the rig's file, then for the protocol's; an empty name, or escape, keeps a file as it is."""
+        browser = self._browser
 
-    def action_list(self) -> None:
-        """Go back to the list; files that were being typed stay as before."""
-        self._show_files()
-        self._options.focus()
+        def answered(name: str | None) -> None:
+            path = Path(name.strip()) if name and name.strip() else None
+            if what == "rig":
+                browser.config = path or browser.config
+                self.action_file("protocol")
+            else:
+                browser.protocol = path or browser.protocol
+                self.show_trouble("")
+                self.on_screen_resume()
 
-    def action_files(self) -> None:
-        """Let the operator type other files: tab goes to the other field, enter takes both."""
-        self._config.focus()
+        before = str(browser.config if what == "rig" else browser.protocol)
+        question = Prompt(f"File of the {what}: enter takes it, escape keeps {before}.", default=before, read=str)
+        app_of(self).push_screen(AskScreen(question), answered)
 
     @work(exclusive=True, group="new")
     async def action_new(self) -> None:
         """Ask for a blank sheet, then begin."""
-        self._choose()
         self.show_trouble("reading the files ...")
         try:
             planned = await asyncio.to_thread(self._browser.planned)
@@ -255,32 +212,20 @@ class StartScreen(Screen[None]):
 
     def action_health(self) -> None:
         """Ask every device for its identity and its faults; powers nothing."""
-        self._choose()
-        self._run_command("doctor", "--config", str(self._browser.paths.config))
-
-    def _show_first_steps(self) -> None:
-        if not self._rows:
-            self._standing.show(first_steps_content(self._browser.paths))
-
-    def _choose(self) -> None:
-        self._browser.choose(self._config.value, self._protocol.value)
-        self._show_files()
-
-    def _show_files(self) -> None:
-        self._config.value, self._protocol.value = str(self._browser.paths.config), str(self._browser.paths.protocol)
+        self._run_command("doctor", "--config", str(self._browser.config))
 
 
-def first_steps_content(paths: Paths) -> Content:
+def first_steps_content(browser: SessionBrowser) -> Content:
     """What to do before the first session, the files with a sign once they are there."""
-    rig, protocol = ("✓" if path.is_file() else "·" for path in (paths.config, paths.protocol))
+    rig, protocol = ("✓" if path.is_file() else "·" for path in (browser.config, browser.protocol))
     return Content(f"""\
 No session yet. First steps:
 
-{rig} 1  The rig: {plain(str(paths.config))}
+{rig} 1  The rig: {plain(str(browser.config))}
 An arm: `brushloop rig new` writes it, step by step.
 No arm: `brushloop sim --write-rig rig.toml --rate 20`, in another terminal.
 
-{protocol} 2  What to press: {plain(str(paths.protocol))}
+{protocol} 2  What to press: {plain(str(browser.protocol))}
 Copy examples/protocol-quick.toml, or press e and type another path.
 
 · 3  Health: d asks every device; nothing is powered.
@@ -293,24 +238,3 @@ Then the strokes follow.""")
 def _row_content(row: Summary) -> Content:
     sign, style = SIGNS.get(row.state, ("✓", ""))
     return Content.assemble((sign, style), f" {one_line(row.session_id)} {row.state}")
-
-
-def _standing_content(details: Details) -> Content:
-    """What is finished, what is void, what comes next."""
-    planned = "" if details.planned is None else f" of {details.planned}"
-    bad = f", {details.marked_bad} marked bad" if details.marked_bad else ""
-    parts = [
-        Content.assemble((details.session_id, "bold"), f"  {details.state}\n{details.header.source}"),
-        labelled("Finished", f"{details.strokes}{planned} strokes{bad}"),
-    ]
-    if details.void:
-        parts.append(labelled("Void", Content.styled(f"{len(details.void)} cut short", "bold $text-warning")))
-        parts += [Content(f"  × {plain(line)}") for line in details.void[-5:]]
-    if details.state == "open":
-        following = details.next or ("the next stroke" if details.strokes else "set-up")
-        parts.append(labelled("Next", Content.styled(plain(following), "bold")))
-        parts.append(Content("The arm first lifts and parks; then the run continues there. No stroke is made twice."))
-    parts.append(labelled("Sheets", str(len(details.sheets))))
-    if details.repairs:
-        parts.append(Content.styled(f"{len(details.repairs)} repairs", "$text-warning"))
-    return Content("\n").join(parts)

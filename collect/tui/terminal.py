@@ -11,16 +11,15 @@ import io
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TextIO
 
 from rich.segment import Segment
 from textual import events
-from textual.app import App, SystemCommand
+from textual.app import App
 from textual.color import Color
 from textual.drivers.linux_driver import LinuxDriver
 from textual.filter import LineFilter
-from textual.screen import Screen
 from textual.widgets import HelpPanel
 
 from brushloop.sessions.terminal import inert, plain
@@ -54,6 +53,7 @@ class PlainApp(App[None]):
     """An app that shows text of any origin without letting it control the terminal, and takes stop keys first."""
 
     TITLE = "brushloop"
+    ENABLE_COMMAND_PALETTE = False
     # A selection would be copied with ctrl+c, which is a stop key here.
     ALLOW_SELECT = False
 
@@ -61,7 +61,7 @@ class PlainApp(App[None]):
         super().__init__(driver_class=TerminalDriver)
 
     async def on_event(self, event: events.Event) -> None:
-        """Handle stop keys before textual, which would give a letter to a field that takes text, as in the palette."""
+        """Handle stop keys before textual, which would give a letter to a field that takes text."""
         if isinstance(event, events.Key) and event.key in STOP_KEYS and self.stops(event):
             self.action_stop()
             return
@@ -99,10 +99,6 @@ class PlainApp(App[None]):
                 sys.stdin.readline()
             finally:
                 signal.signal(signal.SIGINT, before)
-
-    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """Only the choice of colours: textual's own way to quit would leave a moving arm."""
-        yield SystemCommand("Colours", "Choose dark, light or other colours", self.action_change_theme)
 
     def get_line_filters(self) -> Sequence[LineFilter]:
         """Add `PlainLines` after textual's own filters."""

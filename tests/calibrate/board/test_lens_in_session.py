@@ -24,7 +24,7 @@ from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import prepare_press
 from brushloop.calibrate.session import Calibration
 from brushloop.calibrate.stroke import PX_PER_MM
-from brushloop.collect.tui.captures import Review
+from brushloop.collect.tui.review_screen import Review
 from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Condition, Stroke
 from tests.calibrate.given import kept_lens

@@ -13,7 +13,7 @@ from brushloop.collect.planning.summary import make_plan
 from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.tui.captures import Review
+from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording

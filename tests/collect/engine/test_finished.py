@@ -16,27 +16,24 @@ if TYPE_CHECKING:
 
 def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
     folder = tmp_path / "grid-01"
-    recorded = f"recorded: {folder}/grid-01.mcap\n"
-    assert ending(folder, "grid") == f"{recorded}next:     brushloop calibrate {folder}\n"
+    recorded = f"recorded: {folder}/grid-01.mcap"
+    assert ending(folder, "grid") == [recorded, f"next:     brushloop calibrate {folder}"]
     (folder / "calibration").mkdir(parents=True)
-    assert ending(folder, "list") == f"{recorded}next:     brushloop validate {folder}\n"
-    assert ending(folder, "calibration") == recorded
+    assert ending(folder, "list") == [recorded, f"next:     brushloop validate {folder}"]
+    assert ending(folder, "calibration") == [recorded]
 
 
 def test_it_is_printed_after_the_screen_too(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    monkeypatch.setattr(
-        "brushloop.collect.tui.app.run_screen",
-        lambda engine, *_options: (engine.start(), wait_for_end(engine), engine)[-1],
-    )
-    folder, given_up = collect(
+    monkeypatch.setattr("brushloop.collect.tui.app.run_app", lambda app: (app.engine.start(), wait_for_end(app.engine)))
+    folder, left_out = collect(
         CollectRequest(
             lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, on_screen=True, preview="off"
         )
     )
     assert [folder] == list(lab.sessions.iterdir())
-    assert given_up == 0
-    assert capsys.readouterr().out == ending(folder, "grid")
+    assert left_out == 0
+    assert capsys.readouterr().out.splitlines() == ending(folder, "grid")
     assert (folder / f"{folder.name}.mcap").is_file()

@@ -12,7 +12,7 @@ from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
 from brushloop.collect.engine.control import State
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.rig.config import load_rig
-from brushloop.collect.tui.captures import Review
+from brushloop.collect.tui.review_screen import Review
 from brushloop.sessions.journal import replay
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording

@@ -289,7 +289,7 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
 
     thread = threading.Thread(target=look)
     thread.start()
-    assert collect(request).given_up == 0
+    assert collect(request).left_out == 0
     thread.join(timeout=PATIENCE_S)
     [folder] = lab.sessions.iterdir()
     assert verify_session(folder).sound

@@ -22,7 +22,7 @@ from brushloop.collect.engine.open_or_resume import (
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.planning.limit_check import distinct_steps
 from brushloop.collect.protocols.steps import StepKind
-from brushloop.collect.tui.start_screen import Paths, SessionBrowser
+from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
@@ -169,9 +169,9 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) 
         openings.append(opening)
         return FakeEngine(picture())
 
-    browser = SessionBrowser(Paths(), engine_for)
+    browser = SessionBrowser(engine_for)
     for session_id in ("grid-01", "grid-02"):
-        browser.engine(session_id, preview=False)
+        browser.engine(session_id)
         assert find_resumable(openings[-1]) == Path("sessions") / session_id
         assert openings[-1].protocol.kind == "grid"
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from brushloop.collect.engine.last_capture import LastCapture
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.captures import CapturePictures, Review, ReviewCapture
 from brushloop.collect.tui.pictures import Pictures
-from brushloop.collect.tui.review_screen import ReviewScreen
-from brushloop.collect.tui.start_screen import Paths, SessionBrowser
+from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
+from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.sessions.events import CaptureResult, Press, Remark
 from brushloop.sessions.records import Condition, Header, Source
 from brushloop.sessions.show import Details, Summary
@@ -28,7 +28,7 @@ class FakeBrowser(SessionBrowser):
     """Two sessions, one cut in its middle."""
 
     def __init__(self) -> None:
-        super().__init__(Paths(), engine_for)
+        super().__init__(engine_for)
         self.asked: list[Any] = []
 
     def recent(self) -> list[Summary]:
@@ -70,9 +70,10 @@ class FakeReview(Review):
             ReviewCapture(captured("H13-a0-r03", 10, 10.2, "split"), "0010-capture-c.mcap", None, LATE),
         )
 
-    def pictures(self, capture: ReviewCapture) -> CapturePictures:
+    def pictures(self, capture: ReviewCapture) -> LastCapture:
         binary = blot()
-        return CapturePictures(np.where(binary, 40, 210).astype(np.uint8), binary, 1_795_273_966_402_000_000)
+        photo = np.where(binary, 40, 210).astype(np.uint8)
+        return LastCapture(capture.press, capture.result.still, True, None, photo, binary)
 
     def repeatability(self, condition: Condition) -> tuple[float, int] | None:
         return 0.914, 9

@@ -19,7 +19,7 @@ from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.review_screen import ReviewScreen
 from brushloop.collect.tui.run_screen import RunScreen
-from brushloop.collect.tui.start_screen import Paths, SessionBrowser, StartScreen
+from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
 from tests.collect.tui.screen_text import has_picture, shown
@@ -130,8 +130,8 @@ def day(tmp_path: Path) -> Iterator[Day]:
 
 @pytest.mark.timeout(400)
 async def test_a_day_at_the_rig(day: Day) -> None:
-    paths = Paths(day.sessions, day.folder / "rig.toml", day.folder / "protocol.toml")
-    app = OperatorApp(browser=SessionBrowser(paths, engine_for))
+    browser = SessionBrowser(engine_for, day.sessions, day.folder / "rig.toml", day.folder / "protocol.toml")
+    app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         operator = Operator(app, pilot)
 
@@ -186,7 +186,7 @@ async def test_a_day_at_the_rig(day: Day) -> None:
             await operator.on(AskScreen)
             await operator.press("y")
         await operator.on(StartScreen)
-        await operator.reads("▶", "open", f"{done} of {STROKES} strokes", "Next")
+        await operator.reads("▶", "open", f"{done} of {STROKES} planned", "steps")
 
         # resume: asked first; board seen and paper touched again, not checked again; then to the end
         await operator.press("enter")

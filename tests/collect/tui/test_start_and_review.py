@@ -28,8 +28,8 @@ from tests.collect.tui.screen_text import has_picture, look, shown
 class Beginning(FakeBrowser):
     """Notes which session is gone on with."""
 
-    def engine(self, session_id: str | None, *, preview: bool) -> Any:
-        self.asked.append((session_id, preview))
+    def engine(self, session_id: str | None) -> Any:
+        self.asked.append(session_id)
         if session_id is None:
             raise ConfigError("rig.toml", "robot", "another brushloop is driving the arm")
         return FakeEngine(picture())
@@ -47,7 +47,7 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
     app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
-        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 strokes", "1 cut short", "the process", "press H15-a5-r01"):
+        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "cut: 1", "the process", "press H15-a5-r01"):
             assert part in text
         await pilot.press("n")
         assert "30 strokes on 1 sheet" in await ready(app, pilot)
@@ -57,11 +57,11 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
         await ready(app, pilot)
         await pilot.press("y")
         text = await ready(app, pilot)
-        assert browser.asked == [(None, True)]
+        assert browser.asked == [None]
         assert "rig.toml: robot: another brushloop is driving the arm" in text
         await pilot.press("enter")
         await ready(app, pilot)
-        assert browser.asked[1:] == [("2026-11-21-grid-02", True)]
+        assert browser.asked[1:] == ["2026-11-21-grid-02"]
         assert isinstance(app.engine, FakeEngine)
         assert app.engine.calls == ["start"]
         await look(app, pilot)
@@ -69,20 +69,16 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
         assert "stop" in app.engine.calls
 
 
-async def test_other_files_can_be_typed_and_letters_of_stop_keys_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+async def test_other_files_can_be_typed_and_letters_of_stop_keys_too() -> None:
     browser = FakeBrowser()
     app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         await ready(app, pilot)
-        await pilot.press("e", "ctrl+u", *"s2.toml", "enter")
-        await ready(app, pilot)
-        assert str(browser.paths.config) == "s2.toml"
-        await pilot.press("e", "ctrl+u", "enter")
-        assert "s2.toml" in await ready(app, pilot), "an emptied field leaves the file as it was"
-    assert FakeBrowser().paths == browser.paths, "the next start knows the files"
+        await pilot.press("e", "ctrl+u", *"s2.toml", "enter", "ctrl+u", "enter")
+        text = await ready(app, pilot)
+        assert "rig s2.toml   protocol protocol.toml" in text, "an emptied field leaves the file as it was"
+        await pilot.press("e", *"x", "escape", *"s", "enter")
+        assert "rig s2.toml   protocol protocol.tomls" in await ready(app, pilot)
 
 
 async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> None:
@@ -94,7 +90,7 @@ async def test_marks_and_notes_are_kept_beside_the_recording(tmp_path: Path) -> 
         for part in (
             "1 of 3 count",
             "mean CSIM 0.914 of every pair of 9 presses",
-            "still 4  at 1795273966.402 s",
+            "still 4",
             "Waited    1.2 s from dip to touch",
             "H13-a0-r03 dip?",
         ):
@@ -127,7 +123,6 @@ async def test_no_note_is_typed_while_a_run_is_in_progress(tmp_path: Path) -> No
         await pilot.press("o", "f", "s")
         assert engine.calls == ["stop"]
         assert app.screen is review
-        assert not review.has_class("-noting")
 
 
 async def test_after_a_session_the_next_commands_run_in_the_terminal(
