@@ -6,7 +6,7 @@ Imports wait until a command runs, so that `--help` loads nothing heavy.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -45,10 +45,6 @@ def collect(
     set_up: Annotated[
         bool, typer.Option("--set-up", help="On the screen: accept what each set-up step measured, or measure again.")
     ] = False,
-    preview: Annotated[
-        Literal["auto", "cells", "off"],
-        typer.Option(help="Pictures: pixels if the terminal supports them, else braille cells; off: no camera."),
-    ] = "auto",
     live: Annotated[bool, typer.Option("--live", help="Let a Foxglove viewer on this machine watch the run.")] = False,
     live_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of --live; 0: any.")] = 8765,
 ) -> None:
@@ -73,7 +69,6 @@ def collect(
         armed=arm,
         on_screen=on_screen,
         guided=set_up and on_screen,
-        preview=preview,
         live=LiveView(live_port) if live else None,
     )
     left_out = start.collect(request).left_out
@@ -88,12 +83,12 @@ def browse() -> None:
     from brushloop.collect.tui.pictures import Pictures
     from brushloop.collect.tui.start_screen import SessionBrowser
 
-    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
+    def engine_for(opening: Opening, *, watched: bool, guided: bool) -> Engine:
         from brushloop.collect import start
 
-        return start.engine_for(opening, watched=watched, guided=guided, preview=preview)
+        return start.engine_for(opening, watched=watched, guided=guided)
 
-    run_app(OperatorApp(browser=SessionBrowser(engine_for), pictures=Pictures("auto")))
+    run_app(OperatorApp(browser=SessionBrowser(engine_for), pictures=Pictures(pixels=True)))
 
 
 @app.command()

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from brushloop.collect.engine.engine import DryRunEngine, Engine
 from brushloop.collect.engine.live import LiveView
@@ -17,10 +17,6 @@ from brushloop.collect.planning.limit_check import check_protocol
 from brushloop.drivers.host import HostClock
 from brushloop.sessions.disk import check_writable
 from brushloop.sessions.terminal import say
-
-if TYPE_CHECKING:
-    from brushloop.collect.tui.pictures import Preview
-
 
 PRESSES = frozenset({"grid", "few-strokes", "list"})
 """Protocols whose recording can be calibrated and validated by itself; after others, no single next command exists."""
@@ -43,7 +39,6 @@ class CollectRequest:
     on_screen: bool = False
     guided: bool = False
     """Whether the operator accepts on the screen what each set-up step measured."""
-    preview: Preview = "auto"
     live: LiveView | None = None
 
 
@@ -60,7 +55,6 @@ def engine_for(
     watched: bool,
     live: LiveView | None = None,
     guided: bool = False,
-    preview: bool = False,
     make: type[Engine] = Engine,
 ) -> Engine:
     """Make an engine that resumes the open session or begins a new one; connects nothing yet. Raises `ConfigError`."""
@@ -80,7 +74,7 @@ def engine_for(
         armed=opening.armed,
         live=live,
         guided=guided,
-        preview=preview,
+        preview=watched,
     )
 
 
@@ -96,14 +90,13 @@ def collect(request: CollectRequest) -> Collected:
             watched=request.on_screen,
             live=request.live,
             guided=request.guided,
-            preview=request.on_screen and request.preview != "off",
         )
 
     engine = make()
     with nullcontext() if request.live is None else closing(request.live):
         if request.live is not None:
             request.live.start()
-        now = _run(engine, request.preview, make, on_screen=request.on_screen).snapshot()
+        now = _run(engine, make, on_screen=request.on_screen).snapshot()
     folder = Path(now.folder)
     say(*ending(folder, opening.protocol.kind))
     return Collected(folder, now.given_up)
@@ -124,8 +117,8 @@ def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_sc
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=depth_mm)
-        engine = engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine)
-        _run(engine, "auto", None, on_screen=on_screen)
+        engine = engine_for(opening, watched=on_screen, make=DryRunEngine)
+        _run(engine, None, on_screen=on_screen)
     say("dry run done; nothing was kept")
 
 
@@ -139,7 +132,7 @@ def ending(folder: Path, kind: str) -> list[str]:
     return lines
 
 
-def _run(engine: Engine, preview: Preview, again: Callable[[str], Engine] | None, *, on_screen: bool) -> Engine:
+def _run(engine: Engine, again: Callable[[str], Engine] | None, *, on_screen: bool) -> Engine:
     """Run to the end; return the engine that ran last, as the operator may resume after a stop."""
     if not on_screen:
         run_headless(engine)
@@ -147,6 +140,6 @@ def _run(engine: Engine, preview: Preview, again: Callable[[str], Engine] | None
     from brushloop.collect.tui.app import OperatorApp, run_app
     from brushloop.collect.tui.pictures import Pictures
 
-    app = OperatorApp(engine, again=again, pictures=Pictures(preview))
+    app = OperatorApp(engine, again=again, pictures=Pictures(pixels=True))
     run_app(app)
     return app.engine or engine

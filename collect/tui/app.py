@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,16 +19,14 @@ from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.errors import NOT_AT_REST, CollectAborted, ConfigError
 from brushloop.collect.headless import REFRESH_S, obey, stop_signals
-from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.tui.capture_screen import CaptureScreen
+from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.question_screens import YES, AskScreen, yes_or_no
-from brushloop.collect.tui.run_screen import RunScreen, live_content
+from brushloop.collect.tui.run_screen import CAN_RESUME, RunScreen, live_content
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import HELP_KEY, plain
 from brushloop.sessions.errors import SessionError
-from brushloop.sessions.recording import mark_bad_or_good
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
@@ -47,12 +44,8 @@ UNSEEN = yes_or_no(f"{NOT_AT_REST} Leave this screen anyway?", "leave it as it i
 COMMANDS = {"f": ("sessions", "verify"), "c": ("calibrate",), "t": ("fit",), "w": ("validate",)}
 """What can be done with a session on which no run is in progress, in the order in which it is done."""
 LOOK, BACK = Choice("v", "look through the captures"), Choice("q", "back")
-BOUNCE_S = 0.7
-"""Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
 CAN_BEGIN_AGAIN = frozenset({State.STOPPED, State.FAILED})
 """States in which a run has ended before its session was finished."""
-CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
-CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
 
 
 class OperatorApp(PlainApp):
@@ -72,7 +65,6 @@ class OperatorApp(PlainApp):
         browser: SessionBrowser | None = None,
         again: Callable[[str], Engine] | None = None,
         pictures: Pictures | None = None,
-        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """With an engine, show that run; with a browser, the start screen first.
 
@@ -87,9 +79,7 @@ class OperatorApp(PlainApp):
         self._again = again if browser is None else browser.engine
         self._now: Snapshot | None = None if engine is None else engine.snapshot()
         self._main: RunScreen | None = None
-        self._now_s = now_s
         self._leave_when_over = False
-        self._deaf_until_s = 0.0
 
     def on_mount(self) -> None:
         """Show the first screen; then poll the engine at 10 Hz."""
@@ -102,7 +92,7 @@ class OperatorApp(PlainApp):
             )
             self.push_screen(start)
         if self.engine is not None:
-            self._show_run()
+            self._show_run(self.engine)
         self.call_after_refresh(self._poll)
         self.set_interval(REFRESH_S, self._poll)
 
@@ -119,16 +109,10 @@ class OperatorApp(PlainApp):
         """Disable the keys that would do nothing now."""
         now = self._now
         match action:
-            case "stop" | "request" | "mark_last":
+            case "stop":
                 return self.at_work
-            case "pause":
-                return self.at_work and now is not None and now.state not in CAN_RESUME
-            case "go_on":
-                return now is not None and now.state in CAN_RESUME
             case "begin_again":
                 return self._can_begin_again
-            case "enlarge":
-                return now is not None and now.last is not None and not self._can_begin_again
             case "review":
                 return now is not None and bool(now.folder)
             case _:
@@ -142,42 +126,6 @@ class OperatorApp(PlainApp):
                 self._main.stop_sent()
             if self.screen is not self._main:
                 self.notify("STOP SENT", severity="warning", timeout=2)
-
-    def action_pause(self) -> None:
-        """Pause before the next step; while the arm is being stopped or a question waits, nothing is to be paused."""
-        if self.engine is not None and self._now is not None and self._now.state in CAN_PAUSE:
-            self.engine.pause()
-
-    def action_go_on(self) -> None:
-        """Go on after a pause."""
-        if self.engine is not None:
-            self.engine.resume()
-
-    def action_mark_last(self) -> None:
-        """Mark the newest capture bad, or good again; the mark is on disk at once."""
-        last = None if self._now is None else self._now.last
-        if self._now is None or last is None or not last.kept or self.screen is not self._main:
-            return
-        try:
-            bad = mark_bad_or_good(Path(self._now.folder), last.still, last.press.stroke_id, time.time_ns())
-        except SessionError as error:
-            self._complain(error)
-            return
-        mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
-        self.notify(f"{last.press.stroke_id}: {mark}")
-
-    def action_request(self, name: str) -> None:
-        """Send the engine a request, or withdraw it."""
-        if self.engine is not None and self._now_s() >= self._deaf_until_s:
-            self.engine.request(OperatorRequest[name])
-            self._poll()
-
-    def action_enlarge(self) -> None:
-        """Show the last capture large."""
-        if self._now is not None and (last := self._now.last) is not None and self.screen is self._main:
-            model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
-            checks = () if last.verdict is None else last.verdict.checks
-            self.push_screen(CaptureScreen(last, checks, model, self._pictures))
 
     def action_review(self) -> None:
         """Look through the captures of the run that is shown."""
@@ -270,12 +218,13 @@ class OperatorApp(PlainApp):
         self._leave_when_over = False
         engine.start()
         self._now = engine.snapshot()
-        self._show_run()
+        self._show_run(engine)
 
-    def _show_run(self) -> None:
+    def _show_run(self, engine: Engine) -> None:
         if self._main is None:
-            self._main = RunScreen(self._pictures, resumable=self._again is not None)
+            self._main = RunScreen(engine, self._pictures, resumable=self._again is not None)
             self.push_screen(self._main)
+        self._main.engine = engine
 
     def _poll(self) -> None:
         if not self.is_running:
@@ -330,7 +279,8 @@ class OperatorApp(PlainApp):
             return
         if shown is not None and shown is self.screen:
             self.pop_screen()
-            self._deaf_until_s = self._now_s() + BOUNCE_S
+            if self._main is not None:
+                self._main.answered()
         if prompt is not None and self.engine is not None and not isinstance(self.screen, AskScreen):
             self.push_screen(AskScreen(prompt, partial(self.engine.answer, prompt.number), self._pictures))
 

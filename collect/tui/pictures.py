@@ -5,10 +5,10 @@ A braille cell has eight dots and two colours. Its ground has the colour of most
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache, partial
+import contextlib
+from functools import lru_cache
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from rich.segment import Segment
 from rich.style import Style
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-Preview = Literal["auto", "cells", "off"]
-"""How pictures are shown: in pixels where the terminal has them, in cells, or without those of the camera."""
 EMPTY = 0x2800
 """The braille pattern without dots; its 256 patterns follow each other."""
 ROWS, COLUMNS = 4, 2
@@ -147,31 +145,25 @@ class ImagePicture(Container):
             self._inner.image = None if image is None else Image.fromarray(image)
 
 
-AnyPicture = CellPicture | ImagePicture
-
-
 class Pictures:
-    """Makes picture widgets of the kind that this terminal shows best. Make it before the app takes the terminal."""
+    """Makes picture widgets: in pixels, if asked for, where textual-image finds that this terminal draws them.
 
-    def __init__(self, preview: Preview = "cells") -> None:
-        self.camera_shown = preview != "off"
-        self._make = _best_kind() if preview == "auto" else CellPicture
+    Make it before the app takes the terminal, which textual-image asks what it can do.
+    """
 
-    def make(self, id: str) -> AnyPicture:  # noqa: A002 - textual's name
+    def __init__(self, *, pixels: bool = False) -> None:
+        self._widget: type[Any] | None = None
+        if pixels:
+            # The extra may be missing, or textual-image may not understand the terminal's answer.
+            with contextlib.suppress(ImportError, OSError, ValueError):
+                from textual_image import renderable, widget
+
+                if renderable.Image in (renderable.SixelImage, renderable.TGPImage):
+                    self._widget = widget.Image
+
+    def make(self, id: str) -> CellPicture | ImagePicture:  # noqa: A002 - textual's name
         """Make a widget."""
-        return self._make(id)
-
-
-def _best_kind() -> Callable[[str], AnyPicture]:
-    """textual-image's widget, if that package is installed and has found that this terminal draws pixels."""
-    try:
-        from textual_image import renderable, widget
-    except (ImportError, OSError, ValueError):
-        # The extra is missing, or textual-image does not understand the terminal's answer.
-        return CellPicture
-    if renderable.Image in (renderable.SixelImage, renderable.TGPImage):
-        return partial(ImagePicture, widget.Image)
-    return CellPicture
+        return CellPicture(id) if self._widget is None else ImagePicture(self._widget, id)
 
 
 def binary_picture(binary: NDArray[np.bool_] | None) -> NDArray[np.uint8] | None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from rich.text import Text
-from textual import events
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
@@ -19,15 +19,16 @@ from textual.widgets import DataTable, Footer
 from brushloop.collect.engine.control import FINAL, State
 from brushloop.collect.engine.snapshot import CellCount, Mark, SheetMap, Snapshot
 from brushloop.collect.headless import eta_text, minutes_text, no_pose_text
-from brushloop.collect.tui.capture_screen import checks_content
+from brushloop.collect.operator import OperatorRequest
+from brushloop.collect.tui.capture_screen import CaptureScreen, checks_content
 from brushloop.collect.tui.pictures import Pictures, binary_picture
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
-    NARROW_COLUMNS,
     SHORT_STOP,
     SOFTWARE_STOP,
     STOP,
     Line,
+    app_of,
     condition_text,
     entitle,
     labelled,
@@ -35,9 +36,12 @@ from brushloop.collect.tui.widgets import (
     plain,
     tip_text,
 )
+from brushloop.sessions.errors import SessionError
+from brushloop.sessions.recording import mark_bad_or_good
 from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
+    from brushloop.collect.engine.engine import Engine
     from brushloop.collect.engine.last_capture import LastCapture
 
 OVER = "Over: q leaves"
@@ -62,22 +66,26 @@ EIGHTHS = " ▁▂▃▄▅▆▇█"
 TRACE_PEAKS = 50
 """Peaks of the force that are drawn, of a tenth of a second each."""
 LEAST_SCALE_N = 0.1
-"""Smallest full scale, so that noise is not stretched: a soft brush pushes with a few tens of mN."""
+"""Smallest full scale of that drawing, so that noise is not stretched: a soft brush pushes with a few tens of mN."""
+CAN_PAUSE = frozenset({State.IDLE, State.RECOVERING, State.RUNNING})
+CAN_RESUME = frozenset({State.PAUSING, State.PAUSED})
+BOUNCE_S = 0.7
+"""Time after an answer in which the keys of requests do nothing: pressing an answer's key twice sends no request."""
 RUN_BINDINGS = (
     STOP,
-    Binding("space,p", "app.pause", "Pause", tooltip="before the next step"),
-    Binding("space,p", "app.go_on", "Resume"),
+    Binding("space,p", "pause", "Pause", tooltip="before the next step"),
+    Binding("space,p", "go_on", "Resume"),
     Binding("q", "app.quit", "Leave", tooltip="after this step, with the arm parked"),
     HELP_KEY,
     Binding("enter", "app.begin_again", "Resume the session"),
-    Binding("enter", "app.enlarge", "Large", tooltip="the last capture"),
+    Binding("enter", "enlarge", "Large", tooltip="the last capture"),
     Binding("tab", "next_pane", "Pane", tooltip="overview, last capture, camera, where not all fit"),
     Binding("v", "app.review", "Review", tooltip="look through the captures, mark and compare them"),
-    Binding("r", "app.request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r takes it back"),
-    Binding("k", "app.request('SKIP')", "Skip", tooltip="the current stroke"),
-    Binding("n", "app.request('NEW_SHEET')", "New sheet", tooltip="before the next stroke"),
-    Binding("j", "app.request('JOG')", "Jog", tooltip="find the paper again before the next stroke"),
-    Binding("b", "app.mark_last", "Bad", tooltip="the last capture: pressed again at the end; b takes it back"),
+    Binding("r", "request('RETAKE')", "Retake", tooltip="the current stroke, once photographed; r takes it back"),
+    Binding("k", "request('SKIP')", "Skip", tooltip="the current stroke"),
+    Binding("n", "request('NEW_SHEET')", "New sheet", tooltip="before the next stroke"),
+    Binding("j", "request('JOG')", "Jog", tooltip="find the paper again before the next stroke"),
+    Binding("b", "mark_last", "Bad", tooltip="the last capture: pressed again at the end; b takes it back"),
 )
 """Most important first: a narrow screen shows only as many as fit."""
 
@@ -101,12 +109,7 @@ Grid: ✓ complete, ▶ now, › next, ! bad takes, × left out
 Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
 """
     DEFAULT_CSS = """
-    RunScreen #title { height: 1; background: $panel; }
-    RunScreen #session { width: 1fr; padding: 0 1; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis; }
-    RunScreen #source {
-        width: auto; max-width: 50%; padding: 0 1; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis;
-        background: $accent; color: $text;
-    }
+    RunScreen #title { height: 1; background: $panel; text-style: bold; text-wrap: nowrap; text-overflow: ellipsis; }
     RunScreen #band { height: 7; }
     RunScreen #state {
         width: 18; height: 7; margin: 0 1; content-align: center middle; text-align: center; text-style: bold;
@@ -146,12 +149,14 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
     """
     BINDINGS: ClassVar[list[BindingType]] = [*RUN_BINDINGS]
 
-    def __init__(self, pictures: Pictures, *, resumable: bool = False) -> None:
+    def __init__(self, engine: Engine, pictures: Pictures, *, resumable: bool = False) -> None:
         """`resumable`: whether this screen can go on with a run that was stopped."""
         super().__init__()
+        self.engine = engine
+        self._now = engine.snapshot()
         self._resumable = resumable
         # Kept, not queried: a snapshot may come before the parts are mounted or after they are gone.
-        self._session, self._source = Line("session"), Line("source")
+        self._title = Line("title", sized=True)
         self._state, self._figures = Line("state", sized=True), Line("figures", sized=True)
         self._why, self._why_pane = Line("why"), VerticalScroll(id="why-pane")
         self._grid = DataTable[Text](id="grid", classes="pane", show_cursor=False)
@@ -162,24 +167,20 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._log_pane.border_title = "Log"
         self._capture, self._words = Vertical(id="capture", classes="pane"), Line("capture-words")
         self._capture.border_title = "Last capture: photograph, binarised, CCD-BSM"
+        self._made_by = pictures
         self._pictures = [pictures.make(name) for name in ("photo", "binary", "model")]
-        self._camera, self._with_camera = pictures.make("camera"), pictures.camera_shown
+        self._camera = pictures.make("camera")
         self._camera.add_class("pane")
         self._camera.border_title = "Camera"
         self._note = Line("note", sized=True)
-        self._cells: tuple[CellCount, ...] = ()
-        self._messages: tuple[str, ...] = ()
-        self._last: LastCapture | None = None
+        self._drawn: Snapshot | None = None
         self._pane = 0
-        self._doing: tuple[State, str] | None = None
-        self._turn = 0
-        self._stop_sent = False
+        self._stop_sent = self._figures_turn = False
+        self._deaf_until_s = 0.0
 
     def compose(self) -> ComposeResult:
         """Lay out top to bottom, by how soon the operator needs it."""
-        with Horizontal(id="title"):
-            yield self._session
-            yield self._source
+        yield self._title
         with Horizontal(id="band"):
             yield self._state
             yield self._figures
@@ -197,8 +198,7 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
                     yield self._words
                     with Horizontal(id="capture-pictures"):
                         yield from self._pictures
-                if self._with_camera:
-                    yield self._camera
+                yield self._camera
         yield self._note
         yield Footer(compact=True, show_command_palette=False)
 
@@ -206,16 +206,61 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         """Keep the log at its newest line until the operator scrolls away."""
         self._log_pane.anchor()
 
-    def on_resize(self, event: events.Resize) -> None:
-        """Choose what to show for the terminal's width."""
-        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
-
     def action_next_pane(self) -> None:
         """Show overview, last capture, and camera in turn, on a narrow screen."""
-        shown = PANES if self._with_camera else PANES[:-1]
-        self._pane = (self._pane + 1) % len(shown)
-        for name in PANES:
-            self.set_class(name == shown[self._pane], f"-{name}")
+        self._pane = (self._pane + 1) % len(PANES)
+        for number, name in enumerate(PANES):
+            self.set_class(number == self._pane, f"-{name}")
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Disable the keys that would do nothing now."""
+        state, last = self._now.state, self._now.last
+        match action:
+            case "request" | "mark_last":
+                return state not in FINAL
+            case "pause":
+                return state not in FINAL | CAN_RESUME
+            case "go_on":
+                return state in CAN_RESUME
+            case "enlarge":
+                # After a stop or a failure, the same key resumes the session.
+                return last is not None and not (self._resumable and state in FINAL - {State.DONE})
+            case _:
+                return super().check_action(action, parameters)
+
+    def action_pause(self) -> None:
+        """Pause before the next step; while the arm is being stopped or a question waits, nothing is to be paused."""
+        if self._now.state in CAN_PAUSE:
+            self.engine.pause()
+
+    def action_go_on(self) -> None:
+        """Go on after a pause."""
+        self.engine.resume()
+
+    def action_request(self, name: str) -> None:
+        """Send the engine a request, or withdraw it."""
+        if time.monotonic() >= self._deaf_until_s:
+            self.engine.request(OperatorRequest[name])
+
+    def action_mark_last(self) -> None:
+        """Mark the newest capture bad, or good again; the mark is on disk at once."""
+        last = self._now.last
+        if last is None or not last.kept:
+            return
+        try:
+            bad = mark_bad_or_good(Path(self._now.folder), last.still, last.press.stroke_id, time.time_ns())
+        except SessionError as error:
+            self.notify(plain(str(error)), severity="error", timeout=20)
+            return
+        mark = "marked bad: pressed again after the planned strokes" if bad else "marked good again"
+        self.notify(f"{last.press.stroke_id}: {mark}")
+
+    def action_enlarge(self) -> None:
+        """Show the last capture large."""
+        if (last := self._now.last) is not None:
+            model = "CCD-BSM as published" if last.model is not None else "no prediction for this stroke"
+            checks = () if last.verdict is None else last.verdict.checks
+            app_of(self).push_screen(CaptureScreen(last, checks, model, self._made_by))
 
     def stop_sent(self) -> None:
         """Show at once that a stop key was pressed, before the engine answers."""
@@ -223,34 +268,34 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
         self._state.show(STOP_SENT)
         self._state.set_class(True, "-stopping")
 
-    def show(self, now: Snapshot) -> None:
-        """Draw what differs from the previous snapshot.
+    def answered(self) -> None:
+        """A question was answered: leave the keys of requests without effect for a moment."""
+        self._deaf_until_s = time.monotonic() + BOUNCE_S
 
-        Figures and camera take turns (5 times a second each), because textual visits every widget between two that it
-        draws at the same time. A new state or step is shown at once.
-        """
-        self._turn = 0 if self._doing != (now.state, now.step) else self._turn + 1
-        self._doing = now.state, now.step
-        self._session.show(f"brushloop  {one_line(now.session_id) or 'no session yet'}")
-        self._source.show(f"source: {one_line(now.source) or 'not known yet'}")
+    def show(self, now: Snapshot) -> None:
+        """Draw what differs from the previous snapshot."""
+        before, self._now, self._drawn = self._drawn, now, now
+        source, session = one_line(now.source) or "not known yet", one_line(now.session_id) or "no session yet"
+        self._title.show(Content.assemble((f" source: {source} ", "$text on $accent"), f"  {session}"))
         self._show_state(now)
-        if self._turn % 2 == 0:
+        # Figures and camera take turns: textual visits every widget between two that it draws at the same time.
+        self._figures_turn = not self._figures_turn or before is None or now.state is not before.state
+        if self._figures_turn:
             self._figures.show(figures_content(now))
         elif now.picture is not None and self._camera.display:
             self._camera.show(now.picture.image)
         self.set_class(bool(now.error), "-wrong")
         entitle(self._why_pane, "Why it failed" if now.state is State.FAILED else "Why it stopped")
         self._why.show(plain(now.error))
-        if now.grid != self._cells:
-            self._cells = now.grid
+        if before is None or now.grid != before.grid:
             fill_grid(self._grid, now.grid)
         self._sheet.show(sheet_content(now.sheet))
         if now.sheet is not None:
             entitle(self._sheet, f"Sheet {now.sheet.number}: {now.sheet.marks.count(None)} free")
-        if now.messages != self._messages:
-            self._messages = now.messages
+        if before is None or now.messages != before.messages:
             self._log.show(Content("\n").join(_message_content(line) for line in now.messages))
-        self._show_capture(now.last)
+        if before is None or now.last is not before.last:
+            self._show_capture(now.last)
         self._note.show(_note_content(now, resumable=self._resumable and bool(now.folder)))
 
     def _show_state(self, now: Snapshot) -> None:
@@ -263,16 +308,13 @@ Sheet: · blank, ● counts, ! does not, × cut short, △ self-check
             self._state.set_class(known is (State.STOPPING if self._stop_sent else state), f"-{known}")
 
     def _show_capture(self, last: LastCapture | None) -> None:
-        """Draw this capture if it is a new one."""
         if last is None:
             self._words.show(Content.styled("no photograph yet since this start", "dim"))
             return
-        if last is not self._last:
-            self._last = last
-            self._words.show(_capture_words(last))
-            pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
-            for widget, picture in zip(self._pictures, pictures, strict=True):
-                widget.show(picture)
+        self._words.show(_capture_words(last))
+        pictures = (last.photo, binary_picture(last.binary), binary_picture(last.model))
+        for widget, picture in zip(self._pictures, pictures, strict=True):
+            widget.show(picture)
 
 
 def figures_content(now: Snapshot) -> Content:
@@ -288,9 +330,7 @@ def figures_content(now: Snapshot) -> Content:
         ("Step", Content.styled(one_line(now.step) or "-", "bold")),
         ("Strokes", strokes),
         ("Counts", Content.styled("   ".join(filter(None, counts)), warned)),
-        ("Tip", Content.styled(no_pose_text(now) or tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning")),
-        ("Target", _target_text(now)),
-        ("Force", _force_text(now)),
+        *_live_rows(now),
         ("", spark(now.trace_n[-TRACE_PEAKS:])),
     ]
     return Content("\n").join(labelled(name, text, 9) for name, text in rows)
@@ -298,9 +338,7 @@ def figures_content(now: Snapshot) -> Content:
 
 def live_content(now: Snapshot) -> Content:
     """Tip, target, force, and focus at this moment, for a person who answers a question."""
-    rows = [("Tip", no_pose_text(now) or tip_text(now.tip_mm)), ("Target", _target_text(now))]
-    if now.force_n is not None:
-        rows.append(("Force", _force_text(now)))
+    rows = _live_rows(now)
     if now.picture is not None:
         blur_px = now.picture.blur_px
         focus = "no edge in view to measure"
@@ -310,26 +348,22 @@ def live_content(now: Snapshot) -> Content:
     return Content("\n").join(labelled(name, text, 9) for name, text in rows)
 
 
-def _target_text(now: Snapshot) -> str:
-    """Where the arm was sent, and how far it still has to go."""
-    if now.target_mm is None:
-        return "no target yet"
-    to_go = "" if now.tip_mm is None else f"   {math.dist(now.target_mm, now.tip_mm):.2f} mm to go"
-    return tip_text(now.target_mm) + to_go
-
-
-def _force_text(now: Snapshot) -> str:
-    if now.force_n is None:
-        return "not measured now" if now.state in FINAL else "no force sensor, or silent"
-    ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
-    return f"{now.force_n:6.3f} N{ceiling}   drawn to {scale_n(now.trace_n[-TRACE_PEAKS:]):g} N"
+def _live_rows(now: Snapshot) -> list[tuple[str, Content | str]]:
+    """Where the tip is, where the arm was sent and how far it still has to go, and what the brush feels."""
+    tip = Content.styled(no_pose_text(now) or tip_text(now.tip_mm), "" if now.tip_mm else "bold $text-warning")
+    target, force = "no target yet", "not measured now" if now.state in FINAL else "no force sensor, or silent"
+    if now.target_mm is not None:
+        to_go = "" if now.tip_mm is None else f"   {math.dist(now.target_mm, now.tip_mm):.2f} mm to go"
+        target = tip_text(now.target_mm) + to_go
+    if now.force_n is not None:
+        ceiling = "" if now.force_ceiling_n is None else f" (stops at {now.force_ceiling_n:g} N)"
+        force = f"{now.force_n:6.3f} N{ceiling}   drawn to {scale_n(now.trace_n[-TRACE_PEAKS:]):.2g} N"
+    return [("Tip", tip), ("Target", target), ("Force", force)]
 
 
 def scale_n(values_n: Sequence[float]) -> float:
-    """The full scale for these forces: 0.1, 0.2, 0.5, 1, 2, 5 ... N, whatever holds the largest."""
-    top = max(values_n, default=0.0)
-    ladder = (LEAST_SCALE_N * step * 10.0**decade for decade in itertools.count() for step in (1.0, 2.0, 5.0))
-    return next(full for full in ladder if top <= full) if math.isfinite(top) else LEAST_SCALE_N
+    """The force that a full block stands for."""
+    return max(LEAST_SCALE_N, *values_n) if values_n else LEAST_SCALE_N
 
 
 def spark(values_n: Sequence[float]) -> str:
@@ -378,12 +412,12 @@ def _capture_words(last: LastCapture) -> Content:
     lines = [Content.assemble((last.press.stroke_id, "bold"), f"  {condition_text(last.press.condition)}  ", kept)]
     if last.verdict is None:
         lines.append(Content.styled("not judged: [quality] is switched off", "dim"))
-    elif missed := tuple(check for check in last.verdict.checks if not check.passed):
+    elif missed := [check for check in last.verdict.checks if not check.passed]:
         lines.append(checks_content(missed))
     else:
         lines.append(Content(f"✓ all {len(last.verdict.checks)} checks"))
     if last.likeness is not None:
-        words = f"CCD-BSM as published for this H and α, right: CSIM {100.0 * last.likeness:.1f} % in mm"
+        words = f"CCD-BSM as published, right: CSIM {100.0 * last.likeness:.1f} % in mm"
         lines.append(Content.styled(words, "dim"))
     return Content("\n").join(lines)
 

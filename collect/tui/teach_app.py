@@ -31,7 +31,6 @@ from brushloop.collect.tui.question_screens import YES, AskScreen, question_cont
 from brushloop.collect.tui.terminal import PlainApp
 from brushloop.collect.tui.widgets import (
     HELP_KEY,
-    NARROW_COLUMNS,
     SHORT_STOP,
     SOFTWARE_STOP,
     STOP,
@@ -223,10 +222,6 @@ Page up and down turn the pages of what was found.
             yield self._input
         yield self._note
         yield Footer(compact=True, show_command_palette=False)
-
-    def on_resize(self, event: events.Resize) -> None:
-        """Show the picture beside the findings where there is room."""
-        self.set_class(event.size.width < NARROW_COLUMNS, "-narrow")
 
     def action_picture(self) -> None:
         """Show the picture instead of the findings, on a narrow screen."""

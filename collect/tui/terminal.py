@@ -54,6 +54,8 @@ class PlainApp(App[None]):
 
     TITLE = "brushloop"
     ENABLE_COMMAND_PALETTE = False
+    # From 110 columns on, a picture has room beside the text.
+    HORIZONTAL_BREAKPOINTS = [(0, "-narrow"), (110, "-wide")]  # noqa: RUF012 - so textual declares it
     # A selection would be copied with ctrl+c, which is a stop key here.
     ALLOW_SELECT = False
 

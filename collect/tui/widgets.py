@@ -18,8 +18,6 @@ from brushloop.sessions import terminal
 if TYPE_CHECKING:
     from brushloop.sessions.records import Condition
 
-NARROW_COLUMNS = 110
-"""Width from which a picture has room beside the text."""
 SOFTWARE_STOP = "s is a software stop. The red button is the emergency stop."
 SHORT_STOP = "s: software stop; red button: emergency stop"
 STOP = Binding("s", "app.stop", "STOP", tooltip="Stop the arm at once, on every screen and over every question")

@@ -29,9 +29,7 @@ def test_it_is_printed_after_the_screen_too(
     lab.write_protocol("[11.0]", "[0.0]")
     monkeypatch.setattr("brushloop.collect.tui.app.run_app", lambda app: (app.engine.start(), wait_for_end(app.engine)))
     folder, left_out = collect(
-        CollectRequest(
-            lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, on_screen=True, preview="off"
-        )
+        CollectRequest(lab.folder / "rig.toml", lab.folder / "protocol.toml", lab.sessions, on_screen=True)
     )
     assert [folder] == list(lab.sessions.iterdir())
     assert left_out == 0

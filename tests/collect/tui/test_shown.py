@@ -14,7 +14,7 @@ from textual.widgets import Static
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import CellCount
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, OVER, cell_text, scale_n, spark
+from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, OVER, cell_text, spark
 from brushloop.collect.tui.widgets import SOFTWARE_STOP
 from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.records import Condition
@@ -64,7 +64,7 @@ async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_fo
         assert "Log" in await look(app, pilot)
         await pilot.press("tab")
         text = await look(app, pilot)
-        for part in ("H15-a5-r01", "✓ all 4 checks", "CCD-BSM as published for this H and α, right: CSIM"):
+        for part in ("H15-a5-r01", "✓ all 4 checks", "CCD-BSM as published, right: CSIM"):
             assert part in text
         assert has_picture(text)
         await pilot.press("tab")
@@ -113,7 +113,6 @@ def test_every_state_of_a_condition_has_a_sign_as_well_as_a_colour(cell: CellCou
 def test_a_force_is_drawn_to_scale_and_noise_does_not_fill_its_place() -> None:
     assert spark([0.0, 0.5, 1.0]) == " ▄█"
     assert spark([0.001, 0.0]) == "▁ "
-    assert [scale_n([force_n]) for force_n in (0.0, 0.04, 0.11, 0.9, 3.0)] == [0.1, 0.1, 0.2, 1.0, 5.0]
 
 
 async def test_b_marks_the_last_capture_and_takes_it_back_while_the_run_is_on(tmp_path: Path) -> None:

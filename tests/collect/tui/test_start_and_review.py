@@ -162,7 +162,7 @@ async def test_after_a_session_the_next_commands_run_in_the_terminal(
 
 def test_pictures_work_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "textual_image", None)
-    assert isinstance(Pictures("auto").make("x"), CellPicture)
+    assert isinstance(Pictures(pixels=True).make("x"), CellPicture)
 
 
 def test_a_pixel_is_a_dot_of_its_own_colour_on_the_colour_of_most() -> None:
