@@ -15,7 +15,6 @@ from typer.core import TyperGroup
 import brushloop.calibrate.cli
 import brushloop.calibrate.validate.cli
 import brushloop.collect.cli
-import brushloop.collect.cli_rig
 import brushloop.sessions.cli
 import brushloop.twin
 from brushloop.calibrate.cli import PathOrCommand
@@ -100,7 +99,7 @@ def options(
 
 app.add_typer(brushloop.collect.cli.app, name="collect")
 app.command("doctor")(brushloop.collect.cli.doctor)
-app.add_typer(brushloop.collect.cli_rig.app, name="rig")
+app.add_typer(brushloop.collect.cli.rig_app, name="rig")
 app.command("calibrate")(brushloop.calibrate.cli.calibrate)
 app.add_typer(brushloop.calibrate.cli.camera, name="camera")
 app.add_typer(brushloop.calibrate.validate.cli.app, name="validate", cls=PathOrCommand)

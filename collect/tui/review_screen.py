@@ -293,8 +293,9 @@ class ReviewScreen(Screen[None]):
         if (capture := self._capture) is not None:
 
             def answered(note: str | None) -> None:
-                if note is not None:
-                    self._remark(capture, bad=capture.marked_bad, note=note)
+                # Not the capture of when the key was pressed: a mark may have been kept since.
+                if note is not None and self._capture is not None:
+                    self._remark(self._capture, bad=self._capture.marked_bad, note=note)
 
             question = f"{capture.press.stroke_id}: a note. Enter keeps it, escape leaves it."
             app_of(self).push_screen(AskScreen(Prompt(question, default=capture.note, read=str)), answered)
@@ -313,7 +314,9 @@ class ReviewScreen(Screen[None]):
             self.notify(plain(str(error)), severity="error")
             return
         self._alike.pop(capture.press.condition, None)
-        self._list(self._options.highlighted or 0)
+        at = self._options.highlighted or 0
+        self._capture = self._review.captures[at]
+        self._list(at)
 
     def _list(self, at: int) -> None:
         review, captures = self._review, self._review.captures

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from brushloop.collect.engine.control import State
-from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.headless import eta_text
 from brushloop.drivers.sim.faults import Phase
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
@@ -92,12 +89,3 @@ def test_a_second_process_is_refused_and_the_first_goes_on(lab: Lab) -> None:
     pressed = len(lab.rig.world.presses)
     wait_for_presses(lab, pressed + 2)
     assert first.poll() is None
-
-
-def snapshot(eta_s: float | None) -> Snapshot:
-    return Snapshot("s", "loopback rig", State.RUNNING, "dip", 1, 4, (), 0, 1.0, eta_s, None, (), "")
-
-
-@pytest.mark.parametrize(("eta_s", "text"), [(None, ""), (0.0, "ETA 0:00"), (59.6, "ETA 1:00"), (725.0, "ETA 12:05")])
-def test_the_eta_reads_as_minutes_and_seconds(eta_s: float | None, text: str) -> None:
-    assert eta_text(snapshot(eta_s)) == text

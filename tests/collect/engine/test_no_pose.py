@@ -20,8 +20,7 @@ from brushloop.drivers.devices import Identity
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import Addresses, rig_toml
-from tests.collect.tui.fake import TOUCHED, FakeEngine, picture
-from tests.collect.tui.screen_text import look
+from tests.collect.tui.fake import TOUCHED, FakeEngine, look, picture
 
 WHO = Identity("robot", "aubo_i5", "", True)
 

@@ -20,8 +20,7 @@ from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, GOES_ON, OVER, STOP_SENT, RunScreen
 from brushloop.collect.tui.terminal import TerminalDriver, _LostWrites
 from brushloop.collect.tui.widgets import SOFTWARE_STOP
-from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, picture
-from tests.collect.tui.screen_text import look, shown
+from tests.collect.tui.fake import FAILED, SPLIT, FakeEngine, look, picture, shown
 from tests.waiting import PATIENCE_S
 
 AT_WORK = sorted(set(State) - FINAL)

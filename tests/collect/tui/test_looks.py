@@ -11,8 +11,7 @@ from textual.pilot import Pilot
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import Snapshot
 from brushloop.collect.tui.app import OperatorApp
-from tests.collect.tui.fake import FAILED, SPLIT, TOUCHED, FakeEngine, capture, full_picture
-from tests.collect.tui.fake_browser import FakeBrowser, a_review
+from tests.collect.tui.fake import FAILED, SPLIT, TOUCHED, FakeBrowser, FakeEngine, a_review, capture, full_picture
 from tests.collect.tui.teach_fake import Asking, app_of
 
 SMALL, LARGE = (80, 24), (120, 40)

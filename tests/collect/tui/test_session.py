@@ -22,7 +22,7 @@ from brushloop.collect.tui.run_screen import RunScreen
 from brushloop.collect.tui.start_screen import SessionBrowser, StartScreen
 from brushloop.sessions.recording import Recording, remarks_of
 from brushloop.sessions.verify import verify_session
-from tests.collect.tui.screen_text import has_picture, shown
+from tests.collect.tui.fake import has_picture, shown
 from tests.runs import wait_for_end
 from tests.waiting import PATIENCE_S
 

@@ -1,4 +1,4 @@
-"""What the run screen shows: literal text, sizes, the grid, marks; and how often it is drawn."""
+"""What the run screen shows: literal text, captures, questions, marks; and how often it is drawn."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from textual.geometry import Region
 from textual.widget import Widget
@@ -13,13 +14,22 @@ from textual.widgets import Static
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.snapshot import CellCount
+from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.tui.app import OperatorApp
-from brushloop.collect.tui.run_screen import COMMAND_GOES_ON, OVER, cell_text, spark
-from brushloop.collect.tui.widgets import SOFTWARE_STOP
+from brushloop.collect.tui.capture_screen import (
+    BOTH,
+    CAPTURED,
+    PREDICTED,
+    WHITE,
+    CaptureScreen,
+    difference,
+    over_photograph,
+)
+from brushloop.collect.tui.question_screens import AskScreen
+from brushloop.collect.tui.run_screen import RunScreen, cell_text, spark
 from brushloop.sessions.recording import remarks_of
 from brushloop.sessions.records import Condition
-from tests.collect.tui.fake import ERROR, FAILED, FakeEngine, full_picture, picture
-from tests.collect.tui.screen_text import has_picture, look, shown
+from tests.collect.tui.fake import DONE, FakeEngine, capture, full_picture, has_picture, look, picture, shown
 
 
 async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
@@ -33,29 +43,6 @@ async def test_what_comes_from_outside_is_shown_as_it_is() -> None:
         assert r"a\u001b[31mb" in text
         assert "a]0;ownedb 31m ltr" in text
         assert not set(text) & set("\x1b\x07\x9b\u202e")
-
-
-async def test_80_columns_by_24_rows_show_all_that_matters() -> None:
-    app = OperatorApp(FakeEngine(FAILED))
-    async with app.run_test(size=(80, 24)) as pilot:
-        text = await look(app, pilot)
-    for part in ("2026-11-21-grid-01", "source: loopback rig", "FAILED", "13/30", "elapsed 3:05", "voids 1", "20 mm"):
-        assert part in text
-    for part in ("123.40", "10°", OVER, COMMAND_GOES_ON, "q Leave"):
-        assert part in text
-    words = " ".join(text.replace("┃", " ").split())
-    assert " ".join(ERROR.split()) in words
-
-
-async def test_a_run_resized_in_its_middle_shows_the_same() -> None:
-    app = OperatorApp(FakeEngine(full_picture()))
-    async with app.run_test(size=(200, 60)) as pilot:
-        for size in ((200, 60), (80, 24), (120, 40), (81, 25)):
-            await pilot.resize_terminal(*size)
-            text = await look(app, pilot)
-            for part in ("RUNNING", "13/30", "q Leave", "s STOP", "Sheet 1: 25 free", SOFTWARE_STOP):
-                assert part in text, size
-            assert ("Last capture" in text) == (size[0] >= 110)
 
 
 async def test_tab_turns_to_the_capture_and_the_camera_where_there_is_no_room_for_all() -> None:
@@ -144,3 +131,78 @@ async def test_a_disk_that_refuses_is_reported(tmp_path: Path) -> None:
         await pilot.press("b")
         assert "gone" in " ".join(note.message for note in app._notifications)
         assert shown(app)
+
+
+PROMPT = Prompt(
+    "Sheet 1 is full. Put a fresh one in, then go on.",
+    (Choice("g", "sheet 2 is in, and blank"), Choice("x", "stop the run")),
+    "x",
+    number=7,
+)
+
+
+async def test_enter_shows_the_last_capture_large_with_the_missed_check_first() -> None:
+    engine = FakeEngine(full_picture(last=capture(kept=False)))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await look(app, pilot)
+        await pilot.press("enter")
+        text = await look(app, pilot)
+        assert isinstance(app.screen, CaptureScreen)
+        assert text.index("! split") < text.index("✓ exposure")
+        for part in ("0.42  ≤ 0.30 mm", "The tip is split.", "73.2 % in mm", "predicted only", "s STOP"):
+            assert part in text
+        assert has_picture(text)
+        await pilot.press("1", "left", "right", "s", "escape")
+        assert isinstance(app.screen, RunScreen)
+        assert engine.calls == ["stop"]
+
+
+def test_a_difference_has_four_colours_and_an_overlay_the_line_of_the_prediction() -> None:
+    captured, predicted = np.zeros((128, 128), bool), np.zeros((128, 128), bool)
+    captured[40:60, 40:80] = predicted[50:70, 40:80] = True
+    pixels = difference(captured, predicted)
+    assert [tuple(pixels[y, 60].tolist()) for y in (10, 45, 55, 65)] == [WHITE, CAPTURED, BOTH, PREDICTED]
+    line = (over_photograph(np.full((500, 500), 255, np.uint8), predicted) == PREDICTED).all(axis=-1)
+    assert 0 < line.mean() < 0.05
+    assert not line[:140].any()
+
+
+async def test_a_finished_session_offers_what_comes_next() -> None:
+    engine = FakeEngine(picture(folder="sessions/2026-11-21-grid-01"))
+    app = OperatorApp(engine, again=lambda _session_id: engine)
+    async with app.run_test(size=(120, 24)) as pilot:
+        await look(app, pilot)
+        engine.now = replace(DONE, folder="sessions/2026-11-21-grid-01")
+        text = await look(app, pilot)
+        for part in ("with sessions/2026-11-21-grid-01", "v  look through", "c  brushloop calibrate", "30/30"):
+            assert part in text
+        await pilot.press("q")
+        assert isinstance(app.screen, RunScreen)
+
+
+async def test_a_key_answers_the_question_that_is_shown_and_the_next_one_comes() -> None:
+    engine = FakeEngine(picture(state=State.ASKING, step="wait for an answer", prompt=PROMPT))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "Waits until it is answered" in await look(app, pilot)
+        await pilot.press("z", "escape", "g")
+        assert [call for call in engine.calls if call.startswith("answer")] == ["answer 7 g"]
+        engine.now = replace(engine.now, prompt=replace(PROMPT, question="Is there ink?", number=8))
+        assert "Is there ink?" in await look(app, pilot)
+        engine.now = picture()
+        assert "RUNNING" in await look(app, pilot)
+        assert isinstance(app.screen, RunScreen)
+
+
+async def test_q_over_a_question_leaves_it_unanswered_and_parks() -> None:
+    engine = FakeEngine(picture(state=State.ASKING, prompt=PROMPT))
+    app = OperatorApp(engine)
+    async with app.run_test(size=(80, 24)) as pilot:
+        assert "q Leave: park the arm" in await look(app, pilot)
+        for answer, calls in (("n", []), ("y", ["park"])):
+            await pilot.press("q")
+            assert isinstance(app.screen, AskScreen)
+            assert app.screen.own
+            await pilot.press(answer)
+            assert engine.calls == calls

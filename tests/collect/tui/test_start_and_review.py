@@ -20,9 +20,7 @@ from brushloop.collect.tui.pictures import CellPicture, Pictures, braille, strip
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.start_screen import StartScreen
 from brushloop.sessions.recording import remarks_of
-from tests.collect.tui.fake import PAUSED, FakeEngine, picture
-from tests.collect.tui.fake_browser import FakeBrowser, a_review
-from tests.collect.tui.screen_text import has_picture, look, shown
+from tests.collect.tui.fake import PAUSED, FakeBrowser, FakeEngine, a_review, has_picture, look, picture, shown
 
 
 class Beginning(FakeBrowser):

@@ -16,7 +16,7 @@ from brushloop.collect.errors import CollectAborted
 from brushloop.collect.teach.day import LeftOff, WentBack
 from brushloop.collect.tui.question_screens import AskScreen
 from brushloop.collect.tui.teach_app import TeachApp, Teaching
-from tests.collect.tui.screen_text import shown
+from tests.collect.tui.fake import shown
 from tests.collect.tui.teach_fake import Asking, app_of
 from tests.waiting import PATIENCE_S
 
