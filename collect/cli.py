@@ -92,10 +92,10 @@ def browse() -> None:
     from brushloop.collect.tui.pictures import Pictures
     from brushloop.collect.tui.start_screen import SessionBrowser
 
-    def engine_for(opening: Opening, *, watched: bool, guided: bool) -> Engine:
+    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
         from brushloop.collect import start
 
-        return start.engine_for(opening, watched=watched, guided=guided)
+        return start.engine_for(opening, watched=watched, guided=guided, preview=preview)
 
     run_app(OperatorApp(browser=SessionBrowser(engine_for), pictures=Pictures(pixels=True)))
 

@@ -55,6 +55,7 @@ def engine_for(
     watched: bool,
     live: LiveView | None = None,
     guided: bool = False,
+    preview: bool = False,
     make: type[Engine] = Engine,
 ) -> Engine:
     """Make an engine that resumes the open session or begins a new one; connects nothing yet. Raises `ConfigError`."""
@@ -74,7 +75,7 @@ def engine_for(
         armed=opening.armed,
         live=live,
         guided=guided,
-        preview=watched,
+        preview=preview,
     )
 
 
@@ -90,6 +91,7 @@ def collect(request: CollectRequest) -> Collected:
             watched=request.on_screen,
             live=request.live,
             guided=request.guided,
+            preview=request.on_screen,
         )
 
     engine = make()
@@ -117,7 +119,7 @@ def dry_run(config: Path, protocol: Path, depth_mm: float, *, armed: bool, on_sc
     """Move through the protocol in the air; the recording is thrown away, so that no cell counts as used."""
     with tempfile.TemporaryDirectory(prefix="brushloop-dry-") as folder:
         opening = Opening.load(Path(folder), config, protocol, armed=armed, dry_run_mm=depth_mm)
-        engine = engine_for(opening, watched=on_screen, make=DryRunEngine)
+        engine = engine_for(opening, watched=on_screen, preview=on_screen, make=DryRunEngine)
         _run(engine, None, on_screen=on_screen)
     say("dry run done; nothing was kept")
 

@@ -82,7 +82,7 @@ class SessionBrowser:
         else:
             opening = Opening.load(self.root, self.config, self.root / session_id / PROTOCOL_EFFECTIVE)
             opening = replace(opening, resume=session_id)
-        return self.engine_for(opening, watched=True, guided=True)
+        return self.engine_for(opening, watched=True, guided=True, preview=True)
 
 
 class StartScreen(Screen[None]):

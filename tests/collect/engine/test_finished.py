@@ -24,8 +24,9 @@ def test_the_recording_and_what_comes_next(tmp_path: Path) -> None:
 
 
 def test_it_is_printed_after_the_screen_too(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    wired_lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    lab = wired_lab
     lab.write_protocol("[11.0]", "[0.0]")
     monkeypatch.setattr("brushloop.collect.tui.app.run_app", lambda app: (app.engine.start(), wait_for_end(app.engine)))
     folder, left_out = collect(

@@ -165,7 +165,7 @@ def test_the_start_screen_resumes_each_session_with_its_own_protocol(lab: Path) 
     Path("protocol.toml").write_text('kind = "calibration"\n')
     openings: list[Opening] = []
 
-    def engine_for(opening: Opening, *, watched: bool, guided: bool) -> Engine:
+    def engine_for(opening: Opening, *, watched: bool, guided: bool, preview: bool) -> Engine:
         openings.append(opening)
         return FakeEngine(picture())
 
