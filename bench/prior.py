@@ -9,6 +9,7 @@ Each brush is fitted with a prior about the published model, so the file does no
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import tempfile
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from bench.brushes import BRISTLE_SETS, CELLS, bristle_session
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.fit.captures import Grid, Pressed, read_presses
-from brushloop.calibrate.fit.fit import FILE, KnownBrush, KnownBrushes, about, fit_presses
+from brushloop.calibrate.fit.fit import FILE, KnownBrush, about, fit_presses
 from brushloop.model.fitted import chance_within, published
 
 BRISTLE = "bristle simulation"
@@ -155,10 +156,10 @@ def _fitted(
 
 def main() -> None:
     """Write the file."""
-    brushes = KnownBrushes(brushes=tuple(known()))
-    rows = ",\n  ".join(brush.model_dump_json() for brush in brushes.brushes)
+    brushes = list(known())
+    rows = ",\n  ".join(json.dumps(brush._asdict()) for brush in brushes)
     FILE.write_text(f'{{"brushes": [\n  {rows}\n]}}\n', encoding="utf-8")
-    sys.stdout.write(f"{len(brushes.brushes)} brushes: {FILE}\n")
+    sys.stdout.write(f"{len(brushes)} brushes: {FILE}\n")
 
 
 if __name__ == "__main__":

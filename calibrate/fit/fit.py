@@ -26,12 +26,11 @@ from functools import cache
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Grid, Pressed, by_cell, near_ink
 from brushloop.model.damped import Damping, Equations, descend
 from brushloop.model.fitted import (
@@ -79,18 +78,12 @@ END_NOISE = 4.0
 END_STEP_MM, END_ROUNDS = 0.05, 4
 
 
-class KnownBrush(Frozen):
+class KnownBrush(NamedTuple):
     """A brush of the prior: its parameters, in the order of `NAMES`."""
 
     name: str
     family: str
-    values: tuple[float, ...] = Field(min_length=len(NAMES), max_length=len(NAMES))
-
-
-class KnownBrushes(Frozen):
-    """The contents of `prior.json`."""
-
-    brushes: tuple[KnownBrush, ...]
+    values: Sequence[float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,8 +117,8 @@ def about(values: Floats) -> Prior:
 @cache
 def learned(without_families: tuple[str, ...] = ()) -> Prior:
     """The prior from `prior.json`; a bench leaves out the family that it scores."""
-    known = KnownBrushes.model_validate(json.loads(FILE.read_text(encoding="utf-8"))).brushes
-    return of_brushes([b for b in known if b.family not in without_families])
+    known = [KnownBrush(**brush) for brush in json.loads(FILE.read_text(encoding="utf-8"))["brushes"]]
+    return of_brushes([brush for brush in known if brush.family not in without_families])
 
 
 def of_brushes(known: Sequence[KnownBrush]) -> Prior:
