@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.files import write_whole
+from brushloop.calibrate.files import check_target, write_whole
 from brushloop.calibrate.fit.brush import BrushFit
 from brushloop.calibrate.presses import Press, Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
@@ -159,9 +159,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
 
     Raises `CalibrationError` and OSError.
     """
-    out = request.out
-    if out.name == PROTOCOL or not out.name.isprintable() or "\\" in out.name or len(out.name) > 200:
-        raise CalibrationError(str(out), "a protocol cannot name this file: give a plain name, as recovered.csv")
+    check_target(request.out, ".csv")
     session = open_session(request.session, "press")
     inverter, fitted = _inverter(request, session)
     count, refused = len(session.strokes), list[Refused]()
@@ -169,7 +167,7 @@ def recover(request: RecoverRequest, progress: Progress = unseen) -> Recovered:
     chosen = {session.strokes[number * count // most].stroke_id for number in range(most)}
     presses = read_presses(session, Field(), refused, cut, chosen=chosen, progress=progress)
     rows = [row for press in presses if (row := _row(press, inverter, refused))]
-    recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, out)
+    recovered = Recovered(session, inverter.model.name, with_model_error(rows, fitted), refused, request.out)
     _write(recovered, request.repeats, request.seed)
     return recovered
 

@@ -97,7 +97,7 @@ def test_what_cannot_be_inverted_is_refused_and_writes_nothing(tmp_path: Path) -
         recovered(session(tmp_path, start_x_mm=8.0), tmp_path)
     with pytest.raises(CalibrationError, match=r"no press of this brush in the range: depth_mm = \(2, 2\)"):
         recovered(tmp_path / "sessions" / "shots", tmp_path, depth_range_mm=(2.0, 2.0))
-    with pytest.raises(CalibrationError, match="give a plain name"):
+    with pytest.raises(CalibrationError, match=r"must end in \.csv"):
         recover(RecoverRequest(tmp_path, tmp_path / PROTOCOL))
     assert not (tmp_path / "recovered.csv").exists()
 
