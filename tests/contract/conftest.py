@@ -6,7 +6,8 @@ python -m pytest tests/contract --rig rig.toml     a real arm; asks before it mo
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,12 +23,12 @@ from brushloop.drivers.host import HostClock
 from brushloop.drivers.sim.arcs_server import ArcsServer, RtdeServer
 from brushloop.drivers.sim.config import SimConfig
 from brushloop.drivers.sim.rig import HOST, Addresses, rig_toml
-from brushloop.drivers.sim.world import World
+from brushloop.drivers.sim.world import SimClock, World
 from tests.contract.asking import permission_refused
 from tests.contract.motion import ACC_MM_S2, LIFT_MM, SAME_PLACE_MM, SPEED_MM_S, Enabled, raised
+from tests.simulated_time import SimulatedTimeLoop
 
 RATE = 5.0
-"""Of the loopback clock: a slow move still takes so long that a busy machine stops it in time."""
 LOOPBACK = ("sof", "bare", "sof, RTDE")
 RIG = pytest.StashKey[RigConfig]()
 BEGAN = pytest.StashKey[Pose]()
@@ -60,6 +61,11 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("rig", ["rig.toml"] if RIG in metafunc.config.stash else LOOPBACK, indirect=True)
 
 
+def pytest_asyncio_loop_factories(config: pytest.Config) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Nobody waits for the loopback controller: its time is simulated."""
+    return {"real": asyncio.new_event_loop} if RIG in config.stash else {"simulated": SimulatedTimeLoop}
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Ask once, before the first test, and only where one that moves was selected."""
@@ -83,7 +89,7 @@ async def rig(request: pytest.FixtureRequest) -> AsyncIterator[RigConfig]:
         return
     framing, _, rtde = request.param.partition(", ")
     config = SimConfig(rate=RATE, force_sensor=False, ink_device="none")
-    server = ArcsServer(World(config))
+    server = ArcsServer(World(config, SimClock(RATE, asyncio.get_running_loop().time)))
     await server.start(HOST, 0)
     pushing = RtdeServer(server.cabinet)
     await pushing.start(HOST, 0)

@@ -18,7 +18,7 @@ from unittest.mock import AsyncMock, Mock
 import pytest
 
 from tests.contract import asking
-from tests.contract.conftest import pytest_configure
+from tests.contract.conftest import RIG, pytest_collection_modifyitems, pytest_configure
 from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
@@ -88,9 +88,9 @@ def test_it_says_what_it_will_do_and_after_a_yes_it_moves(rig_toml: Path):
         assert re.search(expected, output), expected
 
 
-def answered(monkeypatch: pytest.MonkeyPatch, answer: str) -> str | None:
-    """What a person's answer comes to, of an arm that nobody has to connect to."""
-    terminal = Mock(spec=io.StringIO, **{"isatty.return_value": True, "readline.return_value": f"{answer}\n"})
+def answered(monkeypatch: pytest.MonkeyPatch, answer: str, *, asked: bool = True) -> str | None:
+    """What a person's answer comes to, of an arm that nobody has to connect to; `asked` on a terminal."""
+    terminal = Mock(spec=io.StringIO, **{"isatty.return_value": asked, "readline.return_value": f"{answer}\n"})
     monkeypatch.setattr(sys, "stdin", terminal)
     monkeypatch.setattr(asking, "_look", AsyncMock(return_value=(None, None, None)))
     monkeypatch.setattr(asking, "_announcement", Mock(return_value=""))
@@ -118,21 +118,18 @@ def test_any_other_answer_skips_what_moves_and_runs_the_rest(rig_toml: Path, ans
     assert f"the answer to whether the arm may move was {answer or 'no'!r}" in output
 
 
-def test_without_a_terminal_nothing_moves(rig_toml: Path):
-    run = subprocess.run(
-        command(rig_toml), cwd=ROOT, input="y\n", capture_output=True, text=True, check=False, timeout=PATIENCE_S
-    )
-    assert run.returncode == 0, run.stdout
-    assert "2 passed, 1 skipped" in run.stdout
-    assert "no terminal to ask on" in run.stdout
+def test_a_refusal_skips_what_moves_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tests.contract.conftest.permission_refused", lambda *_: "no")
+    config = Mock(stash=pytest.Stash(), option=Mock(collectonly=False))
+    config.stash[RIG] = Mock()
+    moving, still = Mock(), Mock(**{"get_closest_marker.return_value": None})
+    pytest_collection_modifyitems(config, [moving, still])
+    assert [mark.args[0].name for mark in moving.add_marker.call_args_list] == ["skip"]
+    assert not still.add_marker.called
 
 
-def test_what_cannot_be_used_is_one_line(tmp_path: Path):
-    path = tmp_path / "rig.toml"
-    run = subprocess.run(command(path), cwd=ROOT, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
-    assert run.returncode == pytest.ExitCode.USAGE_ERROR
-    assert run.stderr.count("\n") == 1 + run.stderr.endswith("\n\n"), run.stderr
-    assert "no such file" in run.stderr
+def test_without_a_terminal_nothing_moves(monkeypatch: pytest.MonkeyPatch):
+    assert "no terminal to ask on" in str(answered(monkeypatch, "y", asked=False))
 
 
 @pytest.mark.parametrize(

@@ -1,34 +1,32 @@
-"""The engine on the loopback rig: every stroke exactly once, whatever interrupts it."""
+"""The engine on the loopback rig: every stroke exactly once, whatever interrupts it, and how a session goes on."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from brushloop.collect.engine.control import State
 from brushloop.collect.engine.engine import UNCHECKED, Engine
+from brushloop.collect.engine.open_or_resume import Opening
 from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.errors import CollectAborted, ConfigError
+from brushloop.collect.errors import CollectAborted, ConfigError, NeedsOperator, Parked, SheetFull
 from brushloop.drivers.arcs.controller import SafetyMode
 from brushloop.drivers.devices import Identity
-from brushloop.drivers.errors import RobotNotSafe
+from brushloop.drivers.errors import DeviceError, RobotNotSafe
+from brushloop.drivers.sim.config import View
 from brushloop.sessions.events import CaptureResult
-from brushloop.sessions.journal import replay
+from brushloop.sessions.journal import JOURNAL_NAME, replay
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.store import SessionStore
+from tests.collect.conftest import Collected
 from tests.journal_lines import read_lines
-from tests.runs import until, wait_for_end
+from tests.rigs import SMALL_VIEW, Lab
+from tests.runs import answered_alike, question, until, wait_for_end
 
-if TYPE_CHECKING:
-    from tests.collect.conftest import Collected
-    from tests.rigs import Lab
-
-
-def run(engine: Engine) -> None:
-    engine.start()
-    wait_for_end(engine)
+ELSEWHERE = replace(SMALL_VIEW, centre_mm=(SMALL_VIEW.centre_mm[0] + 3.0, SMALL_VIEW.centre_mm[1]))
 
 
 def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
@@ -37,6 +35,12 @@ def run_and_stop(engine: Engine, when: Callable[[Snapshot], bool]) -> None:
     engine.stop()
     with pytest.raises(CollectAborted):
         wait_for_end(engine)
+    assert engine.snapshot().state == State.STOPPED
+
+
+def slowly(lab: Lab) -> None:
+    lab.edit_rig("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0")
+    lab.write_protocol("[11.0]", "[0.0]")
 
 
 @pytest.mark.xdist_group("collected")
@@ -64,31 +68,37 @@ def test_the_arm_presses_what_the_protocol_says_where_the_cell_lies(collected: C
         assert press.ink_load == 1.0
 
 
-def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab) -> None:
+@pytest.mark.xdist_group("collected")
+def test_a_finished_session_is_not_followed_by_another_on_the_same_sheet(collected: Collected) -> None:
+    with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
+        collected.lab.engine()
+    assert len(list(collected.lab.sessions.iterdir())) == 1
+
+
+@pytest.mark.parametrize("parked_before", [False, True])
+def test_stop_in_mid_press_voids_the_cell_and_the_same_command_goes_on(lab: Lab, parked_before: bool) -> None:
+    """Who has asked to park does not have to wait for the end of the press."""
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.strokes_done == 1)
     until(engine, lambda now: now.step.startswith("press") and now.tip_mm is not None and now.tip_mm[2] < 125.0)
+    if parked_before:
+        engine.park()
     engine.stop()
     engine.stop()
     with pytest.raises(CollectAborted):
         wait_for_end(engine)
     assert engine.snapshot().state == State.STOPPED
-    stopped_at = lab.rig.world.tool()
-    time.sleep(0.1)
-    assert lab.rig.world.tool() == stopped_at
+    assert lab.at_rest
 
-    again = lab.engine()
-    run(again)
-
-    [folder] = lab.sessions.iterdir()
-    state = replay(folder / "journal.jsonl")
+    lab.run()
+    state = replay(lab.session / JOURNAL_NAME)
     assert state.cut
-    ids = [c.stroke.stroke_id for c in Recording(folder).captures()]
+    ids = [c.stroke.stroke_id for c in Recording(lab.session).captures()]
     assert len(ids) == len(set(ids)) == 2
     # The cut press burnt its patch: three presses (one of them cut) touched three places.
     assert len(state.used_patches) == 3
-    strokes = list(Recording(folder).stroke_records())
+    strokes = list(Recording(lab.session).stroke_records())
     pressed = [capture.press for capture in state.results(CaptureResult)]
     assert [stroke.reached_mm for stroke in strokes] == [press.reached_mm for press in pressed]
     assert all(abs((stroke.reached_mm or 0.0) - (stroke.depth_mm or 0.0)) < 0.2 for stroke in strokes)
@@ -103,22 +113,16 @@ def test_stop_before_anything_has_moved(lab: Lab) -> None:
     assert engine.snapshot().state == State.STOPPED
 
 
-def test_pause_waits_between_steps_and_resume_goes_on(lab: Lab) -> None:
+def test_pause_waits_between_steps_and_resume_or_stop_ends_it(lab: Lab) -> None:
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.strokes_done == 1)
     engine.pause()
     paused = until(engine, lambda now: now.state == State.PAUSED)
-    time.sleep(0.2)
+    later_s = lab.rig.time.now_s + 10.0
+    until(engine, lambda _: lab.rig.time.now_s > later_s)
     assert engine.snapshot().strokes_done == paused.strokes_done
     engine.resume()
-    wait_for_end(engine)
-    assert engine.snapshot().state == State.DONE
-
-
-def test_stop_works_while_paused(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.start()
     until(engine, lambda now: now.state == State.RUNNING)
     engine.pause()
     until(engine, lambda now: now.state == State.PAUSED)
@@ -127,85 +131,43 @@ def test_stop_works_while_paused(lab: Lab) -> None:
         wait_for_end(engine)
 
 
-def test_a_protective_stop_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
-    engine = lab.engine()
-    engine.start()
-    until(engine, lambda now: now.step.startswith("press"))
-    lab.rig.arcs.cabinet.safety_stop()
-    with pytest.raises(RobotNotSafe, match="pendant"):
-        wait_for_end(engine)
-    now = engine.snapshot()
-    assert now.state == State.FAILED
-    assert "ProtectiveStop" in now.error
-    assert lab.rig.arcs.cabinet.power.safety == SafetyMode.PROTECTIVE_STOP, "nothing is ever cleared automatically"
-
-
-def test_a_changed_protocol_is_refused_with_the_difference(lab: Lab) -> None:
-    run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
-
-    lab.write_protocol(heights="[11.0, 16.0]")
-    with pytest.raises(ConfigError, match=r"(?s)protocol.toml: depths_mm: \[11.0, 15.0\] -> \[11.0, 16.0\]\n.*--new"):
-        lab.engine()
-    with pytest.raises(ConfigError, match="--sheet 1"):
-        lab.engine(new=True)
-    run(lab.engine(new=True, sheet=1))
-    assert len(list(lab.sessions.iterdir())) == 2
-
-
 def test_a_full_sheet_asks_for_a_fresh_one_and_goes_on_with_it(lab: Lab) -> None:
-    text = (lab.folder / "rig.toml").read_text().replace("cell_mm = [40.0, 24.0]", "cell_mm = [120.0, 80.0]")
-    (lab.folder / "rig.toml").write_text(text)
+    lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [120.0, 80.0]")
     lab.write_protocol("[11.0, 13.0, 15.0]", "[0.0, 10.0]")  # 6 presses, 4 patches
-
-    from brushloop.collect.errors import SheetFull
-
     with pytest.raises(SheetFull, match="--sheet 2"):
-        run(lab.engine())
-    [folder] = lab.sessions.iterdir()
-    begun = [line["kind"] for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
+        lab.run()
+    begun = [line["kind"] for line in read_lines(lab.session / JOURNAL_NAME) if line["event"] == "begin"]
     assert begun[-1] == "capture", "no brush was dipped for a sheet that was full"
     run_and_stop(lab.engine(sheet=2), lambda now: now.strokes_done == 5)
     with pytest.raises(ConfigError, match="only 2 or 3"):
-        run(lab.engine(sheet=5))
-    run(lab.engine(sheet=2))  # the same command again: the sheet is not changed twice
-    [folder] = lab.sessions.iterdir()
-    assert sum(1 for _ in Recording(folder).captures()) == 6
-    lines = [line for line in read_lines(folder / "journal.jsonl") if line["event"] == "begin"]
+        lab.run(sheet=5)
+    lab.run(sheet=2)  # the same command again: the sheet is not changed twice
+    assert sum(1 for _ in Recording(lab.session).captures()) == 6
+    lines = [line for line in read_lines(lab.session / JOURNAL_NAME) if line["event"] == "begin"]
     pressed = [(line["sheet"], patch) for line in lines for patch in line.get("patches", [])]
     assert len(pressed) == len(set(pressed))
     assert {sheet for sheet, _ in pressed} == {0, 1}
-
-
-def test_a_sheet_is_not_changed_while_a_press_on_it_waits_for_its_photograph(lab: Lab) -> None:
-    run_and_stop(lab.engine(), lambda now: now.step.startswith("capture"))
-    with pytest.raises(ConfigError, match=r"is pressed on sheet 1 but not photographed"):
-        run(lab.engine(sheet=2))
-    run(lab.engine())
-
-
-@pytest.mark.xdist_group("collected")
-def test_a_finished_session_is_not_followed_by_another_on_the_same_sheet(collected: Collected) -> None:
-    with pytest.raises(ConfigError, match="Put a fresh sheet in, then confirm it with --sheet 1"):
-        collected.lab.engine()
-    assert len(list(collected.lab.sessions.iterdir())) == 1
 
 
 def test_what_the_environment_changes_is_recorded_and_held_against_a_resume(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BRUSHLOOP_PAPER__TOUCH_Z_MM", "121.0")
-    run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
-    [folder] = lab.sessions.iterdir()
-    assert '"touch_z_mm": 121.0' in (folder / "rig.effective.json").read_text()
+    run_and_stop(lab.engine(), lambda now: now.step == "retreat")
+    assert '"touch_z_mm": 121.0' in (lab.session / "rig.effective.json").read_text()
     monkeypatch.delenv("BRUSHLOOP_PAPER__TOUCH_Z_MM")
     with pytest.raises(ConfigError, match=r"rig.toml: paper.touch_z_mm: 121.0 -> 120.03\n.*in the same environment;"):
         lab.engine()
 
 
-def test_real_hardware_is_not_moved_unless_armed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_real_hardware_is_not_moved_unless_armed_or_allowed_on_the_screen(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("brushloop.drivers.arcs.robot.LOOPBACK_CONTROL_BOX", "something else")
     with pytest.raises(ConfigError, match=r"real hardware.*--arm"):
-        run(lab.engine())
+        lab.run()
+    with pytest.raises(CollectAborted, match="nothing moved"):
+        answered_alike(lab.engine(watched=True), "x")
     assert not lab.sessions.exists()
     assert lab.rig.arcs.cabinet.power.mode == "PowerOff"
 
@@ -215,13 +177,134 @@ def test_an_armed_run_without_its_self_check_says_so(lab: Lab) -> None:
     lab.edit_rig("", "\n[self_check]\nenabled = false\n")
     engine = lab.run(armed=True)
     assert any(UNCHECKED in line for line in engine.snapshot().messages)
-    assert "self_check" not in {step.kind for step in replay(next(lab.sessions.glob("*/journal.jsonl"))).files.values()}
+    assert "self_check" not in {step.kind for step in replay(lab.session / JOURNAL_NAME).files.values()}
+
+
+# How a session goes on
+
+
+def begun(lab: Lab) -> Path:
+    """The folder of a session that was parked after its first stroke."""
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.strokes_done == 1)
+    engine.park()
+    with pytest.raises(Parked):
+        wait_for_end(engine)
+    return lab.session
+
+
+def test_who_resumes_on_a_screen_is_asked_before_anything_moves(lab: Lab) -> None:
+    folder = begun(lab)
+    before = lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()
+    for leaves in (False, True):
+        engine = lab.engine(watched=True)
+        engine.start()
+        prompt = question(engine, "parked on request")
+        assert engine.snapshot().state is State.ASKING
+        assert folder.name in prompt.question
+        engine.park() if leaves else engine.answer(prompt.number, "x")
+        with pytest.raises(CollectAborted, match="nothing moved"):
+            wait_for_end(engine)
+        assert (lab.rig.world.tool(), (folder / JOURNAL_NAME).read_bytes()) == before
+
+    SessionStore(folder, lambda: 1).release()  # as a process that is killed
+    engine = lab.engine(watched=True)
+    [asked] = answered_alike(engine, "g")
+    assert "cut off" in asked
+    assert engine.snapshot().strokes_done == 2
+
+
+@pytest.mark.parametrize(
+    ("view", "said"), [(replace(SMALL_VIEW, width_px=640, height_px=480), "640 x 480 px"), (ELSEWHERE, r"3\.\d mm")]
+)
+def test_a_session_does_not_go_on_with_another_camera_or_a_board_elsewhere(lab: Lab, view: View, said: str) -> None:
+    begun(lab)
+    lab.rig.reconfigure(replace(lab.rig.config, view=view))
+    pressed = len(lab.rig.world.presses)
+    with pytest.raises(NeedsOperator, match=said):
+        lab.run()
+    assert not [press for press in lab.rig.world.presses[pressed:] if press.depth_mm > 1.0]
 
 
 def test_a_session_is_not_resumed_on_another_robot(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_and_stop(lab.engine(), lambda now: now.strokes_done == 1)
+    begun(lab)
     monkeypatch.setattr(
         "brushloop.drivers.arcs.robot.Identity", lambda device, _model, *rest: Identity(device, "another arm", *rest)
     )
     with pytest.raises(ConfigError, match="was begun on"):
-        run(lab.engine(armed=True))
+        lab.run(armed=True)
+
+
+def test_a_resume_that_fails_while_connecting_still_names_its_session(lab: Lab) -> None:
+    folder = begun(lab)
+    lab.edit_rig(f"port = {lab.rig.arcs.port}", "port = 1")
+    engine = lab.engine(watched=True)
+    engine.start()
+    with pytest.raises(DeviceError):
+        wait_for_end(engine)
+    now = engine.snapshot()
+    assert (now.state, now.session_id, now.folder) == (State.FAILED, folder.name, str(folder))
+
+
+# A run that is held, and one that only moves
+
+
+@pytest.mark.parametrize(
+    "mode", [SafetyMode.PROTECTIVE_STOP, pytest.param(SafetyMode.SAFEGUARD_STOP, marks=pytest.mark.soak)]
+)
+def test_a_safety_stop_holds_the_session_until_a_person_has_released_it(lab: Lab, mode: SafetyMode) -> None:
+    """An answer before that is asked again and moves nothing."""
+    slowly(lab)
+    engine, power = lab.engine(watched=True), lab.rig.arcs.cabinet.power
+    engine.start()
+    until(engine, lambda _: lab.rig.world.tool().z_mm <= 117.0)
+    lab.rig.arcs.cabinet.safety_stop(mode)
+    first = question(engine, mode)
+    assert first.default == "x"
+    assert engine.snapshot().state is State.ASKING
+    where = lab.rig.world.tool()
+    assert engine.answer(first.number, "g")
+    again = until(engine, lambda now: now.prompt is not None and now.prompt.number != first.number).prompt
+    assert again is not None
+    assert mode in again.question
+    assert lab.rig.world.tool() == where
+    assert power.safety == mode, "nothing is ever cleared automatically"
+
+    power.safety = SafetyMode.NORMAL  # a person, at the pendant
+    assert engine.answer(again.number, "g")
+    wait_for_end(engine)
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
+
+
+def test_a_safety_stop_where_nobody_watches_ends_the_run_and_says_what_to_do(lab: Lab) -> None:
+    engine = lab.engine()
+    engine.start()
+    until(engine, lambda now: now.step.startswith("press"))
+    lab.rig.arcs.cabinet.safety_stop()
+    with pytest.raises(RobotNotSafe, match="pendant"):
+        wait_for_end(engine)
+    assert "ProtectiveStop" in engine.snapshot().error
+
+
+def test_a_dry_run_moves_all_the_way_and_leaves_neither_ink_nor_session(lab: Lab) -> None:
+    lab.write_protocol("[11.0, 20.0]")
+    well_ml = lab.rig.world.well.ml
+    ran = lab.command("--dry-run", "30")
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout == "dry run done; nothing was kept\n"
+    assert "dry run: nothing is pressed, dipped or kept" in ran.stderr
+    assert "dry run: every move was made" in ran.stderr
+    assert "session" not in ran.stderr
+    assert not lab.sessions.exists()
+    assert not lab.rig.world.presses
+    assert lab.rig.world.well.ml == well_ml
+    assert lab.at_rest
+
+
+@pytest.mark.parametrize("depth_mm", [24.0, 46.0])
+def test_a_dry_run_too_low_or_too_high_is_refused_with_the_range(lab: Lab, tmp_path: Path, depth_mm: float) -> None:
+    lab.write_protocol("[20.0]", "[0.0]")
+    with pytest.raises(ConfigError, match=r"--dry-run.*outside \[25, 44.97\] mm"):
+        Opening.load(tmp_path / "out", lab.folder / "rig.toml", lab.folder / "protocol.toml", dry_run_mm=depth_mm)

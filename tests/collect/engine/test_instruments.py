@@ -2,57 +2,59 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from mcap.reader import make_reader
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.errors import ForceTooHigh, PosesLate
+from brushloop.collect.engine.recorder import ForceGuard, Recorder
+from brushloop.collect.errors import ForceTooHigh, PosesLate, arm_at_fault, describe, rest_is_unknown
 from brushloop.drivers.arcs.robot import AuboArcs
-from brushloop.drivers.errors import ConnectionLost, Stuck
+from brushloop.drivers.devices import ForceSample, Stamp
+from brushloop.drivers.errors import ConnectionLost, DeviceError, MotionFailed, Stuck
+from brushloop.drivers.host import HostClock
 from brushloop.drivers.ink.port import DoseLost, InkRefused
 from brushloop.drivers.sim.faults import Device, Fault
 from brushloop.sessions.events import DipResult, PressResult
-from brushloop.sessions.journal import RunState, replay
+from brushloop.sessions.journal import JOURNAL_NAME, RunState, replay
+from brushloop.sessions.mcap_writer import Outgoing
 from brushloop.sessions.records import Topic
-from tests.runs import until, wait_for_end
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from brushloop.collect.engine.engine import Engine
-    from tests.collect.conftest import Collected
-    from tests.rigs import Lab
-
-
-def run(engine: Engine) -> None:
-    engine.start()
-    wait_for_end(engine)
-
-
-def only_session(lab: Lab) -> Path:
-    [folder] = lab.sessions.iterdir()
-    return folder
+from tests.collect.conftest import Collected
+from tests.rigs import Lab
+from tests.runs import question, until, wait_for_end
 
 
 def state_of(lab: Lab) -> RunState:
-    return replay(only_session(lab) / "journal.jsonl")
+    return replay(lab.session / JOURNAL_NAME)
 
 
 def slowly(lab: Lab) -> None:
     """Presses of seconds, so that there is time to act in their middle at the rig's pace."""
-    path = lab.folder / "rig.toml"
-    path.write_text(path.read_text(encoding="utf-8").replace("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0"))
-    lab.write_protocol("[11.0]", "[0.0]")
-    protocol = lab.folder / "protocol.toml"
-    protocol.write_text(protocol.read_text(encoding="utf-8").replace("dwell_s = 0.0", "dwell_s = 60.0"))
+    lab.edit_rig("press_speed_mm_s = 20.0", "press_speed_mm_s = 2.0")
+    lab.write_protocol("[11.0]", "[0.0]", dwell_s=60.0)
 
 
-def at_rest(lab: Lab) -> bool:
-    world = lab.rig.world
-    return world.motion.steady(world.clock.now_s() + 1.0)
+def in_mid_press(lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault) -> None:
+    """The sensor has this fault as soon as the brush is 4 mm deep, once."""
+    push_n = lab.rig.world.reaction.push_n
+    hung: list[int] = []
+
+    def pushed_n(depth_mm: float, tilt_deg: float) -> float:
+        if depth_mm > 4.0 and not hung:
+            hung.append(lab.rig.faults.hang(fault))
+        return push_n(depth_mm, tilt_deg)
+
+    monkeypatch.setattr(lab.rig.world.reaction, "push_n", pushed_n)
+
+
+def presses(lab: Lab) -> int:
+    return len([press for press in lab.rig.world.presses if press.depth_mm > 1.0])
 
 
 @pytest.mark.xdist_group("collected")
@@ -72,116 +74,195 @@ def test_something_hard_under_the_brush_stops_the_arm_at_once_and_burns_the_cell
 ) -> None:
     monkeypatch.setattr(lab.rig.world.reaction, "push_n", lambda depth_mm, _tilt_deg: 9.0 if depth_mm > 4.0 else 0.0)
     slowly(lab)
-    engine = lab.engine()
     with pytest.raises(ForceTooHigh, match="ceiling is 5 N"):
-        run(engine)
-
-    assert engine.snapshot().state == State.FAILED
-    assert at_rest(lab)
+        lab.run()
+    assert lab.engines[-1].snapshot().state == State.FAILED
+    assert lab.at_rest
     # It was stopped on its way down, and not moved away from what it met: a person must look first.
     assert 120.0 - 11.0 <= lab.rig.world.tool().z_mm < 116.0
-    state = replay(only_session(lab) / "journal.jsonl")
-    assert (len(state.cut), len(state.used_patches)) == (1, 1)
+    assert (len(state_of(lab).cut), len(state_of(lab).used_patches)) == (1, 1)
 
 
 def test_a_sensor_that_goes_silent_in_mid_press_stops_the_arm_and_the_press_is_done_again_elsewhere(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    push_n = lab.rig.world.reaction.push_n
-    silenced: list[float] = []
-
-    def silent_once(depth_mm: float, tilt_deg: float) -> float:
-        if depth_mm > 4.0 and not silenced:
-            silenced.append(depth_mm)
-            lab.rig.faults.hang(Fault(device=Device.FORCE, kind="silence", for_s=20.0))
-        return push_n(depth_mm, tilt_deg)
-
-    monkeypatch.setattr(lab.rig.world.reaction, "push_n", silent_once)
-    text = (lab.folder / "rig.toml").read_text(encoding="utf-8").replace("stale_ms = 1000.0", "stale_ms = 600.0")
-    (lab.folder / "rig.toml").write_text(text, encoding="utf-8")
+    in_mid_press(lab, monkeypatch, Fault(device=Device.FORCE, kind="silence", for_s=20.0))
+    lab.edit_rig("stale_ms = 1000.0", "stale_ms = 600.0")
     slowly(lab)
     engine = lab.engine()
     engine.start()
     until(engine, lambda now: now.voids > 0)
     lab.rig.faults.clear()
     wait_for_end(engine)
-
     now = engine.snapshot()
     assert (now.state, now.strokes_done, now.voids) == (State.DONE, 1, 1)
     assert any("newest sample" in line for line in now.messages)
 
 
-def test_a_sensor_that_is_stuck_in_mid_press_stops_the_arm_and_ends_the_run_with_its_name(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("fault", "error", "says"),
+    [
+        (Fault(device=Device.FORCE, kind="stuck", for_s=2.0), Stuck, "the sensor is stuck"),
+        (Fault(device=Device.FORCE, kind="bus-off"), ConnectionLost, "is off after too many errors"),
+    ],
+)
+def test_a_sensor_that_fails_in_mid_press_ends_the_run_with_the_brush_lifted(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, fault: Fault, error: type[Exception], says: str
 ) -> None:
-    push_n = lab.rig.world.reaction.push_n
-    stuck: list[float] = []
-
-    def stick_once(depth_mm: float, tilt_deg: float) -> float:
-        if depth_mm > 2.0 and not stuck:
-            stuck.append(depth_mm)
-            lab.rig.faults.hang(Fault(device=Device.FORCE, kind="stuck", for_s=2.0))
-        return push_n(depth_mm, tilt_deg)
-
-    monkeypatch.setattr(lab.rig.world.reaction, "push_n", stick_once)
+    in_mid_press(lab, monkeypatch, fault)
     slowly(lab)
-    with pytest.raises(Stuck, match="the sensor is stuck"):
-        run(lab.engine())
-    state = replay(only_session(lab) / "journal.jsonl")
-    assert (len(state.cut), len(state.used_patches)) == (1, 1)
-    assert at_rest(lab)
-    assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order: the brush was lifted"
-
-
-def test_a_bus_that_goes_off_ends_the_run_with_the_arm_parked(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    push_n = lab.rig.world.reaction.push_n
-
-    def off(depth_mm: float, tilt_deg: float) -> float:
-        if depth_mm > 4.0:
-            lab.rig.faults.hang(Fault(device=Device.FORCE, kind="bus-off"))
-        return push_n(depth_mm, tilt_deg)
-
-    monkeypatch.setattr(lab.rig.world.reaction, "push_n", off)
-    with pytest.raises(ConnectionLost, match="is off after too many errors"):
-        run(lab.engine())
-    assert at_rest(lab)
-    assert lab.rig.world.tool().z_mm > 170.0
+    with pytest.raises(error, match=says):
+        lab.run()
+    assert (len(state_of(lab).cut), len(state_of(lab).used_patches)) == (1, 1)
+    assert lab.at_rest
+    assert lab.rig.world.tool().z_mm > 170.0, "a sensor is at fault, the arm is in order"
 
 
 def test_a_low_well_is_filled_before_the_brush_dips(lab: Lab) -> None:
     well = lab.rig.world.well
     well.ml = 0.4 * well.capacity_ml
-    run(lab.engine())
+    lab.run()
     assert well.share > 0.45
     dips = state_of(lab).results(DipResult)
     assert all(dip.ink_level is not None and dip.ink_level >= 0.5 for dip in dips)
     assert max(dip.dosed_ml or 0.0 for dip in dips) >= 1.0
 
 
-def test_an_empty_reservoir_ends_the_run_before_a_dry_press(lab: Lab) -> None:
-    lab.rig.world.well.ml = 1.0
+@pytest.mark.parametrize("watched", [False, True])
+def test_an_empty_reservoir_holds_the_run_before_a_dry_press_until_it_is_refilled(lab: Lab, watched: bool) -> None:
     assert lab.rig.ink is not None
-    lab.rig.ink.instrument.reservoir_ml = 0.2  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(InkRefused, match="Refill the reservoir"):
-        run(lab.engine())
-    assert at_rest(lab)
-    assert lab.rig.world.tool().z_mm > 170.0
-    assert not [press for press in lab.rig.world.presses if press.depth_mm > 1.0]
+    firmware: Any = lab.rig.ink.instrument
+    lab.write_protocol("[11.0]", "[0.0]")
+    lab.rig.world.well.ml, firmware.reservoir_ml = 4.0, 0.2
+    engine = lab.engine(watched=watched)
+    engine.start()
+    if watched:
+        prompt = question(engine, "Refill the reservoir")
+        assert lab.rig.world.tool().z_mm > 170.0, "a person is about to reach under the arm"
+        firmware.reservoir_ml = 100.0
+        assert engine.answer(prompt.number, "g")
+        wait_for_end(engine)
+    else:
+        with pytest.raises(InkRefused, match="Refill the reservoir"):
+            wait_for_end(engine)
+        assert lab.at_rest
+        assert lab.rig.world.tool().z_mm > 170.0
+    assert presses(lab) == watched
 
 
 def test_a_dose_that_does_not_arrive_is_the_operators_to_mend(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.rig.world.well.ml = 1.0
     monkeypatch.setattr(lab.rig.world.well, "add", lambda _volume_ml: None)  # the tube has come off
     with pytest.raises(DoseLost, match="Look at the tube"):
-        run(lab.engine())
-    assert not [press for press in lab.rig.world.presses if press.depth_mm > 1.0]
+        lab.run()
+    assert not presses(lab)
 
 
 def test_poses_that_come_late_end_the_run_before_a_press_counts(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AuboArcs, "pose_lag_ms", lambda _: 412.0)
     with pytest.raises(PosesLate, match="max_pose_lag_ms = 100") as caught:
-        run(lab.engine())
+        lab.run()
     assert caught.value.lag_ms == 412.0
-    state = replay(only_session(lab) / "journal.jsonl")
-    assert len(state.cut) == 1
-    assert not state.results(PressResult)
+    assert len(state_of(lab).cut) == 1
+    assert not state_of(lab).results(PressResult)
+
+
+# The force ceiling: what is under way ends with the stop, and nothing is sent after it
+
+
+class Cell:
+    """An arm whose lines end at once and whose stops take a while, and a sensor that a test speaks for."""
+
+    def __init__(self) -> None:
+        self.did: list[str] = []
+        self.say: Callable[[ForceSample], None] = lambda _: None
+
+    def listen(self, on_sample: Callable[[ForceSample], None] | None) -> None:
+        self.say = on_sample or (lambda _: None)
+
+    def latest(self) -> None:
+        pass
+
+    async def move(self) -> None:
+        self.did.append("line")
+        await asyncio.sleep(0.0)
+
+    async def stop(self) -> None:
+        self.did.append("stop")
+        await asyncio.sleep(0.05)
+        self.did.append("at rest")
+
+    async def press_too_hard(self) -> None:
+        """Move down step by step, guarded, with 6 N from the third line on where 5 N are allowed."""
+        rig: Any = SimpleNamespace(robot=self, force=self, config=SimpleNamespace(force=SimpleNamespace(max_n=5.0)))
+        guard = ForceGuard(rig)
+        guard.listen()
+
+        async def down_step_by_step() -> None:
+            while True:
+                await self.move()
+                if len(self.did) == 3:
+                    self.say(ForceSample(Stamp(1), (0.0, 0.0, 6.0), (0.0, 0.0, 0.0)))
+
+        await guard.guarded(down_step_by_step())
+
+
+async def test_no_line_is_sent_after_the_stop_for_too_much_force() -> None:
+    cell = Cell()
+    with pytest.raises(ForceTooHigh, match=r"reached 6\.00 N"):
+        await cell.press_too_hard()
+    assert cell.did[cell.did.index("stop") :] == ["stop", "at rest"]
+
+
+async def test_where_the_stop_fails_too_the_force_is_named_first_and_the_arm_counts_as_moving() -> None:
+    class Runaway(Cell):
+        async def stop(self) -> None:
+            raise MotionFailed("robot", "stop", "not seen at rest", condition="The arm may still be moving.")
+
+    with pytest.raises(DeviceError) as caught:
+        await Runaway().press_too_hard()
+    told = describe(caught.value)
+    assert told.index("6.00 N") < told.index("The arm may still be moving.")
+    assert rest_is_unknown(caught.value)
+    assert arm_at_fault(caught.value)
+
+
+# The two times of a sample: when the host got it, and when the device took it, both by the host's clock
+
+MS = 1_000_000
+SECOND = 1000 * MS
+
+
+@dataclass
+class Kept:
+    """A writer that keeps what it is given."""
+
+    messages: list[Outgoing] = field(default_factory=list[Outgoing])
+
+    def write(self, message: Outgoing) -> None:
+        self.messages.append(message)
+
+
+def delays_ms(ahead_ns: list[int], delays: list[int]) -> list[float]:
+    """How much earlier than the host got it each force was taken, as recorded.
+
+    The device's clock is this far ahead of the host's, and the samples took so many ms to arrive.
+    """
+    kept = Kept()
+    recorder = Recorder(cast(Any, kept), HostClock(), 1000.0)
+    for number, (ahead, delay_ms) in enumerate(zip(ahead_ns, delays, strict=True)):
+        taken_ns = 1_700_000_000 * SECOND + number * 10 * MS
+        stamp = Stamp(taken_ns + delay_ms * MS, taken_ns + ahead, number)
+        recorder.force(ForceSample(stamp, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)))
+        assert kept.messages[-1].log_ns == stamp.host_ns
+    return [(message.log_ns - message.publish_ns) / MS for message in kept.messages]
+
+
+@pytest.mark.parametrize("ahead_s", [-1_700_000_000, -3, 0, 5])
+def test_the_time_of_a_device_is_told_by_the_hosts_clock_and_never_after_its_arrival(ahead_s: int):
+    delays = [4, 2, 9, 2, 30]
+    assert delays_ms([ahead_s * SECOND] * 5, delays) == [0.0, 0.0, 7.0, 0.0, 28.0], "beyond the quickest so far"
+
+
+def test_a_device_clock_that_starts_anew_is_mapped_anew():
+    assert delays_ms([0, 0, -4000 * SECOND, -4000 * SECOND], [2, 3, 3, 5]) == [0.0, 1.0, 0.0, 2.0]

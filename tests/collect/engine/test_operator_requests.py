@@ -19,11 +19,11 @@ from brushloop.sessions.recording import Recording, mark_bad_or_good
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
 from tests.runs import answer, until, wait_for_end
+from tests.waiting import PATIENCE_S
 
 
 def lines(lab: Lab, event: str) -> list[dict[str, object]]:
-    [folder] = lab.sessions.iterdir()
-    return [line for line in read_lines(folder / "journal.jsonl") if line["event"] == event]
+    return [line for line in read_lines(lab.session / "journal.jsonl") if line["event"] == event]
 
 
 def test_a_request_made_twice_is_withdrawn_and_retake_and_skip_exclude_each_other() -> None:
@@ -57,7 +57,7 @@ async def test_a_question_that_is_asked_as_the_screen_goes_away_does_not_wait_fo
             self._lock.release()
 
     asker._lock = GoneFirst()  # type: ignore[assignment]
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(PATIENCE_S):
         with pytest.raises(NeedsOperator):
             await asker.ask(Prompt("Is the sheet in?", (Choice("g", "yes"),), "g"))
 
@@ -75,7 +75,7 @@ def test_a_stroke_is_pressed_again_on_a_new_cell_because_the_operator_asked(lab:
     assert now.sheet is not None
     assert [mark for mark in now.sheet.marks if mark] == [Mark.BAD, Mark.KEPT]
     assert now.grid[0].bad == 1
-    [folder] = lab.sessions.iterdir()
+    folder = lab.session
     assert len(list(Recording(folder).captures())) == 1
 
 
@@ -89,9 +89,7 @@ def test_a_stroke_is_left_out_before_it_is_pressed_and_stays_left_out_after_a_re
     with pytest.raises(Parked):
         wait_for_end(first)
     assert first.snapshot().strokes_done + first.snapshot().given_up < 3
-    again = lab.engine()
-    again.start()
-    wait_for_end(again)
+    again = lab.run()
     now = again.snapshot()
     assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 1)
     assert len(lab.rig.world.presses) == 1
@@ -104,15 +102,14 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     first.start()
     last = until(first, lambda now: now.strokes_done == 1 and now.last is not None).last
     assert last is not None
-    [folder] = lab.sessions.iterdir()
-    assert mark_bad_or_good(folder, last.still, last.press.stroke_id, 1)
+    folder = lab.session
+    # bad, good after all, and bad again: the last word counts
+    assert [mark_bad_or_good(folder, last.still, last.press.stroke_id, n) for n in range(3)] == [True, False, True]
     until(first, lambda now: any(cell.now and cell.bad for cell in now.grid))
     first.park()
     with pytest.raises(Parked):
         wait_for_end(first)
-    again = lab.engine()
-    again.start()
-    wait_for_end(again)
+    again = lab.run()
 
     now = again.snapshot()
     assert (now.state, now.strokes_done, now.strokes_planned) == (State.DONE, 2, 2)
@@ -122,18 +119,6 @@ def test_what_is_marked_bad_meanwhile_is_pressed_again_at_the_end_exactly_once(l
     assert len(captures) == 3
     assert {name for name, bad in captures.items() if bad} == {last.press.stroke_id}
     assert f"{last.press.stroke_id}-again" in captures
-
-
-def test_what_is_good_after_all_is_not_pressed_again(lab: Lab) -> None:
-    lab.write_protocol("[11.0, 15.0]", "[0.0]")
-    engine = lab.engine(watched=True)
-    engine.start()
-    last = until(engine, lambda now: now.strokes_done == 1 and now.last is not None).last
-    assert last is not None
-    [folder] = lab.sessions.iterdir()
-    assert [mark_bad_or_good(folder, last.still, last.press.stroke_id, n) for n in range(2)] == [True, False]
-    wait_for_end(engine)
-    assert len(list(Recording(folder).captures())) == 2
 
 
 def test_a_new_sheet_is_asked_for_and_the_next_stroke_lies_on_it(lab: Lab) -> None:
@@ -177,27 +162,23 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     monkeypatch.setattr(Run, "perform", performed)
 
 
-def test_too_much_force_in_a_jog_between_strokes_is_looked_at_before_the_arm_moves(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "asks"),
+    [
+        (ForceTooHigh(6.0, 5.0), "the force reached 6.00 N"),  # looked at before the arm moves
+        (DeviceTimeout("force", "latest", "no sample"), ""),
+    ],
+)
+def test_a_jog_between_strokes_that_fails_leaves_the_paper_where_it_was(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, error: Exception, asks: str
 ) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    failing(monkeypatch, ForceTooHigh(6.0, 5.0))
+    failing(monkeypatch, error)
     engine = lab.engine(watched=True)
     engine.request(OperatorRequest.JOG)
     engine.start()
-    answer(engine, "the force reached 6.00 N", "g")
-    wait_for_end(engine)
-    assert engine.snapshot().strokes_done == 1
-
-
-def test_a_sensor_that_falls_silent_in_a_jog_between_strokes_leaves_the_paper_where_it_was(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lab.write_protocol("[11.0]", "[0.0]")
-    failing(monkeypatch, DeviceTimeout("force", "latest", "no sample"))
-    engine = lab.engine(watched=True)
-    engine.request(OperatorRequest.JOG)
-    engine.start()
+    if asks:
+        answer(engine, asks, "g")
     wait_for_end(engine)
     assert engine.snapshot().strokes_done == 1
 
@@ -226,8 +207,7 @@ def test_a_height_that_is_not_taken_and_a_jog_that_is_given_up_leave_the_paper_w
 @pytest.mark.parametrize("guided", [False, pytest.param(True, marks=pytest.mark.soak)])
 def test_who_gives_the_jog_of_the_set_up_up_keeps_the_taught_height_and_the_run_goes_on(lab: Lab, guided: bool) -> None:
     lab.write_protocol("[11.0]", "[0.0]")
-    rig = lab.folder / "rig.toml"
-    rig.write_text(rig.read_text().replace("[paper]", '[touch]\nmethod = "jog"\n\n[paper]'))
+    lab.edit_rig("[paper]", '[touch]\nmethod = "jog"\n\n[paper]')
     engine = lab.engine(watched=True, guided=guided)
     engine.start()
     if guided:
@@ -259,28 +239,18 @@ def test_park_ends_the_run_after_the_step_with_the_arm_at_its_place(lab: Lab) ->
     now = engine.snapshot()
     assert (now.state, now.voids) == (State.STOPPED, 0)
     assert now.parked
-    again = lab.engine()
-    again.start()
-    wait_for_end(again)
+    again = lab.run()
     assert again.snapshot().strokes_done == 2
     assert len({c.stroke.stroke_id for c in Recording(next(lab.sessions.iterdir())).captures()}) == 2
 
 
-def test_park_while_paused_parks_too(lab: Lab) -> None:
-    engine = lab.engine(watched=True)
-    engine.pause()
+@pytest.mark.parametrize("state", [State.PAUSED, State.ASKING])
+def test_park_while_the_run_waits_parks_and_asks_nobody_any_more(lab: Lab, state: State) -> None:
+    engine = lab.engine(watched=True, guided=state is State.ASKING)
+    if state is State.PAUSED:
+        engine.pause()
     engine.start()
-    until(engine, lambda now: now.state is State.PAUSED)
-    engine.park()
-    with pytest.raises(Parked):
-        wait_for_end(engine)
-    assert engine.snapshot().parked
-
-
-def test_park_while_a_question_waits_asks_nobody_any_more(lab: Lab) -> None:
-    engine = lab.engine(watched=True, guided=True)
-    engine.start()
-    until(engine, lambda now: now.prompt is not None)
+    until(engine, lambda now: now.state is state)
     engine.park()
     with pytest.raises((NeedsOperator, CollectAborted)):
         wait_for_end(engine)
@@ -303,8 +273,7 @@ def test_who_accepted_the_set_up_is_not_asked_at_later_views_of_the_board(lab: L
 
 def test_a_guided_calibration_has_no_self_check(lab: Lab) -> None:
     (lab.folder / "protocol.toml").write_text('kind = "calibration"\nboard_views = 2\n')
-    rig = lab.folder / "rig.toml"
-    rig.write_text(rig.read_text() + "\n[self_check]\nenabled = true\n")
+    lab.edit_rig("", "\n[self_check]\nenabled = true\n")
     engine = lab.engine(watched=True, guided=True)
     engine.start()
     answer(engine, "Camera, board, scale", "g")

@@ -14,7 +14,7 @@ from brushloop.drivers.arcs.wire import RpcConnection
 from brushloop.drivers.errors import MotionFailed, NotPowered, PathDisturbed, SettingsChanged
 from brushloop.drivers.geometry import brush_pose, from_wire, lean, to_wire
 from tests.journal_lines import read_lines
-from tests.runs import until, wait_for_end
+from tests.runs import question, until, wait_for_end
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
@@ -102,8 +102,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     (lab.folder / "rig.toml").write_text(text + '\n[touch]\nmethod = "jog"\ntouches = 1\n')
     engine = lab.engine(watched=True)
     engine.start()
-    jog = until(engine, lambda now: now.prompt is not None).prompt
-    assert jog is not None
+    jog = question(engine)
     assert "Jog until" in jog.question
     second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
@@ -129,8 +128,7 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     second_client(lab, engine, MotionControl_moveLine=slowly)
     sent = lines_sent(lab)
     engine.resume()
-    prompt = until(engine, lambda now: now.prompt is not None).prompt
-    assert prompt is not None
+    prompt = question(engine)
     assert "the arm is moving, and not from here" in prompt.question
     assert not sent
     assert lab.rig.world.tool().z_mm > here.z_mm, "it is not stopped either"
@@ -145,8 +143,7 @@ def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_agai
     second_client(lab, engine, RobotManage_poweroff={})
     sent = lines_sent(lab)
     engine.resume()
-    prompt = until(engine, lambda now: now.prompt is not None).prompt
-    assert prompt is not None
+    prompt = question(engine)
     assert "robot mode is not Running" in prompt.question
     assert not sent
     engine.answer(prompt.number, "g")
@@ -170,8 +167,7 @@ def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged
     second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
     sent = lines_sent(lab)
     engine.resume()
-    prompt = until(engine, lambda now: now.prompt is not None).prompt
-    assert prompt is not None
+    prompt = question(engine)
     assert "the arm stands where tilt = 60.000 deg" in prompt.question
     assert "Jog the arm up" in prompt.question
     assert not sent
@@ -216,7 +212,7 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
     engine.start()
     with pytest.raises((SettingsChanged, MotionFailed)):
         wait_for_end(engine)
-    [folder] = lab.sessions.iterdir()
+    folder = lab.session
     lines = list(read_lines(folder / "journal.jsonl"))
     pressed = {line["key"] for line in lines if line["event"] == "begin" and line["kind"] == "press"}
     assert pressed
@@ -230,8 +226,7 @@ def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
     start_and_pause(engine)
     second_client(lab, engine, **SHORTER)
     engine.resume()
-    prompt = until(engine, lambda now: now.prompt is not None).prompt
-    assert prompt is not None
+    prompt = question(engine)
     assert "tool offset is (0, 0, 170) mm" in prompt.question
     assert prompt.default == "x"
     engine.answer(prompt.number, "g")
@@ -267,10 +262,8 @@ def test_a_press_with_another_clients_line_is_void_lifted_and_made_again_on_a_ne
     assert moment == "startMove" or not world.drags
 
     methods[method] = carry_out
-    again = lab.engine()
-    again.start()
-    wait_for_end(again)
-    [folder] = lab.sessions.iterdir()
+    again = lab.run()
+    folder = lab.session
     lines = list(read_lines(folder / "journal.jsonl"))
     begun = [line["patches"][0] for line in lines if line["event"] == "begin" and line["kind"] == "press"]
     assert len(set(begun)) == 2

@@ -149,21 +149,14 @@ async def test_the_first_pose_out_of_reach_is_named(rig_path: Path, cabinet: Arc
 
 async def test_reach_is_that_of_our_tool_whatever_is_set_on_the_controller(rig_path: Path, cabinet: ArcsServer) -> None:
     """The same pose is as far away with either tool set; only a wrong conversion would bring it into reach."""
-    config, edges = at(rig_path, cabinet.port), list[float]()
-    wanted = load_protocol(EXAMPLES / "protocol-calibration.toml")
+    config, refused = at(rig_path, cabinet.port), list[str]()
     for offset in ([0.0] * 6, [0.0, 0.0, 0.18, 0.0, 0.0, 0.0], [0.05, -0.1, 0.3, 0.0, 0.0, 1.0]):
         cabinet.cabinet.tcp_offset = offset
-        x_mm = 700.0
-        while x_mm < 1200.0:
-            far = config.model_copy(update={"paper": config.paper.model_copy(update={"origin_mm": (x_mm, -110.0)})})
-            try:
-                await ask_reach(rig_path, far, all_poses(far, wanted, PaperPlane(120.0)))
-            except ConfigError:
-                break
-            x_mm += 20.0
-        edges.append(x_mm)
-    assert 700.0 < edges[0] < 1200.0
-    assert edges == [edges[0]] * 3
+        row = [(brush_pose(x_mm, 0.0, 200.0), 10.0, f"{x_mm:.0f}") for x_mm in range(700, 1200, 20)]
+        with pytest.raises(ConfigError, match="finds no joint solution for") as caught:
+            await ask_reach(rig_path, config, row)
+        refused.append(str(caught.value))
+    assert refused == [refused[0]] * 3
 
 
 async def test_a_tool_that_is_no_number_is_an_error_of_the_device(rig_path: Path, cabinet: ArcsServer) -> None:

@@ -1,18 +1,27 @@
-"""Every press is pressed alike: the paper is looked at before the dip, and the time from dip to touch is recorded."""
+"""From the dip to the press: every press is made alike, the arm sets out for the next dip while a photograph is judged,
+and the dip's extras, across the rim after each dip and into water before every so many."""
 
 from __future__ import annotations
 
+import asyncio
+import math
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 
+from brushloop.collect.engine.engine import Engine
 from brushloop.collect.engine.progress import Progress
 from brushloop.collect.engine.steps import brush as brush_steps
+from brushloop.collect.engine.steps import capture as capturing
+from brushloop.collect.engine.steps.context import meanwhile
+from brushloop.collect.errors import BadPicture, CollectAborted, ConfigError
+from brushloop.collect.motion import Procedures, dip_moves, wash_moves
 from brushloop.collect.planning.summary import make_plan
 from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import load_protocol
-from brushloop.collect.rig.config import load_rig
+from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.mcap_file import McapFile
@@ -20,12 +29,8 @@ from brushloop.sessions.recording import Recording
 from brushloop.sessions.records import Quality, Topic
 from tests.collect.sent import noting
 from tests.journal_lines import read_lines
-from tests.runs import wait_for_end
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.rigs import Lab
+from tests.rigs import Lab
+from tests.runs import until, wait_for_end
 
 LIST = 'kind = "list"\npresses = [{depth_mm = 11.0}, {depth_mm = 13.0}]\ndwell_s = 0.0\n'
 FIGURE = (
@@ -39,11 +44,8 @@ def run(lab: Lab, protocol: str = "") -> Path:
     """The session's folder."""
     if protocol:
         (lab.folder / "protocol.toml").write_text(protocol, encoding="utf-8")
-    engine = lab.engine()
-    engine.start()
-    wait_for_end(engine)
-    [folder] = lab.sessions.iterdir()
-    return folder
+    lab.run()
+    return lab.session
 
 
 def results(folder: Path, kind: str) -> list[dict[str, Any]]:
@@ -175,10 +177,164 @@ def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
 
     monkeypatch.setattr(brush_steps.DipToTouch, "begin", late)
     lab.write_protocol("[11.0]", "[0.0]", repeats=4)
-    engine = lab.engine()
-    engine.start()
-    wait_for_end(engine)
-    [folder] = lab.sessions.iterdir()
+    engine = lab.run()
+    folder = lab.session
     assert engine.snapshot().strokes_done == 4
     named = {seen.press.stroke_id: seen.unlike for seen in Review(folder).captures if seen.unlike}
     assert "after its dip, the others after" in named["H11-a0-r03"]
+
+
+# The arm goes where the next dip begins; the decision on a photograph still comes before the dip
+
+
+def events(lab: Lab) -> list[tuple[str, str]]:
+    lines = list(read_lines(lab.session / "journal.jsonl"))
+    kinds = {line["key"]: str(line["kind"]) for line in lines if line["event"] == "begin"}
+    return [(str(line["event"]), kinds[line["key"]]) for line in lines if "key" in line]
+
+
+def away_from_park_mm(engine: Engine) -> float:
+    tip_mm = engine.snapshot().tip_mm
+    return 0.0 if tip_mm is None else math.dist(tip_mm, engine._rig_config.motion.park_mm)
+
+
+def test_a_capture_is_judged_on_the_way_to_the_well_and_decided_before_the_dip(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine, look = lab.engine(), capturing._looked_at
+
+    async def once_under_way(*arguments: Any) -> Any:
+        async with asyncio.timeout(10.0):
+            while engine.snapshot().strokes_done == 0 and away_from_park_mm(engine) < 20.0:
+                await asyncio.sleep(0.001)
+        return await look(*arguments)
+
+    monkeypatch.setattr(capturing, "_looked_at", once_under_way)
+    engine.start()
+    wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 2
+    assert engine.snapshot().parked, "the arm does not wait over the well for a dip that does not come"
+    recorded = events(lab)
+    after_captures = [recorded[at + 1] for at, one in enumerate(recorded[:-1]) if one == ("begin", "capture")]
+    assert after_captures == [("done", "capture")] * 2
+
+
+def test_every_stroke_has_one_dip_and_the_arm_does_not_set_out_after_the_last(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    went: list[str] = []
+    for name in ("set_out", "dip", "press", "capture"):
+        method = getattr(Procedures, name)
+
+        async def noted(*arguments: Any, _name: str = name, _method: Any = method, **options: Any) -> Any:
+            went.append(_name)
+            return await _method(*arguments, **options)
+
+        monkeypatch.setattr(Procedures, name, noted)
+    lab.run()
+    assert went[went.index("dip") :] == ["dip", "press", "capture", "set_out", "dip", "press", "capture"]
+
+
+def test_a_stop_while_a_capture_is_judged_costs_a_photograph_and_no_press(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judging = asyncio.Event()
+
+    async def for_ever(*_: Any) -> Any:
+        judging.set()
+        await asyncio.Event().wait()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(capturing, "_looked_at", for_ever)
+        engine = lab.engine()
+        engine.start()
+        until(engine, lambda _: judging.is_set())
+        engine.stop()
+        with pytest.raises(CollectAborted):
+            wait_for_end(engine)
+    assert events(lab)[-2:] == [("begin", "capture"), ("void", "capture")]
+
+    again = lab.run()
+    assert again.snapshot().strokes_done == 2
+    assert len([press for press in lab.rig.world.presses if press.depth_mm > 1.0]) == 2
+
+
+async def test_a_photograph_at_fault_does_not_stop_the_arm_on_its_way() -> None:
+    arrived = False
+
+    async def moving() -> None:
+        nonlocal arrived
+        await asyncio.sleep(0.01)
+        arrived = True
+
+    async def judging() -> None:
+        raise BadPicture("too dark")
+
+    with pytest.raises(BadPicture):
+        await meanwhile(moving(), judging())
+    assert arrived
+
+
+async def test_of_a_failed_motion_and_a_failed_photograph_the_motion_is_reported() -> None:
+    async def failing(error: Exception) -> None:
+        raise error
+
+    with pytest.raises(RuntimeError, match="protective stop"):
+        await meanwhile(failing(RuntimeError("protective stop")), failing(BadPicture("too dark")))
+
+
+# Across the rim, and into water
+
+WIPE = "\n[ink.wipe]\nrim_mm = [322.0, 20.0]\nz_mm = 130.0\n"
+WASH = "\n[ink.wash]\npot_mm = [305.0, 80.0]\ndip_z_mm = 125.0\nevery_dips = 2\nstrokes = 2\n"
+
+
+def rig(lab: Lab, extra: str = "") -> RigConfig:
+    lab.edit_rig("", extra)
+    return load_rig(lab.folder / "rig.toml")
+
+
+def test_the_brush_leaves_the_well_across_its_rim_and_rises_there(lab: Lab) -> None:
+    plain, wiped = dip_moves(rig(lab)), dip_moves(rig(lab, WIPE))
+    assert [m.target for m in wiped[:2]] == [m.target for m in plain[:2]]
+    assert [round(m.target.z_mm) for m in wiped] == [180, 122, 130, 130, 180]
+    assert wiped[-1].target.position_mm[:2] == pytest.approx(wiped[-2].target.position_mm[:2])
+    assert wiped[-1].target.position_mm[:2] != pytest.approx(plain[-1].target.position_mm[:2])
+
+
+def test_washing_goes_down_and_up_so_often(lab: Lab) -> None:
+    config = rig(lab, WASH)
+    assert config.ink.wash is not None
+    assert [round(m.target.z_mm) for m in wash_moves(config, config.ink.wash)] == [180, 125, 152, 125, 152, 180]
+
+
+def test_a_session_with_both_washes_before_every_second_dip(lab: Lab) -> None:
+    rig(lab, WIPE + WASH)
+    lab.write_protocol("[11.0]", "[0.0]", repeats=2)
+    over_the_pot: list[float] = []
+    travelled = lab.rig.world.motion._on_path
+
+    def watch(start, end) -> None:
+        x_mm, y_mm = lab.rig.world.to_paper(end.x_mm, end.y_mm)
+        if abs(y_mm - 80.0) < 0.1 and abs(x_mm - 305.0) < 0.1 and abs(end.z_mm - 125.0) < 0.1:
+            over_the_pot.append(end.z_mm)
+        travelled(start, end)
+
+    lab.rig.world.motion._on_path = watch
+    engine = lab.run()
+    assert engine.snapshot().strokes_done == 2
+    assert len(over_the_pot) == 2  # once, two strokes deep
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (WIPE.replace("322.0", "120.0"), "ink.wipe.rim_mm = .* lies on the sheet"),
+        (WIPE.replace("130.0", "250.0"), "ink.wipe.z_mm = 250 is outside"),
+        (WASH.replace("305.0", "100.0"), "ink.wash.pot_mm = .* lies on the sheet"),
+        (WASH.replace("strokes = 2", "strokes = 0"), "strokes"),
+    ],
+)
+def test_a_place_on_the_sheet_or_a_height_that_cannot_be_is_refused(lab: Lab, extra: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        rig(lab, extra)

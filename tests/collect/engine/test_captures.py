@@ -1,0 +1,296 @@
+"""Captures are judged as they come, through the camera's lens: a bad stroke is made again elsewhere, then a person
+decides; and what a screen shows of a capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+
+from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
+from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, simulated
+from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.engine.control import State
+from brushloop.collect.engine.last_capture import LastCapture, mark_of
+from brushloop.collect.engine.steps import capture as capturing
+from brushloop.collect.engine.steps import context
+from brushloop.collect.engine.steps.context import RunContext
+from brushloop.collect.errors import BadPicture, ConfigError, NeedsOperator, Parked, StepError
+from brushloop.collect.quality.checks import Verdict, check_drawing
+from brushloop.collect.rig.config import load_rig
+from brushloop.collect.tui.review_screen import Review
+from brushloop.drivers.sim.brush.footprint import Flaw
+from brushloop.model.fitted import FittedPress
+from brushloop.model.strokes import stroke_model
+from brushloop.sessions.events import Press, PressResult
+from brushloop.sessions.journal import JOURNAL_NAME, replay
+from brushloop.sessions.mcap_file import McapFile
+from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Condition, Topic
+from tests.calibrate.given import kept_lens
+from tests.journal_lines import read_lines
+from tests.rigs import Lab
+from tests.runs import answered_alike, question, until, wait_for_end
+
+if TYPE_CHECKING:
+    from brushloop.calibrate.stroke import Gray
+
+
+def used(lab: Lab) -> int:
+    return len(replay(lab.session / JOURNAL_NAME).used_patches)
+
+
+def test_a_split_stroke_is_pressed_again_on_a_new_cell_and_only_the_sound_one_counts(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws[0] = (Flaw.SPLIT, 1.0)
+    engine = sharp_lab.run()
+
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 0)
+    assert any("split" in line.lower() for line in now.messages), now.messages
+    assert used(sharp_lab) == 2 + now.voids
+    folder = sharp_lab.session
+    [capture] = Recording(folder).captures()
+    assert capture.stroke.stroke_id == "H13-a0-r01"
+    assert capture.stroke.anchor_mm == pytest.approx(
+        (sharp_lab.rig.world.presses[-1].x_mm, sharp_lab.rig.world.presses[-1].y_mm), abs=0.1
+    )
+
+
+def test_a_stroke_that_fails_every_time_is_given_up_where_nobody_watches(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
+    engine = sharp_lab.run()
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 0, 1)
+    assert now.eta_s == 0.0, "a stroke that was left out takes no more time"
+    assert used(sharp_lab) == 3 + now.voids
+
+
+def test_a_question_that_nobody_answered_is_asked_again_on_resume(sharp_lab: Lab) -> None:
+    sharp_lab.rig.world.flaws.update(dict.fromkeys(range(20), (Flaw.SPLIT, 1.0)))
+    left = sharp_lab.engine(watched=True)
+    left.start()
+    assert until(left, lambda now: now.prompt is not None).state is State.ASKING
+    left.park()  # as `q` does, and a lost connection
+    with pytest.raises(Parked):
+        wait_for_end(left)
+    assert left.snapshot().given_up == 0
+
+    resumed = sharp_lab.engine(watched=True)
+    questions = answered_alike(resumed, "g")
+    assert [question.partition(":")[0] for question in questions[1:]] == ["H13-a0-r01, take 3"]
+    assert (resumed.snapshot().strokes_done, resumed.snapshot().given_up) == (1, 0)
+    assert len(sharp_lab.rig.world.presses) == 3
+
+
+def test_ink_on_a_cell_that_should_be_blank_is_seen_before_the_brush_is_dipped(sharp_lab: Lab) -> None:
+    world = sharp_lab.rig.world
+    ink_ml = world.well.ml
+    world.paper.lay(world.brush.press(13.0, 0.0, ink_load=1.0, press_seed=5), 31.0, 67.0, 0.0)
+    world.version += 1
+    with pytest.raises(NeedsOperator, match=r"patches? of sheet 1 that should be blank"):
+        sharp_lab.run()
+    assert not [press for press in world.presses if press.depth_mm > 1.0]
+    assert world.well.ml == ink_ml
+
+
+def test_a_full_sheet_is_changed_on_the_screen_and_the_run_goes_on(sharp_lab: Lab) -> None:
+    sharp_lab.edit_rig("cell_mm = [40.0, 24.0]", "cell_mm = [100.0, 60.0]")
+    sharp_lab.write_protocol("[13.0, 15.0]", "[0.0]")
+    engine = sharp_lab.engine(watched=True)
+    engine.start()
+    prompt = question(engine)
+    assert "Sheet 1 is full" in prompt.question
+    sharp_lab.rig.world.fresh_sheet()
+    assert engine.answer(prompt.number, "g")
+    wait_for_end(engine)
+    assert engine.snapshot().strokes_done == 2
+
+
+FIGURE = """kind = "write"
+cell_mm = [50.0, 36.0]
+[[figures]]
+name = "bar"
+[[figures.strokes]]
+points = [[12.0, 18.0, 5.0, 0.0, 0.0], [37.0, 18.0, 5.0, 0.0, 0.0]]
+"""
+SHALLOW = """[[figures.strokes]]
+points = [[12.0, 26.0, 1.0, 0.0, 0.0], [37.0, 26.0, 1.0, 0.0, 0.0]]
+"""
+
+
+def test_the_peak_force_of_a_figure_is_that_of_its_deepest_stroke(sharp_lab: Lab) -> None:
+    (sharp_lab.folder / "protocol.toml").write_text(FIGURE + SHALLOW, encoding="utf-8")
+    sharp_lab.run()
+    folder = sharp_lab.session
+    [drawn] = replay(folder / JOURNAL_NAME).results(PressResult)
+    assert (drawn.peak_force_n or 0.0) > 0.02, "the shallow stroke comes last and reaches 0.007 N"
+
+
+def test_a_figure_without_ink_is_drawn_again(sharp_lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    (sharp_lab.folder / "protocol.toml").write_text(FIGURE, encoding="utf-8")
+    left = [1]
+
+    def blank(image: Gray, *rest: object, **more: object) -> Verdict:
+        left[0] -= 1
+        return check_drawing(np.full_like(image, 200) if left[0] >= 0 else image, *rest, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(capturing, "check_drawing", blank)
+    engine = sharp_lab.run()
+    now = engine.snapshot()
+    assert (now.state, now.strokes_done, now.given_up) == (State.DONE, 1, 0)
+    assert used(sharp_lab) == 2
+    folder = sharp_lab.session
+    assert [capture.stroke.stroke_id for capture in Recording(folder).captures()] == ["bar-r01"]
+
+
+# A camera that distorts, with its lens file
+
+K1 = -0.08
+
+
+def lens_file(folder: Path, k1: float = K1) -> Path:
+    return kept_lens(folder, (1024, 768), k1)
+
+
+def named(lab: Lab, path: Path, also: str = "") -> Path:
+    """Name the lens file in rig.toml, as an operator does."""
+    lab.edit_rig("[camera]", f'[camera]\nlens_file = "{path.relative_to(lab.folder)}"')
+    lab.edit_rig("", also)
+    return lab.folder / "rig.toml"
+
+
+def test_a_session_is_collected_straight_and_holds_its_lens(bent_lab: Lab) -> None:
+    lens = lens_file(bent_lab.folder / "camera")
+    named(bent_lab, lens, "\n[self_check]\nenabled = true\n")
+    engine = bent_lab.engine()
+    engine.start()
+    wait_for_end(engine)
+    assert engine.snapshot().state is State.DONE, engine.snapshot().messages
+
+    folder = bent_lab.session
+    [(schema, _, message)] = McapFile(Recording(folder).path).messages([str(Topic.CALIBRATION)])
+    recorded = CameraCalibration.FromString(message.data)
+    assert schema is not None
+    assert (schema.name, recorded.width, recorded.height) == ("foxglove.CameraCalibration", 1024, 768)
+    assert (list(recorded.D), recorded.K[0]) == ([K1, 0.0, 0.0, 0.0, 0.0], 1024.0)
+
+    # The review looks through the recorded lens: the file that rig.toml names does not lie beside its snapshot.
+    review = Review(folder)
+    looked = review.pictures(next(capture for capture in review.captures if capture.counts))
+    assert looked.binary is not None
+    assert looked.binary.any()
+
+    made = calibrate_session(CalibrateRequest(folder)).calibration
+    assert made.lens is not None
+    assert made.lens.source == f"lens file {lens.stem}"
+
+    # The self-check spent three patches far apart, and the press lies on a fourth.
+    lines = read_lines(folder / "journal.jsonl")
+    [check] = [line for line in lines if line["event"] == "done" and line["result"]["kind"] == "self_check"]
+    assert check["result"]["patches"] == [0, 5, 36]
+    assert max(abs(scale - 1.0) for scale in check["result"]["scale"]) < 0.005
+    state = replay(folder / "journal.jsonl")
+    assert {(0, 0), (0, 5), (0, 36), (0, 1)} <= state.used_patches
+    assert len(state.used_patches) == 4 + 3 * len(state.cut)
+
+
+def test_without_the_lens_file_the_run_ends_before_ink_and_names_the_remedy(bent_lab: Lab) -> None:
+    with pytest.raises(StepError, match=r"the lens bends straight lines: .*camera\.lens_file"):
+        bent_lab.run()
+    folder = bent_lab.session
+    assert replay(folder / "journal.jsonl").used_patches == set()
+
+
+def test_what_is_no_lens_file_is_refused_in_one_line(bent_lab: Lab) -> None:
+    lens = lens_file(bent_lab.folder)
+    rig = named(bent_lab, lens)
+    optics = load_rig(rig).camera.optics
+    assert optics is not None
+    assert optics.distortion[0] == K1
+    lens.write_text(lens.read_text().replace("a board", "another"))
+    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*was edited"):
+        load_rig(rig)
+    lens.unlink()
+    with pytest.raises(ConfigError, match=r"rig.toml: camera.lens_file: .*no such file"):
+        load_rig(rig)
+
+
+def test_a_changed_lens_file_is_a_changed_configuration(bent_lab: Lab) -> None:
+    rig = named(bent_lab, lens_file(bent_lab.folder))
+    before = load_rig(rig).model_dump_json()
+    other = lens_file(bent_lab.folder, -0.07)
+    rig.write_text(rig.read_text().replace(lens_file(bent_lab.folder).name, other.name))
+    assert load_rig(rig).model_dump_json() != before
+
+
+# Where the paper lies: the board is looked for once in each frame
+
+
+class Camera:
+    """Frames, and the planes that are found in them."""
+
+    def __init__(self, *planes: str | None) -> None:
+        self.frames: list[Any] = [np.zeros((2, 2), np.uint8) for _ in planes]
+        self.planes = planes
+        self.searched: list[int] = []
+
+    def see_board(self, image: Any, _spec: object) -> str:
+        [number] = [k for k, frame in enumerate(self.frames) if frame is image]
+        self.searched.append(number)
+        if (plane := self.planes[number]) is None:
+            raise CalibrationError("camera", "no board")
+        return plane
+
+
+def run_with(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> RunContext:
+    monkeypatch.setattr(context, "see_board", camera.see_board)
+    nothing: Any = SimpleNamespace()
+    rig: Any = SimpleNamespace(config=SimpleNamespace(board=None))
+    return RunContext(rig, nothing, nothing, nothing, nothing, nothing, nothing)
+
+
+def test_a_hidden_board_is_taken_from_the_newest_frame_that_showed_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(None, "seen", None)
+    run = run_with(camera, monkeypatch)
+    with pytest.raises(BadPicture, match="no board"):
+        run.image_plane(camera.frames[0])
+    assert [run.image_plane(camera.frames[k]) for k in (1, 2, 2)] == ["seen"] * 3
+    assert camera.searched == [0, 1, 2]
+
+
+# What a screen shows of a capture, without torch
+
+BRUSH = FittedPress(6.0, 48.0)
+
+
+@pytest.mark.parametrize("depth_mm", [11.0, 15.0, 20.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0, 10.0])
+def test_the_mark_is_the_one_of_the_closed_form(depth_mm: float, tilt_deg: float) -> None:
+    mark = mark_of(BRUSH, Condition(depth_mm, tilt_deg))
+    model = stroke_model("ccd-bsm", BRUSH)
+    exact = simulated(model, depth_mm, tilt_deg, Field())[KEYS.index((Alignment.MM, Tone.BINARY))] > 0
+    assert mark is not None
+    assert exact.sum() > 100
+    assert np.logical_xor(mark, exact).sum() <= 0.01 * exact.sum()
+
+
+def test_beyond_the_domain_there_is_none() -> None:
+    assert mark_of(BRUSH, Condition(0.0, 0.0)) is None
+    assert mark_of(BRUSH, Condition(11.0, 85.0)) is None
+
+
+def test_likeness_is_a_cosine_and_needs_ink_on_both() -> None:
+    mark = mark_of(BRUSH, Condition(11.0, 0.0))
+
+    def capture(binary: np.ndarray | None) -> LastCapture:
+        press = Press(stroke_id="H11-a0-r00", condition=Condition(11.0, 0.0))
+        return LastCapture(press, 1, True, None, None, binary, mark)
+
+    assert capture(mark).likeness == pytest.approx(1.0)
+    assert capture(np.roll(mark, 60, axis=0)).likeness == pytest.approx(0.0)
+    assert capture(None).likeness is None
+    assert capture(np.zeros_like(mark)).likeness is None
