@@ -291,16 +291,16 @@ class LoopRounds(force_driver.RoundStream):
         super().__init__(*arguments)
         assert rig.force is not None
         self._rig, self._board = rig, rig.force.board
-        self._task: asyncio.Task[None] | None = None
-
-    def start(self) -> None:
-        self.identity = Identity("force", "SRI M8123B2 on the loopback rig", "", True)
         self._board.streaming = True
+        self.identity = Identity("force", "SRI M8123B2 on the loopback rig", "", True)
         self._task = asyncio.get_running_loop().create_task(self._read(), name="force rounds")
 
     def stop(self, timeout_s: float = 5.0) -> None:
-        if self._task is not None:
-            self._task.cancel()
+        super().stop(timeout_s)
+        self._task.cancel()
+
+    def _run(self) -> None:
+        """Leave the thread without work."""
 
     async def _read(self) -> None:
         while self.loss is None:

@@ -1,21 +1,25 @@
-"""Every kind of protocol: each planned stroke exactly once, under an id and keys that no process or sheet changes."""
+"""Every kind of protocol: each planned stroke exactly once, under an id and keys that no process or sheet changes;
+grids balanced over the sheet, few strokes that span the grid, and patches of the sheet that are used once."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from brushloop.collect.planning.walk import as_planned
 from brushloop.collect.protocols.config import ProtocolConfig, load_protocol
 from brushloop.collect.protocols.kinds import (
     CalibrationConfig,
     DrawnStroke,
+    FewStrokesConfig,
     Figure,
     GridConfig,
     ListConfig,
@@ -24,6 +28,7 @@ from brushloop.collect.protocols.kinds import (
     ReplayRow,
     WriteConfig,
 )
+from brushloop.collect.protocols.plan import Planned
 from brushloop.collect.protocols.steps import (
     MARKING,
     CaptureStep,
@@ -34,7 +39,9 @@ from brushloop.collect.protocols.steps import (
     TouchStep,
     press_of,
 )
-from brushloop.collect.rig.paper import Layout
+from brushloop.collect.rig.config import PaperConfig
+from brushloop.collect.rig.paper import Layout, Sheet, to_base
+from brushloop.sessions.events import Condition, Press
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 
@@ -192,3 +199,130 @@ def test_a_calibration_touches_and_looks_and_leaves_no_mark() -> None:
     assert walked[1] == TouchStep(walked[1].index, 20.0, 20.0)
     again = [step.kind for step in walked if step.run_scoped]
     assert again == [StepKind.ZERO_TOUCH, StepKind.BOARD], "each process touches the paper and looks at the board first"
+
+
+# Grids and their sheets
+
+GRID = {"depths_mm": [11.0, 13.0, 15.0, 17.0, 20.0], "tilts_deg": [0.0, 5.0, 10.0]}
+
+
+def thirds(plan: list[Planned], layout: Layout) -> dict[Condition, list[float]]:
+    """Of each (H, alpha): how many of its strokes lie in each third of rows, then of columns, less the fair number."""
+    found: dict[Condition, list[float]] = defaultdict(lambda: [0.0] * 6)
+    fair = [0.0] * 6
+    conditions = len({s.condition for s in plan})
+    for place, stroke in enumerate(plan):
+        row, column = divmod(place % layout.capacity, layout.columns)
+        for band in (3 * row // layout.rows, 3 + 3 * column // layout.columns):
+            found[stroke.condition][band] += 1
+            fair[band] += 1 / conditions
+    return {key: [count - want for count, want in zip(counts, fair, strict=True)] for key, counts in found.items()}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("layout", [Layout(6, 7), Layout(5, 9), Layout(4, 4)], ids=str)
+def test_each_condition_is_within_one_or_two_strokes_of_its_share_of_every_third(seed: int, layout: Layout) -> None:
+    config = GridConfig(kind="grid", **GRID, repeats=10, seed=seed)
+    balanced, plain = thirds(config.planned(layout), layout), thirds(config.planned(), layout)
+    worst = max(abs(off) for offs in balanced.values() for off in offs)
+    square = sum(off * off for offs in balanced.values() for off in offs)
+    assert worst < 1.7
+    assert square < 0.35 * sum(off * off for offs in plain.values() for off in offs)
+
+
+def test_rounds_stay_whole() -> None:
+    plan = GridConfig(kind="grid", **GRID, repeats=4).planned(Layout(6, 7))
+    for first in range(0, len(plan), 15):
+        assert len({s.condition for s in plan[first : first + 15]}) == 15
+
+
+def test_another_seed_is_another_order() -> None:
+    plans = [GridConfig(kind="grid", **GRID, repeats=2, seed=seed).planned(Layout(6, 7)) for seed in (1, 2)]
+    assert [s.stroke_id for s in plans[0]] != [s.stroke_id for s in plans[1]]
+
+
+@pytest.mark.parametrize("layout", [Layout(1, 1), Layout(0, 0), Layout(1, 50)], ids=str)
+def test_a_sheet_without_thirds_is_no_trouble(layout: Layout) -> None:
+    plan = GridConfig(kind="grid", **GRID, repeats=2).planned(layout)
+    assert len({s.stroke_id for s in plan}) == 30
+
+
+def test_keys_tell_steps_apart() -> None:
+    press = Press(stroke_id="a", condition=Condition(depth_mm=11.0, tilt_deg=5.0))
+    step = PressStep(3, press)
+    assert step.key != PressStep(4, press).key
+    assert step.key != PressStep(3, press, dwell_s=1.0).key
+    steeper = press.model_copy(update={"condition": Condition(depth_mm=11.0, tilt_deg=6.0)})
+    assert step.key != PressStep(3, steeper).key
+    measured = press.model_copy(update={"reached_mm": 10.9, "dip_to_touch_s": 1.2})
+    assert CaptureStep(3, measured).key == CaptureStep(3, press).key, "what was measured does not change what was asked"
+
+
+def paper(**changes: object) -> PaperConfig:
+    values = {"origin_mm": (460.0, -110.0), "yaw_deg": 90.0, "touch_z_mm": 120.0, "size_mm": (244.0, 172.0)}
+    return PaperConfig.model_validate(values | changes)
+
+
+def test_cells_tile_the_sheet_without_overlap() -> None:
+    sheet = Sheet(paper())
+    assert (sheet.columns, sheet.rows, sheet.capacity) == (6, 7, 42)
+    corners = {sheet.patch(i).rect_mm[:2] for i in range(sheet.capacity)}
+    assert len(corners) == 42
+    for index in range(sheet.capacity):
+        x, y, width, height = sheet.patch(index).rect_mm
+        assert x >= 0.0
+        assert x + width <= 244.0
+        assert y >= 0.0
+        assert y + height <= 172.0
+        anchor_x, anchor_y = sheet.patch(index).anchor_mm
+        assert x < anchor_x < x + width
+        assert y < anchor_y < y + height
+
+
+def test_a_used_cell_is_never_handed_out_again() -> None:
+    sheet = Sheet(paper())
+    used: set[int] = set()
+    for _ in range(sheet.capacity):
+        patch = sheet.free(used)
+        assert patch.index not in used
+        used.add(patch.index)
+
+
+def test_paper_axes_turn_with_the_yaw() -> None:
+    assert to_base(paper(), 10.0, 0.0) == (460.0, -100.0)
+    x, y = to_base(paper(), 0.0, 10.0)
+    assert (round(x, 9), round(y, 9)) == (450.0, -110.0)
+
+
+# Few strokes
+
+FEW = GRID | {"kind": "few-strokes"}
+
+
+def pressed(**changed: object) -> list[tuple[float, float]]:
+    return [
+        (p.condition.depth_mm, p.condition.tilt_deg) for p in FewStrokesConfig.model_validate(FEW | changed).planned()
+    ]
+
+
+def test_the_first_four_presses_are_the_corners_of_the_grid() -> None:
+    assert set(pressed(strokes=4)) == {(11.0, 0.0), (11.0, 10.0), (20.0, 0.0), (20.0, 10.0)}
+
+
+def test_more_presses_continue_the_same_order() -> None:
+    assert pressed(strokes=9) == pressed(strokes=12)[:9]
+    assert len(set(pressed(strokes=15))) == 15
+    assert pressed(strokes=20)[15:] == pressed(strokes=5)
+
+
+def test_every_press_has_a_name_and_a_number_of_its_own() -> None:
+    plan = FewStrokesConfig.model_validate(FEW | {"strokes": 31}).planned()
+    assert len({p.stroke_id for p in plan}) == 31
+    assert [p.index for p in plan] == list(range(31))
+    assert (plan[0].stroke_id, plan[15].stroke_id) == ("H11-a0-r01", "H11-a0-r02")
+
+
+@pytest.mark.parametrize("changed", [{"strokes": 0}, {"tilts_deg": [5.0, 5.0]}, {"seed": 1}])
+def test_what_it_does_not_accept(changed: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        FewStrokesConfig.model_validate(FEW | changed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,13 +14,15 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.board.pix2len import Plane
+from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.collect.quality.checks import Failure, Family, check_capture, check_drawing, check_frame, patch_is_blank
-from brushloop.collect.quality.measure import blur_px, glare, paper_level
+from brushloop.collect.quality.measure import Ink, Window, blur_px, glare, measure_mark, paper_level
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
 from tests.calibrate.given import flat_plane
 
 LIMITS = QualityConfig()
+PAGE = (Path(__file__).parents[3] / "docs" / "quality.md").read_text(encoding="utf-8")
 PX = 8.0
 CELL = Patch(0, 20.0, 15.0, 40.0, 24.0)
 Gray = NDArray[np.uint8]
@@ -180,3 +183,30 @@ def test_limits_that_contradict_each_other_are_refused() -> None:
         QualityConfig(dark_level=200.0, bright_level=150.0)
     with pytest.raises(ValidationError, match="split_m"):
         QualityConfig.model_validate({"split_m": 1.0})
+
+
+@pytest.mark.parametrize("photo_px_per_mm", [6.25, 3.3, 2.5])
+def test_an_even_mark_is_even_at_any_resolution(photo_px_per_mm: float) -> None:
+    """A coarse photograph blurs the edge of a mark over more of it: a sound mark is not called dry for that."""
+    mark = measure_mark(photographed(photo_px_per_mm), (20.0, 7.0))
+    assert mark is not None
+    assert mark.uneven < 0.25 * LIMITS.uneven
+
+
+def photographed(photo_px_per_mm: float) -> Ink:
+    """An even ellipse of 24 x 8 mm in a window of 30 x 14 mm."""
+    sharp = np.zeros((round(14 * PX_PER_MM), round(30 * PX_PER_MM)), np.float32)
+    half = round(12 * PX_PER_MM), round(4 * PX_PER_MM)
+    cv2.ellipse(sharp, (sharp.shape[1] // 2, sharp.shape[0] // 2), half, 0.0, 0.0, 360.0, 0.85, cv2.FILLED)
+    share = photo_px_per_mm / PX_PER_MM
+    photo = cv2.GaussianBlur(cv2.resize(sharp, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    dark = np.asarray(cv2.resize(photo, sharp.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+    raster = (255.0 * (1.0 - dark)).astype(np.uint8)
+    window = Window((0.0, 0.0, 30.0, 14.0), raster, dark, np.ones(dark.shape, np.bool_), 1.0 / photo_px_per_mm)
+    return Ink(window, dark > 0.2, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("field", "default"), QualityConfig().model_dump().items())
+def test_the_page_gives_the_default_of_every_field(field: str, default: float | bool) -> None:
+    shown = f"{default:g}" if isinstance(default, float) else str(default).lower()
+    assert f"`{field}` {shown}" in PAGE
