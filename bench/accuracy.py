@@ -36,7 +36,7 @@ from bench.harness import BenchError, Result, at_most, brushloop, machine, round
 from bench.prior import BRISTLE
 from brushloop.calibrate.compare.place import TABLE_2, Field
 from brushloop.calibrate.fit.captures import Captures, by_cell, read_presses
-from brushloop.calibrate.fit.fit import Prior, fit_presses, learned
+from brushloop.calibrate.fit.descent import Prior, fit_presses, learned
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED, Refit, held_out_scores, image_of, leave_cell_out, refit
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.writing.compare import HEADLINE, REFERENCE, SIMULATED, read_written

@@ -72,7 +72,7 @@ def fit(
         _fit_drags(session, mm_per_px, prior, strokes)
         return
 
-    from brushloop.calibrate.fit.brush import FitRequest, fit_presses
+    from brushloop.calibrate.fit.fit import FitRequest, fit_presses
     from brushloop.sessions.terminal import show_work
 
     show_work(fit_presses, FitRequest(session, mm_per_px or MM_PER_PX))

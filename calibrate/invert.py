@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import check_target, write_whole
-from brushloop.calibrate.fit.brush import BrushFit
+from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.presses import Press, Refused, cut, read_presses
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.stats import student_95

@@ -28,7 +28,7 @@ from brushloop.calibrate.compare.place import (
     simulated,
 )
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import BrushFit
+from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.presses import Press, Refused, read_presses, too_thin, uncommanded
 from brushloop.calibrate.report import (
     Point,
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from brushloop.model.strokes import StrokeModel
 
 FILE, PAGE, TABLE = "loop.json", "loop.html", "loop.csv"
-FORMAT = "brushloop-loop-2"
+FORMAT = "brushloop-loop-3"
 MAX_BYTES = 8 * 1024 * 1024
 AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated"
 """What is compared with an original: its repetition, other originals of its condition, the model's image of it."""
@@ -138,7 +138,7 @@ class LoopRecord(Sealed):
     """Scale of the millimetre field."""
     pairs: int
     goal_points: float
-    table_1: tuple[Stat, ...]
+    stats: tuple[Stat, ...]
     verdicts: tuple[Verdict, ...]
     refused: tuple[Refused, ...]
     software: str
@@ -146,11 +146,11 @@ class LoopRecord(Sealed):
 
     def rows(self, key: Key) -> list[Stat]:
         """The rows of the table in one alignment and tone."""
-        return [row for row in self.table_1 if (row.alignment, row.tone) == key]
+        return [row for row in self.stats if (row.alignment, row.tone) == key]
 
     def stat(self, compared: str, key: Key) -> Stat | None:
         """One row of the table, or None if nothing was compared in this way."""
-        return find_stat(self.table_1, compared, key)
+        return find_stat(self.stats, compared, key)
 
     @property
     def answer(self) -> Point:
@@ -213,7 +213,7 @@ def compare(request: CompareRequest, progress: Progress = unseen) -> Written:
         mm_per_px=view.mm_per_px,
         pairs=len(pairs),
         goal_points=GOAL_POINTS,
-        table_1=tuple(table_1(scores)),
+        stats=tuple(statistics_of(scores)),
         verdicts=tuple(verdicts(scores)),
         refused=tuple(refused),
         software=made_by(),
@@ -260,7 +260,7 @@ def score_pairs(pairs: Sequence[Pair], originals: Iterable[Press]) -> Scores:
     return scores
 
 
-def table_1(scores: Scores) -> Iterator[Stat]:
+def statistics_of(scores: Scores) -> Iterator[Stat]:
     """The statistics of each comparison, in percent."""
     for compared in scores.models:
         yield from statistics(compared, 100.0 * scores.of(compared), scores.cell_of)

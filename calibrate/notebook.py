@@ -35,7 +35,7 @@ from brushloop.sessions.records import Condition, Header, Quality, Topic, Wrench
 if TYPE_CHECKING:
     # What only some of the functions need is imported when they are called.
     from brushloop.calibrate.calibrated import Calibrated
-    from brushloop.calibrate.fit.brush import BrushFit, FitResult
+    from brushloop.calibrate.fit.fit import BrushFit, FitResult
     from brushloop.calibrate.invert import Recovered
     from brushloop.calibrate.validate.command import ValidationOutput
     from brushloop.model.strokes import StrokeModel
@@ -181,7 +181,7 @@ class Session:
     @property
     def fit(self) -> BrushFit | None:
         """The brush fit in use."""
-        from brushloop.calibrate.fit.brush import FOLDER, BrushFit
+        from brushloop.calibrate.fit.fit import FOLDER, BrushFit
 
         path = current(self.recording.path.parent, FOLDER)
         return None if path is None else load_artefact(path, BrushFit)
@@ -318,7 +318,7 @@ def calibrate_session(session: Place, *, lens: Path | None = None) -> Calibrated
 
 def fit(session: Place, **options: Any) -> FitResult:
     """Fit the brush to the presses of a session, as `brushloop fit` does; `options` are fields of `FitRequest`."""
-    from brushloop.calibrate.fit.brush import FitRequest, fit_presses
+    from brushloop.calibrate.fit.fit import FitRequest, fit_presses
 
     return fit_presses(FitRequest(_path(session), **options))
 

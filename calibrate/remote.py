@@ -11,7 +11,7 @@ from typing import Any
 from brushloop.calibrate.artefact import FOLDER, POINTER, pointed
 from brushloop.calibrate.errors import CalibrationError, one_line
 from brushloop.calibrate.files import replacing
-from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.sessions.disk import file_sha256
 
 URL = re.compile(r"^[a-z][a-z0-9+.-]+://", re.IGNORECASE)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brushloop.calibrate.compare.place import Alignment, similarity
 from brushloop.calibrate.fit.captures import Cell, Floats, Grid, Pressed, by_cell
-from brushloop.calibrate.fit.fit import Prior, fit_presses
+from brushloop.calibrate.fit.descent import Prior, fit_presses
 from brushloop.calibrate.stats import CEILING, Summary, average, ceiling_values, pair_means
 from brushloop.calibrate.work import Arrays, Scheduler, Store, key_of, threads
 from brushloop.model.ccdbsm import DomainError

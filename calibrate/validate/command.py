@@ -14,8 +14,8 @@ from brushloop.calibrate.drags.report import DragValidation, validate_drags, wri
 from brushloop.calibrate.drags.report import summary as drag_summary
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
-from brushloop.calibrate.fit.brush import FOLDER as FITS
-from brushloop.calibrate.fit.brush import BrushFit
+from brushloop.calibrate.fit.fit import FOLDER as FITS
+from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.loop import FILE as LOOP_FILE
 from brushloop.calibrate.loop import LoopRecord, read_loop
 from brushloop.calibrate.remote import URL, local_path

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from brushloop.calibrate.artefact import Frozen
 from brushloop.calibrate.compare.place import Field, Pixels, brush_of, images_of
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import BrushFit
+from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.fit.heldout import Draw
 from brushloop.calibrate.session import OpenSession
 from brushloop.calibrate.stats import CEILING

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from brushloop.calibrate.artefact import FOLDER
 from brushloop.calibrate.compare.place import KEYS, TABLE_3
-from brushloop.calibrate.fit.brush import FOLDER as FITS
+from brushloop.calibrate.fit.fit import FOLDER as FITS
 from brushloop.calibrate.report import (
     recording_facts,
     render,

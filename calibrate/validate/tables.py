@@ -357,7 +357,7 @@ def summary_csv(report: Report) -> str:
     """Return every statistic, per cell and overall; “robot writing” is what `brushloop loop` pressed again."""
     stats = [(stat.model, report.label, stat) for stat in report.stats]
     for loop in report.loops:
-        again = (stat for stat in loop.table_1 if stat.model == AGAIN)
+        again = (stat for stat in loop.stats if stat.model == AGAIN)
         stats += [(f"{ROBOT_WRITING} ({loop.again})", str(loop.source), stat) for stat in again]
     rows: list[tuple[object, ...]] = []
     for (model, source, stat), measure in itertools.product(stats, MEASURES):

@@ -60,7 +60,7 @@ def calibrated(session: Path) -> None:
 
 def fitted(session: Path) -> Path:
     """The brush fit in use of a session, made if there is none. Raises `CalibrationError`, `SessionError`."""
-    from brushloop.calibrate.fit.brush import FOLDER, FitRequest, fit_presses  # slow to import
+    from brushloop.calibrate.fit.fit import FOLDER, FitRequest, fit_presses  # slow to import
 
     fit = current(session, FOLDER)
     if fit is None:

@@ -23,8 +23,8 @@ from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.board.pix2len import Plane, see_board
 from brushloop.calibrate.board.spec import BoardSpec
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import FOLDER as FITS
-from brushloop.calibrate.fit.brush import BrushFit
+from brushloop.calibrate.fit.fit import FOLDER as FITS
+from brushloop.calibrate.fit.fit import BrushFit
 from brushloop.calibrate.session import board_of, lens_in_use
 from brushloop.calibrate.stats import odd_waits, waits_of
 from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from brushloop.calibrate.compare.place import KEYS, Tone
-from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, table_1, verdicts
+from brushloop.calibrate.loop import AGAIN, ANOTHER, SIMULATED, LoopRecord, statistics_of, verdicts
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.scores import Scores
 from brushloop.calibrate.stroke.preprocess import Measured
@@ -47,7 +47,7 @@ def loop_record(original: str, original_sha256: str, source: Source = Source.LOO
         mm_per_px=0.3,
         pairs=6,
         goal_points=1.0,
-        table_1=tuple(table_1(scores)),
+        stats=tuple(statistics_of(scores)),
         verdicts=tuple(verdicts(scores)),
         refused=(),
         software="brushloop test",

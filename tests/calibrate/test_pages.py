@@ -18,7 +18,7 @@ from brushloop.__main__ import app
 from brushloop.calibrate.board.lens import Gray
 from brushloop.calibrate.board.spec import BoardSpec, charuco_board
 from brushloop.calibrate.compare.place import KEYS, Tone
-from brushloop.calibrate.loop import NOT_AGAIN, Pair, score_pairs, table_1, verdicts, write_loop
+from brushloop.calibrate.loop import NOT_AGAIN, Pair, score_pairs, statistics_of, verdicts, write_loop
 from brushloop.calibrate.presses import Press
 from brushloop.calibrate.report import Axis, Marks, Panel, chart_uri, source_label, source_note
 from brushloop.calibrate.stroke.preprocess import Measured
@@ -95,7 +95,7 @@ def _loop(folder: Path) -> str:
         for name in ("grid", "replay")
     )
     scores = score_pairs(pairs, [first, second])
-    rows = {"table_1": tuple(table_1(scores)), "verdicts": tuple(verdicts(scores))}
+    rows = {"stats": tuple(statistics_of(scores)), "verdicts": tuple(verdicts(scores))}
     record = loop_record("grid", "ab", refused=(("a-r02", NOT_AGAIN), ("x<u>", "is blank")), **rows)
     return write_loop(record, (original, again), pairs, scores, folder / "loop").read_text(encoding="utf-8")
 

@@ -21,7 +21,7 @@ from brushloop.calibrate import presses, work
 from brushloop.calibrate.compare.place import Field
 from brushloop.calibrate.errors import CaptureRefused
 from brushloop.calibrate.fit import heldout
-from brushloop.calibrate.fit.brush import FitRequest, fit_presses
+from brushloop.calibrate.fit.fit import FitRequest, fit_presses
 from brushloop.calibrate.presses import Press, cut, too_thin, uncommanded
 from brushloop.calibrate.session import OpenSession, open_session
 from brushloop.calibrate.validate import run as validation

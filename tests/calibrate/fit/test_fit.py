@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brushloop.calibrate.fit.captures import FEWEST_CELLS, Grid, Pressed, sizes_of
-from brushloop.calibrate.fit.fit import KnownBrush, about, draw, fit_presses, learned, of_brushes, regress, spreads
+from brushloop.calibrate.fit.descent import KnownBrush, about, draw, fit_presses, learned, of_brushes, regress, spreads
 from brushloop.calibrate.fit.heldout import FITTED, leave_cell_out
 from brushloop.calibrate.stats import CEILING
 from brushloop.model.fitted import NAMES, PARAMETERS, TERMS, FittedPress, command_terms, published

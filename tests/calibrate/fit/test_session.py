@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from brushloop.__main__ import app
 from brushloop.calibrate.artefact import current, load_artefact
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import FOLDER, BrushFit, FitRequest, fit_presses
+from brushloop.calibrate.fit.fit import FOLDER, BrushFit, FitRequest, fit_presses
 from brushloop.calibrate.session import open_session
 from brushloop.calibrate.validate.tables import load_report
 from brushloop.model.fitted import NAME, NAMES

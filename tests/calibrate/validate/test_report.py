@@ -17,7 +17,7 @@ import brushloop
 from brushloop.__main__ import app
 from brushloop.calibrate.compare.place import KEYS
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.fit.brush import FitRequest, fit_presses
+from brushloop.calibrate.fit.fit import FitRequest, fit_presses
 from brushloop.calibrate.fit.heldout import BEZIER, FITTED
 from brushloop.calibrate.stats import CEILING
 from brushloop.calibrate.validate.command import Request, validate

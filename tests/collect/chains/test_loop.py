@@ -70,7 +70,7 @@ def test_the_loop_is_closed_and_goes_on_after_kill_nine(bench: Bench) -> None:
     assert report["pairs"] == 6
     assert report["refused"] == []
     assert report["in_sample"]
-    rows = read_loop(session / "loop").table_1
+    rows = read_loop(session / "loop").stats
     assert {row.model for row in rows} == {"re-pressed", "recovered, simulated"}
     assert all(row.csim.n == 6 for row in rows)
     # No patch was pressed twice: the brush's repeatability is not known, and nothing is claimed.

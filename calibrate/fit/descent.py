@@ -1,0 +1,341 @@
+"""Fit `model.fitted` to coverage images: its parameters by least squares with a prior, then what they cannot express.
+
+No press repeats exactly: width, place and lengths differ from press to press, each by one amount along the whole mark.
+These differences (`STRAYS`) are integrated out of the likelihood, linearised at the fit.
+
+What the parameters cannot express are residuals of the edges and ends, by empirical Bayes. Each stroke is compared with
+the fitted parameters: how much further its tip and its heel reach, and by which sines each of its edges differs from
+the profile. Over the strokes, each of these numbers is a polynomial in depth and tilt plus the stroke's own deviation.
+The scales of the polynomial's constant, of its other terms and of the deviations are those with the greatest marginal
+likelihood on a grid (D. MacKay, "Bayesian interpolation", 1992), with a weak prior on each scale. So the fit smooths
+strokes that repeat badly and follows strokes that repeat well.
+
+The prior is the mean and covariance of the parameters over known brushes. `prior.json` holds those of brushes of
+several families of shape, each fitted to many strokes (`python -m bench.prior` makes it). Each family counts with the
+square root of its number of brushes, so that one large family does not make the others implausible. The covariance is
+shrunk toward its diagonal, because there are few brushes, and it has a floor, because the next brush may belong to none
+of the families.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brushloop.calibrate.fit.captures import SPREAD_MM, Cell, Grid, Pressed, by_cell, near_ink
+from brushloop.model.damped import Damping, Equations, descend
+from brushloop.model.fitted import (
+    MODES,
+    NAMES,
+    PARAMETERS,
+    TERMS,
+    FittedPress,
+    Sizes,
+    chance_within,
+    command_terms,
+    modes,
+    published,
+)
+
+Floats = NDArray[np.float64]
+
+FILE = Path(__file__).with_name("prior.json")
+SHRINKAGE = 0.3
+FLOOR = 0.15
+"""Least standard deviation of a parameter, in units of its spread."""
+
+ALL = tuple(range(len(NAMES)))
+SCALE = tuple(NAMES.index(name) for name in ("lam", "heel_gain", "tip_gain", "origin_mm"))
+"""Size and place of the marks."""
+ROUNDS = 40
+DAMPING = Damping(1e-2, 6.0, 8.0, 1e-7, 1e5, floor=0.0)
+STEP = 1e-4
+"""Step of a derivative, as a share of the parameter's spread."""
+STRAYS = {"lam": 0.09, "origin_mm": 0.3, "heel_gain": 0.3, "tip_gain": 0.04}
+"""Standard deviations by which single presses of a brush differ: about 5 % of width and lengths, 0.3 mm of place."""
+
+TERM_SCALE = (1.0, 1.0, 0.8, 0.8, 0.8, 0.8)
+"""Expected sizes of the terms: the first in units of the constant's scale, the rest in units of the others' scale."""
+CONSTANT = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+OTHERS = (0.03, 0.07, 0.15, 0.3, 0.6, 1.2)
+OWN = (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
+EXPECTED = (0.3, 0.3, 0.1)
+"""Scales of constant, other terms and a stroke's own deviation that are most plausible beforehand, mm for the first
+sine; each may well be e times larger or smaller."""
+END_MM = 1.5
+"""Plausible error of a length; the scales of the ends are in units of it."""
+END_NOISE = 4.0
+"""Variance of a pixel times the number of pixels whose errors are correlated, where an end is sought."""
+END_STEP_MM, END_ROUNDS = 0.05, 4
+
+
+class KnownBrush(NamedTuple):
+    """A brush of the prior: its parameters, in the order of `NAMES`."""
+
+    name: str
+    family: str
+    values: Sequence[float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """A normal distribution of the parameters over their spreads: `mean` (17,) and `precision` (17, 17)."""
+
+    mean: Floats
+    precision: Floats
+
+    @property
+    def values(self) -> Floats:
+        """The mean in the parameters' own units, within their bounds."""
+        low, high = (np.array([getattr(p, end) for p in PARAMETERS]) for end in ("low", "high"))
+        return np.clip(published() + spreads() * self.mean, low, high)
+
+    def off(self, values: Floats) -> Floats:
+        """Distance of parameters from the mean, over their spreads, (17,)."""
+        return (values - published()) / spreads() - self.mean
+
+
+def spreads() -> Floats:
+    """The plausible spread of each parameter, (17,)."""
+    return np.array([parameter.spread for parameter in PARAMETERS])
+
+
+def about(values: Floats) -> Prior:
+    """A prior that holds only the plausible spread of each parameter about these values (17,)."""
+    return Prior((values - published()) / spreads(), np.eye(len(NAMES)))
+
+
+@cache
+def learned(without_families: tuple[str, ...] = ()) -> Prior:
+    """The prior from `prior.json`; a bench leaves out the family that it scores."""
+    known = [KnownBrush(**brush) for brush in json.loads(FILE.read_text(encoding="utf-8"))["brushes"]]
+    return of_brushes([brush for brush in known if brush.family not in without_families])
+
+
+def of_brushes(known: Sequence[KnownBrush]) -> Prior:
+    """The prior from these brushes. Raises ValueError for fewer than two."""
+    if len(known) < 2:
+        raise ValueError("a prior needs at least two brushes")
+    families = [brush.family for brush in known]
+    weights = np.array([families.count(family) ** -0.5 for family in families])
+    weights /= weights.sum()
+    off = (np.array([brush.values for brush in known]) - published()) / spreads()
+    mean = weights @ off
+    covariance = (off - mean).T @ ((off - mean) * weights[:, None]) / (1.0 - np.sum(weights**2))
+    covariance += SHRINKAGE * (np.diag(np.diag(covariance)) - covariance)
+    widened = np.asarray(covariance + FLOOR**2 * np.eye(len(mean)), np.float64)
+    return Prior(mean, np.asarray(np.linalg.solve(widened, np.eye(len(mean))), np.float64))
+
+
+def fit_presses(
+    strokes: Sequence[Pressed],
+    grid: Grid,
+    radius_mm: float,
+    length_mm: float,
+    *,
+    residual: bool = True,
+    prior: Prior | None = None,
+    start: Floats | None = None,
+) -> FittedPress:
+    """Fit the parameters, then the residual that they cannot express. By default the prior is `learned`.
+
+    The cost has several minima. Of two descents, one from the prior and one that fits size and place of the marks
+    first, the lower one counts; with `start` (17,), the parameters of a fit to nearly the same strokes, one descent
+    from there. Parameters that the strokes do not determine have the values that the prior expects. Raises ValueError
+    without a stroke.
+    """
+    if not strokes:
+        raise ValueError("a fit needs at least one stroke")
+    strokes, grid = near_ink(strokes, grid)
+    prior = learned() if prior is None else prior
+    expected = FittedPress(radius_mm, length_mm, prior.values if start is None else start)
+    starts = [expected]
+    if start is None:
+        starts.append(_minimise(expected, SCALE, strokes, grid, prior)[0])
+    press, _ = min((_minimise(begin, ALL, strokes, grid, prior) for begin in starts), key=itemgetter(1))
+    return fit_residual(press, strokes, grid) if residual else press
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A mark as a brush without residuals predicts it, with its derivatives by P numbers.
+
+    Such a number moves both edges of the mark, and the ink of a pixel depends only on the edge on its side. So the
+    Jacobian J of the image is d ink / d half width, one image, times the derivatives of the half width, and J'J and J'r
+    are sums over columns. Matrices of that size are also too small for a matrix library to start threads for them.
+    """
+
+    ink: Floats
+    """Probability of ink (len(y_mm), len(x_mm))."""
+    by_width: Floats
+    """Its derivative by the half width, 1/mm."""
+    widths: Floats
+    """Derivatives of the half width (P, len(x_mm)), mm."""
+
+    @classmethod
+    def of(cls, width: Floats, widths: Floats, y_mm: Floats) -> Drawn:
+        """The mark of half width (N,) with these derivatives."""
+        ink = chance_within(width, y_mm, SPREAD_MM)
+        return cls(ink, ink * (1.0 - ink) / SPREAD_MM, widths)
+
+    def square(self) -> Floats:
+        """J'J, (P, P)."""
+        return (self.widths * np.einsum("yx,yx->x", self.by_width, self.by_width)) @ self.widths.T
+
+    def pull(self, residuals: Floats) -> Floats:
+        """J'r, (n, P), of n images of residuals."""
+        return np.einsum("yx,nyx->nx", self.by_width, residuals) @ self.widths.T
+
+
+def draw(press: FittedPress, cells: Floats, grid: Grid, free: Sequence[int] = ALL) -> list[Drawn]:
+    """Draw presses at C depths and tilts (C, 2), with derivatives by the free parameters over their spreads."""
+    moved = press.values + np.concatenate([np.zeros((1, len(NAMES))), STEP * np.diag(spreads())[list(free)]])
+    batch = replace(press, values=moved[:, None])
+    width, *others = batch.half_width(batch.sizes(*cells.T), grid.x_mm)
+    by_parameter = (np.stack(others, axis=1) - width[:, None]) / STEP
+    return [Drawn.of(*of_cell, grid.y_mm) for of_cell in zip(width, by_parameter, strict=True)]
+
+
+def _minimise(
+    press: FittedPress, free: Sequence[int], strokes: Sequence[Pressed], grid: Grid, prior: Prior
+) -> tuple[FittedPress, float]:
+    """Levenberg-Marquardt from `press`, and the cost where it ends; a parameter one standard deviation off the prior
+    costs as much as a pixel of wrong ink."""
+    inks = {cell: np.array([s.ink for s in group], np.float64) for cell, group in by_cell(strokes).items()}
+    at = list(free)
+    low, high = (np.array([getattr(PARAMETERS[k], end) for k in at]) for end in ("low", "high"))
+
+    def at_values(vector: Floats) -> FittedPress:
+        values = press.values.copy()
+        values[at] = vector
+        return replace(press, values=values)
+
+    def equations(vector: Floats) -> Equations:
+        trial = at_values(vector)
+        square, gradient, cost = _normal(trial, at, inks, grid)
+        pull = prior.precision @ prior.off(trial.values)
+        cost += 0.5 * float(prior.off(trial.values) @ pull)
+        square += prior.precision[np.ix_(at, at)]
+        gradient += pull[at]
+        # A parameter that is pulled beyond its bound stays there: the step of the others must not count on it.
+        held = ((vector <= low) & (gradient > 0.0)) | ((vector >= high) & (gradient < 0.0))
+        square[held], square[:, held], gradient[held] = 0.0, 0.0, 0.0
+        square[held, held] = 1.0
+        return Equations(cost, square, gradient)
+
+    def feasible(vector: Floats) -> Floats | None:
+        """Within the bounds; None if a press would not reach the paper."""
+        clipped = np.clip(vector, low, high)
+        h0_mm = at_values(clipped).values[NAMES.index("h0_mm")]
+        return None if any(s.depth_mm + h0_mm <= 0.1 for s in strokes) else clipped
+
+    lowest = descend(
+        equations,
+        press.values[at],
+        rounds=ROUNDS,
+        most=1.0,
+        gain=1e-4,
+        scale=spreads()[at],
+        damping=DAMPING,
+        feasible=feasible,
+    )
+    return at_values(lowest.vector), lowest.at.cost
+
+
+def _normal(
+    press: FittedPress, at: Sequence[int], inks: Mapping[Cell, Floats], grid: Grid
+) -> tuple[Floats, Floats, float]:
+    """J'J (P, P) and J'r (P,) by the P parameters `at`, and half the sum of squares, over all strokes.
+
+    `inks` (n, len(y_mm), len(x_mm)) are the strokes of each cell. Strays are integrated out.
+    """
+    strays = [NAMES.index(name) for name in STRAYS]
+    sizes = np.array(list(STRAYS.values())) / spreads()[strays]
+    free = sorted({*at, *strays})
+    stray, kept = ([free.index(k) for k in chosen] for chosen in (strays, at))
+    squares, gradient, cost = np.zeros((len(free), len(free))), np.zeros(len(free)), 0.0
+    for drawn, ink in zip(draw(press, np.array(list(inks)), grid, free), inks.values(), strict=True):
+        square, miss = drawn.square(), drawn.ink - ink
+        pull, by_stray = drawn.pull(miss), square[stray]
+        taken = np.linalg.solve(by_stray[:, stray] + np.diag(sizes**-2.0), np.column_stack([by_stray, pull.T[stray]]))
+        squares += len(ink) * (square - by_stray.T @ taken[:, : len(free)])
+        shift = taken[:, len(free) :]
+        gradient += (pull.T - by_stray.T @ shift).sum(axis=1)
+        # Not a dot product, which would start the matrix library's threads.
+        cost += 0.5 * float(np.einsum("nyx,nyx->", miss, miss) - np.sum(pull.T[stray] * shift))
+    return squares[np.ix_(kept, kept)], gradient[kept], cost
+
+
+def fit_residual(press: FittedPress, strokes: Sequence[Pressed], grid: Grid) -> FittedPress:
+    """The brush with the residuals of its ends and edges; `press` has none."""
+    depths, tilts = np.array([s.depth_mm for s in strokes]), np.array([s.tilt_deg for s in strokes])
+    inks, terms = np.array([s.ink for s in strokes], np.float64), command_terms(depths, tilts)
+    ends = _ends(press, depths, tilts, inks, grid)
+    sides = _sines(press, press.sizes(depths, tilts, ends), inks, grid)
+    falling = 1.0 / np.arange(1, MODES + 1)
+    # Half the sum of the edges is a mark's width, half the difference a bow: each has scales of its own.
+    width, bow = (regress(0.5 * (sides[:, 0] + way * sides[:, 1]), terms, falling) for way in (1.0, -1.0))
+    lengths = [END_MM * regress(ends[:, [k]] / END_MM, terms, np.ones(1))[0] for k in range(2)]
+    return replace(press, edges=np.array([width + bow, width - bow]), ends=np.array(lengths))
+
+
+def regress(seen: Floats, terms: Floats, scale: Floats) -> Floats:
+    """Coefficients (K, TERMS) of the polynomials for K numbers `seen` (strokes, K), of expected sizes `scale` (K,)."""
+    count = len(seen)
+    square, right = terms.T @ terms, terms.T @ (seen / scale)
+    total = float(np.sum((seen / scale) ** 2))
+    choices = np.array(list(product(CONSTANT, OTHERS, OWN)))
+    size = np.concatenate([choices[:, :1], np.repeat(choices[:, 1:2], TERMS - 1, axis=1)], axis=1) * TERM_SCALE
+    noise = choices[:, 2] ** 2
+    # Scaled by the terms' sizes, the prior is the unit matrix times the noise.
+    scaled = square * size[:, :, None] * size[:, None, :] + noise[:, None, None] * np.eye(TERMS)
+    found = np.linalg.solve(scaled, size[:, :, None] * right)
+    explained = np.einsum("ctk,tk,ct->c", found, right, size)
+    determinant = np.linalg.slogdet(scaled)[1] + (count - TERMS) * np.log(noise)
+    likelihood = -0.5 * (seen.shape[1] * determinant + (total - explained) / noise)
+    likelihood -= 0.5 * np.sum(np.log(choices / EXPECTED) ** 2, axis=1)
+    best = int(np.argmax(likelihood))
+    return (size[best, :, None] * found[best]).T * scale[:, None]
+
+
+def _ends(press: FittedPress, depths_mm: Floats, tilts_deg: Floats, inks: Floats, grid: Grid) -> Floats:
+    """By how much the tip and heel of strokes reach beyond the brush's lengths, (strokes, 2) mm, by Gauss-Newton."""
+
+    def width(further: Floats) -> Floats:
+        return press.half_width(press.sizes(depths_mm, tilts_deg, further), grid.x_mm)
+
+    sizes = press.sizes(depths_mm, tilts_deg)
+    reach = np.stack([sizes.tip, sizes.heel], axis=-1)
+    weight = END_NOISE / END_MM**2
+    ends = np.zeros_like(reach)
+    for _ in range(END_ROUNDS):
+        here = width(ends)
+        by_end = np.stack([(width(ends + END_STEP_MM * way) - here) / END_STEP_MM for way in np.eye(2)], axis=1)
+        for k, ink in enumerate(inks):
+            drawn = Drawn.of(here[k], by_end[k], grid.y_mm)
+            pull = drawn.pull((ink - drawn.ink)[None])[0] - weight * ends[k]
+            step = np.asarray(np.linalg.solve(drawn.square() + weight * np.eye(2), pull), np.float64)
+            ends[k] = np.clip(ends[k] + np.clip(step, -0.7, 0.7), -0.5 * reach[k], reach[k])
+    return ends
+
+
+def _sines(press: FittedPress, sizes: Sizes, inks: Floats, grid: Grid) -> Floats:
+    """The sines (strokes, 2, MODES) by which strokes' upper and lower edges differ from the profile, mm."""
+    share = (grid.x_mm - (sizes.widest - sizes.tip)[:, None]) / (sizes.tip + sizes.heel)[:, None]
+    waves = modes(share)  # 0 beyond the ends
+    width = np.maximum(press.half_width(sizes, grid.x_mm), 0.0)
+    above = grid.y_mm > 0.0
+    edges = [inks[:, rows].sum(axis=1) * grid.px_mm - width for rows in (above, ~above)]
+    little = 0.005 * ((share > 0.0) & (share < 1.0)).sum(axis=1)[:, None, None] * np.eye(MODES)
+    across = waves.swapaxes(1, 2)
+    sines = np.asarray(np.linalg.solve(across @ waves + little, across @ np.stack(edges, axis=-1)), np.float64)
+    return sines.swapaxes(1, 2)
