@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from brushloop.sessions.show import Details, Summary
 
 RECENT = 50
+BESIDE_COLUMNS = 6
+"""Columns beside the text about a session: its border, its padding and its scroll bar."""
 SIGNS = {"open": ("▶", "bold $text-warning"), "damaged": ("!", "bold $text-error")}
 GOES_ON = "The arm first lifts and parks; then the run continues there. No stroke is made twice."
 
@@ -165,8 +167,9 @@ class StartScreen(Screen[None]):
             self._standing.show(trouble(error))
             return
         goes_on = [GOES_ON] if details.state == "open" else []
-        columns = app_of(self).size.width - self._options.size.width - 4
-        self._standing.show(text_of([*renderables(details), *goes_on], columns))
+        # What the list leaves of the screen, whether that is laid out yet or not.
+        columns = app_of(self).size.width * 58 // 100 - BESIDE_COLUMNS
+        self._standing.show(text_of([*goes_on, *renderables(details)], columns))
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Resume an open session, or look through a closed one."""

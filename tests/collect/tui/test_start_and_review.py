@@ -45,7 +45,7 @@ async def test_enter_goes_on_with_an_open_session_and_n_asks_for_a_blank_sheet_f
     app = OperatorApp(browser=browser)
     async with app.run_test(size=(80, 24)) as pilot:
         text = await ready(app, pilot)
-        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "cut: 1", "the process", "press H15-a5-r01"):
+        for part in ("▶ 2026-11-21-grid-02 open", "13 of 30 planned", "13 capture", "the process", "H15-a5-r01"):
             assert part in text
         await pilot.press("n")
         assert "30 strokes on 1 sheet" in await ready(app, pilot)
