@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from brushloop.collect.rig.doctor import Finding
-from brushloop.collect.rig.report import Scrubber, numbers_only, transcript, write_archive
+from brushloop.collect.rig.doctor import Finding, Scrubber, numbers_only, transcript, write_archive
 from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, six

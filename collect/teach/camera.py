@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import time
 from collections.abc import AsyncGenerator, Sequence
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_gray
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Choice
-from brushloop.collect.rig.optics import gray
+from brushloop.collect.photograph.frames import gray
 from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook
 from brushloop.drivers.camera import CameraTable, Locked, OpenCvCamera, found_settings
@@ -37,8 +36,8 @@ from brushloop.drivers.host import Clock
 Gray = NDArray[np.uint8]
 LATE_MS = 2500.0
 """Until the delay is measured, a picture counts as taken this long before it came: no useful camera is slower."""
-RATE_S, LIVE_S = 2.0, 0.3
-"""How long frames are counted, and how often one is shown to a person who guides something."""
+SETTLE_S, LIVE_S = 2.0, 0.3
+"""How long a device may take to choose its settings, and time between pictures for a person who guides something."""
 TILE_PX, NUMBER_PX = (480, 360), 64
 """Width and height of one picture beside others, and the side of the square with its number."""
 VIEW = "aside.lens_view_"
@@ -90,7 +89,7 @@ class CameraStep(Step):
     title = "Find the camera"
     minutes = 12
     needs = ("arm",)
-    observes = ("camera.", *PRINTED, "aside.sources", "aside.frame_rate_hz", VIEW)
+    observes = ("camera.", *PRINTED, "aside.sources", VIEW)
 
     async def teach(self, day: Day) -> None:
         """Ask for source and print, measure the rest. Raises `CannotTeach`, `DeviceError`, `CalibrationError`."""
@@ -99,11 +98,7 @@ class CameraStep(Step):
         if "camera.source" not in day.notebook.values:
             await self._source(day)
         async with taught_camera(day.notebook, day.clock) as camera:
-            await day.working("counting frames, looking for the board")
-            if "aside.frame_rate_hz" not in day.notebook.values:
-                rate_hz = await frame_rate_hz(camera)
-                day.keep("camera", "aside.frame_rate_hz", rate_hz, "frames counted", "Hz")
-                await day.say(f"{rate_hz:.1f} frames per second; the delay is measured in the last step, by the arm.")
+            await day.working("looking for the board")
             await self._first_look(day, await still(camera, day.clock))
             await self._lens(day, camera)
 
@@ -139,7 +134,7 @@ class CameraStep(Step):
             chosen = await day.choose("Which of them looks at the sheet?", choices, best)
             source = next(choice.label for choice in choices if choice.key == chosen)
         # What a device chose by itself; the settings of a stream only its own set-up can change.
-        locked = await asyncio.to_thread(found_settings, int(source), RATE_S) if source.isdecimal() else {}
+        locked = await asyncio.to_thread(found_settings, int(source), SETTLE_S) if source.isdecimal() else {}
         if not locked:
             await day.say(
                 "The settings of a stream cannot be set from here: switch automatic exposure, white balance and focus "
@@ -303,16 +298,6 @@ async def shown_live(day: Day, camera: OpenCvCamera) -> AsyncGenerator[None]:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         day.guide.see(None)
-
-
-async def frame_rate_hz(camera: OpenCvCamera) -> float:
-    """Frames per second, counted."""
-    after, count, began_s = Stamp(0), 0, time.monotonic()
-    while time.monotonic() - began_s < RATE_S:
-        frame = await camera.fresh(after)
-        after = Stamp(frame.exposed_after_ns + 1)
-        count += 1
-    return (count - 1) / (time.monotonic() - began_s)
 
 
 def side_by_side(pictures: Sequence[Gray]) -> Gray:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from brushloop.calibrate.files import read_gray
@@ -35,8 +33,12 @@ LEAST_RADIUS_MM, MOST_RADIUS_MM = 5.0, 100.0
 """From the rim of a well to its middle."""
 APART_MM = 150.0
 """Between two places of the arm: farther apart, no part of it that is in both pictures hides the same in both."""
-VIEW: dict[TargetKind, str] = {"park": "aside.view_parked", "clear-view": "aside.view_elsewhere"}
-"""The small picture that was taken with the arm there."""
+AWAY: dict[TargetKind, str] = {
+    "clear-view": "Guide the arm to any place out of the camera's picture.",
+    # Last, because the runs of the proof begin where the arm is left: it has to be within the limits.
+    "park": "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, "
+    f"{APART_MM:g} mm or more from there: two pictures that agree show the arm in neither.",
+}
 INK: tuple[TargetKind, ...] = ("well-rim", "well", "wash-rim", "wash-pot")
 MARGIN_MM = 25.0
 """Room beside what was taught: a brush lifted along a tool axis that leans by 15 deg moves aside by as much."""
@@ -62,7 +64,7 @@ class PlacesStep(Step):
     title = "Well, wash and park"
     minutes = 5
     needs = ("camera", "tip", "sheet")
-    observes = (*INK, *VIEW, *VIEW.values(), "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
+    observes = (*INK, *AWAY, "aside.wipe", "ink.wipe.", "aside.wash", "ink.wash.")
 
     async def teach(self, day: Day) -> None:
         """Have the tip brought to each place; look whether the parked arm is out of the picture."""
@@ -75,15 +77,9 @@ class PlacesStep(Step):
             await day.say(found)
             await self._wipe(day, reader)
             await self._wash(day, reader)
-            how = "Guide the arm to any place out of the camera's picture."
-            await self._out_of_picture(day, reader, Target("clear-view"), how)
-            # Last, because the runs of the proof begin where the arm is left: it has to be within the limits.
-            how = (
-                "Now bring the arm to its waiting place: brush upright, above everything, out of the camera's picture, "
-                f"{APART_MM:g} mm or more from there: two pictures that agree show the arm in neither."
-            )
-            await self._out_of_picture(day, reader, Target("park"), how)
-            await self._compare(day)
+            if "park 0" not in day.notebook.touches:
+                with day.together():
+                    await self._park(day, reader)
 
     async def _wipe(self, day: Day, reader: ArmReader) -> None:
         """Have the side of the rim touched at which a drop is wiped off, if there is to be a wipe."""
@@ -113,34 +109,28 @@ class PlacesStep(Step):
                 check_pot(day.notebook, "wash-rim 0", "wash-pot 0", "pot of water")
         day.keep("places", "aside.wash", wash, "answered")
 
-    async def _out_of_picture(self, day: Day, reader: ArmReader, target: Target, how: str) -> None:
-        """Have the arm brought out of the picture, and keep pose and picture together: one says nothing alone."""
-        if VIEW[target.kind] not in day.notebook.values:
-            with day.together():
-                day.save(day.notebook.without(target.kind))
-                async with taught_camera(day.notebook, day.clock) as camera:
-                    async with shown_live(day, camera):
-                        await touch(day, reader, target, how, f"{target.kind} 0")
-                    await day.working("waiting for a picture without the arm")
-                    picture = thumbnail(await still(camera, day.clock))
-                day.keep("places", VIEW[target.kind], text_of(picture), "a small picture, as PNG in base64")
+    async def _park(self, day: Day, reader: ArmReader) -> None:
+        """Have the arm brought out of the picture, to two places.
 
-    async def _compare(self, day: Day) -> None:
-        """Compare the two pictures. Raises `CannotTeach` unless they show the same, with the arm at two places."""
-        offset_mm, touches = day.notebook.numbers("robot.tcp_offset_mm"), day.notebook.touches
-        parked_mm, away_mm = (tip_of(touches[f"{kind} 0"].pose(), offset_mm) for kind in ("park", "clear-view"))
-        if (apart_mm := math.dist(parked_mm, away_mm)) < APART_MM:
-            day.save(day.notebook.without(*VIEW, *VIEW.values()))
+        Raises `CannotTeach` unless the pictures from there show the same.
+        """
+        pictures: list[Thumbnail] = []
+        async with taught_camera(day.notebook, day.clock) as camera:
+            for kind, how in AWAY.items():
+                async with shown_live(day, camera):
+                    await touch(day, reader, Target(kind), how, f"{kind} 0")
+                await day.working("waiting for a picture without the arm")
+                pictures.append(thumbnail(await still(camera, day.clock)))
+        places = tips(day.notebook)
+        if (apart_mm := math.dist(places["park 0"], places["clear-view 0"])) < APART_MM:
             raise CannotTeach(
                 f"the arm was only {apart_mm:.0f} mm apart in the two pictures: they show the same.",
                 f"Bring it to two places {APART_MM:g} mm or more apart; both are asked again.",
             )
-        pictures = [picture_of(str(day.notebook.get(VIEW[kind]))) for kind in ("park", "clear-view")]
         share = changed_share(*pictures)
         if share >= ARM_SHARE:
             beside = side_by_side([picture.astype(np.uint8) for picture in pictures])
-            await day.say("The arm parked (1), and elsewhere (2):", picture=beside)
-            day.save(day.notebook.without(*VIEW, *VIEW.values()))
+            await day.say("The arm elsewhere (1), and parked (2):", picture=beside)
             raise CannotTeach(
                 f"the arm, or its shadow, is in one of the two pictures: {100 * share:.0f} % of them differs.",
                 "Park it farther from the sheet, or higher; both places are asked again.",
@@ -243,17 +233,6 @@ def check_wipe(notebook: Notebook) -> None:
             "the wipe would end over the sheet, and the drop would fall on it.",
             "Touch the rim on another side; only this place is asked again.",
         )
-
-
-def text_of(picture: Thumbnail) -> str:
-    """A small picture as PNG in base64."""
-    return base64.b64encode(cv2.imencode(".png", picture.astype(np.uint8))[1].tobytes()).decode()
-
-
-def picture_of(text: str) -> Thumbnail:
-    """The picture again."""
-    coded = np.frombuffer(base64.b64decode(text), np.uint8)
-    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.float32)
 
 
 class LimitsStep(Step):

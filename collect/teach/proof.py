@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from brushloop.collect.engine.engine import DryRunEngine, Engine
@@ -22,6 +22,7 @@ from brushloop.drivers.host import finished
 from brushloop.sessions.events import CaptureResult, SelfCheckResult, ZeroTouchResult
 from brushloop.sessions.journal import JOURNAL_NAME, replay
 
+HEIGHT = "paper.touch_z_mm"
 ABOVE_MM = 30.0
 SLOW_MM_S = 45.0
 PRESSES = 6
@@ -32,6 +33,7 @@ DEEPEST_DRY_MM = 24.0
 SLOW_CAMERA_MS = 600.0
 """A camera that is later than this makes every photograph slow, and says that something buffers its pictures."""
 POLL_S = 0.1
+LEAST_SIGMA_MM = 0.01
 
 
 class ProofStep(Step):
@@ -57,7 +59,7 @@ class ProofStep(Step):
         )
         session = await self._run(day, folder_beside(day.rig_path), protocol, dry=False)
         await day.say(f"Recorded in {session}.")
-        await self._keep(day, read_proof(session))
+        await self._keep(day, *read_proof(session))
 
     async def _doctor(self, day: Day, rig: RigConfig) -> None:
         await day.working("asking every device")
@@ -114,26 +116,28 @@ class ProofStep(Step):
                 engine.answer(asked.number, str(await day.guide.ask(asked)))
             await asyncio.sleep(POLL_S)
 
-    async def _keep(self, day: Day, proven: Proven) -> None:
-        plane, by_hand_mm = proven.plane, day.notebook.number("paper.touch_z_mm")
-        x, y = day.notebook.numbers("paper.touch_point_mm")
-        z_mm, sigma_mm, delay_ms = plane.touch_z_mm(x, y), max(proven.sigma_mm, 0.01), proven.delay_ms
-        known = f"residuals up to {proven.worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
-        how = f"touched by {proven.method}, leaning by {plane.slope_deg:.2f} deg"
-        later, jitter = (
-            "the arm was seen to leave the picture later than it did",
-            f"trips differ by {proven.jitter_ms:.0f} ms",
-        )
+    async def _keep(
+        self, day: Day, touch: ZeroTouchResult, check: SelfCheckResult, captures: list[CaptureResult]
+    ) -> None:
+        plane, by_hand_mm = PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y), day.notebook.number(HEIGHT)
+        x_mm, y_mm = day.notebook.numbers("paper.touch_point_mm")
+        z_mm, worst_mm = plane.touch_z_mm(x_mm, y_mm), max(map(abs, touch.residuals_mm), default=0.0)
+        sigmas_mm = [sigma_mm for point in touch.points for sigma_mm in point.sigma_mm if sigma_mm is not None]
+        sigma_mm = max([*sigmas_mm, LEAST_SIGMA_MM])
+        delay_ms, jitter_ms = captures[-1].camera_delay_ms or 0.0, captures[-1].camera_jitter_ms or 0.0
+        how = f"touched by {touch.method}, leaning by {plane.slope_deg:.2f} deg"
+        known = f"residuals up to {worst_mm:.3f} mm; by hand it was {by_hand_mm:.2f} mm"
+        again = sum(capture.retake for capture in captures)
+        later = "the arm was seen to leave the picture later than it did"
         with day.together():
-            day.keep("proof", "paper.touch_z_mm", z_mm, how, "mm", sigma=sigma_mm, known=known)
+            day.keep("proof", HEIGHT, z_mm, how, "mm", sigma=sigma_mm, known=known)
             day.keep("proof", "aside.plane", [plane.z0_mm, plane.slope_x, plane.slope_y], how, "mm", sigma=sigma_mm)
-            day.keep("proof", "camera.latency_ms", delay_ms, later, "ms", known=jitter)
+            day.keep("proof", "camera.latency_ms", delay_ms, later, "ms", known=f"trips differ by {jitter_ms:.0f} ms")
         await day.say(
             f"touch height {z_mm:.3f} mm ({z_mm - by_hand_mm:+.2f} mm from the touch by hand), {known}",
-            f"self-check: marks {proven.offset_mm[0]:+.1f}, {proven.offset_mm[1]:+.1f} mm from where they were "
-            f"commanded, turned by {proven.turn_deg:+.2f} deg",
-            f"{proven.passed} presses passed the quality checks, {proven.again} were repeated; "
-            f"camera delay {delay_ms:.0f} ms",
+            f"self-check: marks {check.offset_mm[0]:+.1f}, {check.offset_mm[1]:+.1f} mm from where they were "
+            f"commanded, turned by {check.turn_deg:+.2f} deg",
+            f"{PRESSES} presses passed the quality checks, {again} were repeated; camera delay {delay_ms:.0f} ms",
         )
         if delay_ms > SLOW_CAMERA_MS:
             await day.say(
@@ -158,26 +162,11 @@ def slowly(rig: RigConfig) -> RigConfig:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Proven:
-    """What the run of the proof measured."""
+def read_proof(session: Path) -> tuple[ZeroTouchResult, SelfCheckResult, list[CaptureResult]]:
+    """Touch, self-check and captures of the session. Raises `CannotTeach` unless all presses passed the quality checks.
 
-    plane: PaperPlane
-    method: str
-    worst_mm: float
-    sigma_mm: float
-    delay_ms: float
-    jitter_ms: float
-    offset_mm: tuple[float, float]
-    turn_deg: float
-    passed: int
-    """Presses that count."""
-    again: int
-    """Presses that failed a quality check and were repeated on another patch."""
-
-
-def read_proof(session: Path) -> Proven:
-    """From the journal of the session. Raises `CannotTeach` unless all presses passed the quality checks."""
+    Captures that failed a check and were repeated on another patch are among them.
+    """
     state = replay(session / JOURNAL_NAME)
     captures = state.results(CaptureResult)
     last = [capture for capture in captures if not capture.retake]
@@ -192,20 +181,7 @@ def read_proof(session: Path) -> Proven:
     touches, checks = state.results(ZeroTouchResult), state.results(SelfCheckResult)
     if not touches or not checks:
         raise CannotTeach("the run had no touch or no self-check.", "Report this as a defect.")
-    touch, check, capture = touches[-1], checks[-1], captures[-1]
-    sigmas = [sigma for point in touch.points for sigma in point.sigma_mm if sigma is not None]
-    return Proven(
-        PaperPlane(touch.touch_z_mm, touch.slope_x, touch.slope_y),
-        touch.method,
-        max((abs(residual_mm) for residual_mm in touch.residuals_mm), default=0.0),
-        max(sigmas, default=0.0),
-        capture.camera_delay_ms or 0.0,
-        capture.camera_jitter_ms or 0.0,
-        check.offset_mm,
-        check.turn_deg,
-        len(passed),
-        sum(capture.retake for capture in captures),
-    )
+    return touches[-1], checks[-1], captures
 
 
 def folder_beside(rig_path: Path) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections import defaultdict
 
 import numpy as np
@@ -23,7 +22,6 @@ from brushloop.collect.teach.sheet_fit import (
     check_board,
     check_seen,
     corners_of,
-    expected_mm,
     fit_sheet,
     seen_margins,
     touched_margins,
@@ -37,7 +35,7 @@ GOOD_MM = 0.13
 """Standard error of the sheet's origin, in each axis, at which touching ends."""
 MOST_ROUNDS = 5
 WORST_MM = 0.25
-EASY_MM = (250.0, 700.0)
+EASY_M = (0.25, 0.7)
 """Distances from the foot of the arm at which it holds a brush upright without being folded up or stretched out."""
 VIEW, SEEN = "sheet-view", "aside.sheet_seen"
 INSET_MM = 2.0
@@ -157,30 +155,15 @@ def all_corners(notebook: Notebook, kind: TargetKind) -> dict[str, list[Point]]:
     for name, flange in notebook.touched(kind).items():
         found[name.split(" ", 1)[1]].append(tip_of(flange, offset_mm))
     thing = kind.removesuffix("-corner")
-    missing = [f"{thing} {name}" for name in CORNERS if name not in found]
-    if missing:
-        how_far = _how_far(found, notebook) if kind == BOARD else "nearer to it"
+    if missing := [f"{thing} {name}" for name in CORNERS if name not in found]:
+        nearest_m, farthest_m = EASY_M
         raise CannotTeach(
             f"not touched: {', '.join(missing)}.",
             "All four corners of both are needed. What the arm does not reach by hand is out of its reach: move the "
-            f"board with the sheet {how_far}, and touch all corners again.",
+            f"board with the sheet, so that all corners are {nearest_m:g} to {farthest_m:g} m from the arm's foot, or "
+            "turn its wrist the other way round, and touch all corners again.",
         )
     return dict(found)
-
-
-def _how_far(found: dict[str, list[Point]], notebook: Notebook) -> str:
-    """In words, how far the board has to be moved; where two corners were touched, the others follow from its print."""
-    if len(found) < 2:
-        return "nearer to it"
-    spec = board_of(notebook)
-    away_mm = [math.hypot(*expected_mm(found, name, spec)) for name in CORNERS if name not in found]
-    nearest_mm, farthest_mm = EASY_MM
-    if max(away_mm) > farthest_mm:
-        more_mm = max(away_mm) - farthest_mm
-        return f"by {more_mm:.0f} mm nearer to its foot, from which that corner is {max(away_mm):.0f} mm"
-    if min(away_mm) < nearest_mm:
-        return f"by {nearest_mm - min(away_mm):.0f} mm away from its foot, to which that corner is too near"
-    return "nearer to it, or turn its wrist the other way round"
 
 
 def fitted(notebook: Notebook) -> SheetFit:

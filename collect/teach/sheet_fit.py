@@ -112,15 +112,6 @@ def _mixed_up(touched: Floats, printed: Floats) -> str:
     return f"fit only if {pair} are swapped (off by {as_named:.1f} mm otherwise): one was touched in the other's place"
 
 
-def expected_mm(touched: Mapping[str, Sequence[Point]], name: str, spec: BoardSpec) -> tuple[float, float]:
-    """Where a corner of the board must lie, (x, y) in the base frame, by two or three others that were touched."""
-    printed, known = corners_of(*size_mm(spec)), [CORNERS.index(corner) for corner in touched]
-    places = np.array([np.mean(points, axis=0)[:2] for points in touched.values()])
-    turn = _rotation(_turn_and_scale(printed[known], places)[0])
-    x, y = turn @ (printed[CORNERS.index(name)] - printed[known].mean(axis=0)) + places.mean(axis=0)
-    return float(x), float(y)
-
-
 def fit_sheet(board: Mapping[str, Sequence[Point]], sheet: Mapping[str, Sequence[Point]], spec: BoardSpec) -> SheetFit:
     """Least squares over all touches of four board corners and four sheet corners, by name; base frame, in mm.
 

@@ -19,9 +19,8 @@ from pydantic import Field, ValidationError
 from brushloop.calibrate.files import replacing, write_whole
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.check import Check, unmeasured
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.rig.config import RigConfig, with_optics
 from brushloop.collect.rig.config_file import Config, Finite, read_text, refusal
-from brushloop.collect.rig.optics import with_optics
 from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.disk import fsync_folder, sync
@@ -75,11 +74,10 @@ def taught(
 
 
 class Touch(Config):
-    """Pose of the flange in the base frame while the tip was at a thing, and when."""
+    """Pose of the flange in the base frame while the tip was at a thing."""
 
     position_mm: tuple[Finite, Finite, Finite]
     quaternion: tuple[Finite, Finite, Finite, Finite]
-    at: Annotated[str, Field(max_length=40)]
 
     def pose(self) -> Pose:
         """The flange."""
@@ -87,8 +85,8 @@ class Touch(Config):
 
 
 def touch_of(pose: Pose) -> Touch:
-    """The pose of the flange as a touch of now."""
-    return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion, at=now_utc())
+    """The pose of the flange as a touch."""
+    return Touch(position_mm=pose.position_mm, quaternion=pose.quaternion)
 
 
 def now_utc() -> str:

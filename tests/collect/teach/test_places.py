@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,12 @@ import pytest
 from brushloop.collect.errors import CannotTeach
 from brushloop.collect.operator import Prompt
 from brushloop.collect.photograph.frames import Thumbnail
+from brushloop.collect.teach import places
+from brushloop.collect.teach.arm import ArmReader
 from brushloop.collect.teach.day import Day, Target
-from brushloop.collect.teach.places import VIEW, PlacesStep, check_pot, check_wipe, text_of
+from brushloop.collect.teach.places import PlacesStep, check_pot, check_wipe
 from brushloop.collect.teach.store import Notebook, taught, touch_of
+from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import brush_pose
 from brushloop.drivers.sim.arcs_server import ArcsServer
 from tests.collect.teach.conftest import Person, day_of
@@ -80,22 +85,51 @@ def picture(*, arm: bool, light: float = 1.0) -> Thumbnail:
     return scene
 
 
-def ready(port: int, folder: Path, away_mm: Place, parked: Thumbnail, away: Thumbnail, person: Person) -> Day:
-    """Everything of the step is taught, and the two pictures are taken."""
-    day = day_of(person, folder, port, tip_mm=(0.0, 0.0, 0.0))
-    for field in ("aside.wipe", "aside.wash"):
-        day.keep("places", field, False, "answered")
-    day.keep("places", VIEW["park"], text_of(parked), "a picture")
-    day.keep("places", VIEW["clear-view"], text_of(away), "a picture")
-    for name, place in {"well-rim 0": RIM, "well 0": WELL, "park 0": PARK_MM, "clear-view 0": away_mm}.items():
-        day.save(day.notebook.with_touch(name, touch_of(brush_pose(*place))))
-    return day
+class Parking(Person):
+    """Brings the arm wherever it is asked for, without a hand; answers no to everything else."""
+
+    async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
+        if target is None:
+            self.asked.append(prompt.default)
+            return "n"
+        return True
 
 
-async def test_two_pictures_that_agree_show_the_arm_in_neither(server: ArcsServer, tmp_path: Path) -> None:
+@pytest.fixture
+def parked(server: ArcsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Day]:
+    """Well and rim are touched; the arm is brought to a place, then parked, and a picture is taken with it at each."""
+
+    def make(away_mm: Place, away: Thumbnail, parked: Thumbnail) -> Day:
+        day, poses, pictures = (
+            day_of(Parking(), tmp_path, server.port, tip_mm=(0.0, 0.0, 0.0)),
+            [away_mm, PARK_MM],
+            [away, parked],
+        )
+        for field in ("aside.wipe", "aside.wash"):
+            day.keep("places", field, False, "answered")
+        for name, place in {"well-rim 0": RIM, "well 0": WELL}.items():
+            day.save(day.notebook.with_touch(name, touch_of(brush_pose(*place))))
+
+        async def flange(_: ArmReader) -> Pose:
+            return brush_pose(*poses.pop(0))
+
+        async def still(*_: object) -> Thumbnail:
+            return pictures.pop(0)
+
+        monkeypatch.setattr(ArmReader, "flange", flange)
+        monkeypatch.setattr(places, "still", still)
+        monkeypatch.setattr(places, "taught_camera", lambda *_: contextlib.nullcontext())
+        monkeypatch.setattr(places, "shown_live", lambda *_: contextlib.nullcontext())
+        return day
+
+    return make
+
+
+async def test_two_pictures_that_agree_show_the_arm_in_neither(parked: Callable[..., Day]) -> None:
     """The light may change in between."""
-    pictures = picture(arm=False), picture(arm=False, light=0.9)
-    await PlacesStep().teach(ready(server.port, tmp_path, AWAY_MM, *pictures, Person()))
+    day = parked(AWAY_MM, picture(arm=False), picture(arm=False, light=0.9))
+    await PlacesStep().teach(day)
+    assert {"park 0", "clear-view 0"} <= set(day.notebook.touches)
 
 
 @pytest.mark.parametrize(
@@ -107,27 +141,19 @@ async def test_two_pictures_that_agree_show_the_arm_in_neither(server: ArcsServe
     ids=["an arm over the pot", "twice one place"],
 )
 async def test_pictures_that_say_nothing_are_taken_again_at_both_places(
-    server: ArcsServer, tmp_path: Path, away_mm: Place, in_the_first: bool, said: str
+    parked: Callable[..., Day], away_mm: Place, in_the_first: bool, said: str
 ) -> None:
-    pictures = picture(arm=in_the_first), picture(arm=True)
-    day = ready(server.port, tmp_path, away_mm, *pictures, Person())
+    day = parked(away_mm, picture(arm=in_the_first), picture(arm=True))
     with pytest.raises(CannotTeach, match=said):
         await PlacesStep().teach(day)
     assert not {"park 0", "clear-view 0"} & set(day.notebook.touches)
-    assert not set(VIEW.values()) & set(day.notebook.values)
     assert "well 0" in day.notebook.touches
 
 
 @pytest.mark.parametrize("field", ["aside.wipe", "aside.wash"])
-async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(server: ArcsServer, tmp_path: Path, field: str) -> None:
-    defaults: list[str] = []
-
-    class Declining(Person):
-        async def ask(self, prompt: Prompt, target: Target | None = None) -> Any:
-            defaults.append(prompt.default)
-            return "n"
-
-    day = ready(server.port, tmp_path, AWAY_MM, picture(arm=False), picture(arm=False), Declining())
+async def test_wipe_and_pot_are_not_left_out_by_an_empty_answer(parked: Callable[..., Day], field: str) -> None:
+    day = parked(AWAY_MM, picture(arm=False), picture(arm=False))
     day.save(day.notebook.without(field))
     await PlacesStep().teach(day)
-    assert defaults == [""]
+    assert isinstance(day.guide, Parking)
+    assert day.guide.asked == [""]
