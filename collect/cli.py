@@ -164,12 +164,10 @@ def doctor(
     import json
 
     from brushloop.collect.rig.config import load_rig
-    from brushloop.collect.rig.doctor import examine
+    from brushloop.collect.rig.doctor import check_report, doctor_table, examine, write_report
     from brushloop.drivers.host import HostClock
 
     if report is not None:
-        from brushloop.collect.rig.report import check_report
-
         check_report(report)
         if not config.exists() and _first_report(config, report):
             return
@@ -178,12 +176,8 @@ def doctor(
     if as_json:
         say(*(json.dumps(finding.as_json()) for finding in findings))
     else:
-        from brushloop.collect.rig.doctor import doctor_table
-
         say(doctor_table(findings))
     if report is not None:
-        from brushloop.collect.rig.report import write_report
-
         asyncio.run(write_report(report, rig, findings))
         say(f"{report} holds what was asked and answered. Read it before you send it.", err=as_json)
     if not all(finding.well for finding in findings):

@@ -18,8 +18,8 @@ import numpy as np
 
 from brushloop.collect.engine.snapshot import Picture
 from brushloop.collect.errors import ConfigError
+from brushloop.collect.photograph.frames import gray
 from brushloop.collect.quality.measure import blur_px, busiest_tile
-from brushloop.collect.rig.optics import gray
 from brushloop.drivers.devices import Camera, ForceSample, Frame, Stamp
 from brushloop.drivers.errors import DeviceError
 from brushloop.sessions.errors import SessionDamaged

@@ -1,4 +1,4 @@
-"""The camera's frames one after the other, each compared with the view without the arm."""
+"""Photographs without colour and distortion; the camera's frames, each compared with the view without the arm."""
 
 from __future__ import annotations
 
@@ -11,14 +11,39 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from brushloop.collect.rig.optics import gray
+from brushloop.collect.errors import StepError
+from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Camera, Frame, Stamp
 
+Gray = NDArray[np.uint8]
 Thumbnail = NDArray[np.float32]
 WIDTH_PX = 160
 """Width of a thumbnail. A pixel averages about 2 mm of a sheet: noise is gone, and an arm is tens of pixels wide."""
 CHANGED_LEVELS = 25.0
 """Difference in gray levels, corrected for the light, from which on a pixel counts as changed."""
+
+
+def gray(image: NDArray[np.uint8]) -> Gray:
+    """(h, w) of an (h, w) or (h, w, 3) BGR image."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def undistorted(camera: CameraConfig, photograph: NDArray[np.uint8]) -> Gray:
+    """An (h, w) or (h, w, 3) BGR photograph in gray, without the lens distortion that recordings keep.
+
+    Raises `StepError` if photographs no longer have the size at which the lens was calibrated.
+    """
+    image = gray(photograph)
+    lens = camera.optics
+    if lens is None:
+        return image
+    height, width = image.shape[:2]
+    if (width, height) != lens.size_px:
+        raise StepError(
+            f"the camera gives {width} x {height} px, its lens was calibrated at {lens.size_px[0]} x {lens.size_px[1]} "
+            "px: set camera.locked, or calibrate the lens at this size"
+        )
+    return lens.undistort(image)
 
 
 def thumbnail(image: NDArray[np.uint8]) -> Thumbnail:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from brushloop.calibrate.stats import student_95
 from brushloop.collect.errors import ArmInPicture, CameraLate
 from brushloop.collect.photograph.frames import ARM_SHARE, FrameChange, Frames, Thumbnail, View, watching
-from brushloop.collect.rig.optics import CameraConfig
+from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Camera, Frame, Robot
 from brushloop.drivers.errors import DeviceError
 from brushloop.drivers.host import Clock

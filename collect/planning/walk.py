@@ -37,7 +37,8 @@ from brushloop.collect.protocols.steps import (
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import Layout, PaperPlane, Patch, Sheet
-from brushloop.collect.touch.heights import lowest_z_mm, patch_spots, touch_rects
+from brushloop.collect.touch.camera import SPOTS_PER_DIP
+from brushloop.collect.touch.heights import EXTENT_MM, lowest_z_mm, patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import PressResult, StepKind, StepResult
@@ -119,13 +120,13 @@ def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchSt
     for rect_mm in touch_rects(config.paper, touch):
         x_mm, y_mm, *_ = rect_mm
         above = over(config, x_mm, y_mm)
-        extent_mm = touch.camera.extent_mm if touch.method == "camera" else 0.0
+        extent_mm = EXTENT_MM if touch.method == "camera" else 0.0
         floor_mm = lowest_z_mm(config.paper, touch, x_mm, y_mm, extent_mm)
         speed_mm_s = max(config.motion.travel_speed_mm_s, config.motion.press_speed_mm_s, touch.speed_mm_s)
         segments += [above, Region.over(config, rect_mm, floor_mm, speed_mm_s), above]
     if touch.method != "camera":
         return StepMoves(segments)
-    count = sum(-(-spots // touch.camera.spots_per_dip) for spots in patch_spots(config.paper, touch))
+    count = sum(-(-spots // SPOTS_PER_DIP) for spots in patch_spots(config.paper, touch))
     inked = [move for number in range(count) for move in inking_moves(config, dips + number)]
     return StepMoves([*photograph_moves(config), *inked, *segments, *photograph_moves(config)], dips=count)
 

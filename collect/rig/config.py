@@ -12,12 +12,14 @@ from typing import Annotated, Any, cast
 
 from pydantic import Field, ValidationError, model_validator
 
+from brushloop.calibrate.board.lens import Lens, read_lens
 from brushloop.calibrate.board.spec import BoardSpec
+from brushloop.calibrate.errors import CalibrationError
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.rig.config_file import Config, Finite, PaperSide, Range, place, read_toml, refusal
 from brushloop.collect.rig.config_touch import QualityConfig, SelfCheckConfig, TouchConfig
-from brushloop.collect.rig.optics import CameraConfig, with_optics
 from brushloop.drivers.arcs.settings import ArcsTable
+from brushloop.drivers.camera import CameraTable
 from brushloop.drivers.force.sri_m8123 import ForceTable
 from brushloop.drivers.ink import AnyInkTable
 
@@ -56,6 +58,17 @@ class RobotConfig(ArcsTable, frozen=True):
     def on_this_machine(self) -> bool:
         """Whether its controller has a loopback address, as the loopback rig's has."""
         return self.host in ("localhost", "::1") or self.host.startswith("127.")
+
+
+class CameraConfig(CameraTable, frozen=True):
+    """The camera, and its lens."""
+
+    lens: str = ""
+    """Name of the lens, for the record."""
+    lens_file: Path | None = None
+    """Written by `brushloop camera intrinsics`, beside rig.toml: distortion is removed before anything is measured."""
+    optics: Lens | None = None
+    """Contents of that file; filled in when rig.toml is read, so that the session holds them."""
 
 
 class BrushConfig(Config):
@@ -223,3 +236,14 @@ def load_rig(path: Path) -> RigConfig:
     except ValidationError as error:
         raise refusal(path, error, RigConfig, environment=environment) from None
     return rig.model_copy(update={"camera": with_optics(path, rig.camera)})
+
+
+def with_optics(rig_path: Path, camera: CameraConfig) -> CameraConfig:
+    """The same camera with its lens, read from a file beside `rig.toml`. Raises `ConfigError`."""
+    if camera.lens_file is None:
+        return camera
+    try:
+        optics = read_lens(rig_path.parent / camera.lens_file)
+    except CalibrationError as error:
+        raise ConfigError(rig_path, "camera.lens_file", str(error)) from None
+    return camera.model_copy(update={"optics": optics})

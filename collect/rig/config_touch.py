@@ -9,7 +9,6 @@ from pydantic import Field, model_validator
 from brushloop.collect.rig.config_file import Config, Finite, Positive
 
 Method = Literal["taught", "force", "camera", "jog"]
-Step = Annotated[float, Field(ge=0.01, le=5.0)]
 Level = Annotated[float, Field(ge=0.0, le=255.0)]
 Share = Annotated[float, Field(gt=0.0, lt=1.0)]
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
@@ -19,27 +18,17 @@ Area = Annotated[float, Field(gt=0.0, le=1e6)]
 class ForceTouchConfig(Config):
     """Zero touch by force: fast steps until something is felt, then slow ones around that height."""
 
-    threshold_n: Positive = 0.0012
-    """Force in N that ends the fast approach. A soft brush pushes with a few mN in its first millimetre."""
-    fast_step_mm: Step = 0.5
     fast_samples: Annotated[int, Field(ge=4, le=10_000)] = 60
     """Samples averaged at each rest of the fast approach."""
-    medium_step_mm: Step = 0.15
     medium_samples: Annotated[int, Field(ge=4, le=10_000)] = 80
     slow_samples: Annotated[int, Field(ge=10, le=100_000)] = 600
     """Samples averaged over the three rests of one slow descent."""
     sigma_mm: Annotated[float, Field(ge=0.001, le=0.5)] = 0.04
     """Slow descents are repeated until the contact is known to this standard error; three touches average to 0.6 of
     it."""
-    max_samples: Annotated[int, Field(ge=100, le=1_000_000)] = 60_000
-    """Most samples of one touch; if they are not enough, the sensor is too noisy for the brush."""
-    linear_mm: Annotated[float, Field(ge=0.05, le=5.0)] = 0.45
-    """Depth to which the brush counts as a linear spring; readings below it are left out."""
     push_axis: tuple[Finite, Finite, Finite] = (0.0, 0.0, -1.0)
     """Direction of the paper's push in the sensor's frame: against its z axis if that points along the tool to the
     tip."""
-    clear_mm: Annotated[float, Field(ge=0.0, le=20.0)] = 1.0
-    """A rest above the previous one is approached from this much higher: every rest is reached on the way down."""
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.05
     """Time from the arm at rest to the first sample that counts."""
 
@@ -48,36 +37,6 @@ class ForceTouchConfig(Config):
         if sum(v * v for v in self.push_axis) < 1e-6:
             raise ValueError("push_axis must not be zero")
         return self
-
-
-class CameraTouchConfig(Config):
-    """Zero touch by first ink: rows of shallow touches, each a little lower, and a photograph of each row."""
-
-    coarse_step_mm: Step = 0.5
-    fine_step_mm: Step = 0.08
-    """Step of the fine rows; the error of a touch is about half of it."""
-    pitch_mm: Annotated[float, Field(ge=2.0, le=20.0)] = 4.0
-    """Distance between spots; a shallow touch leaves a mark of one to three millimetres. Camera and arm must agree on
-    the place within a quarter of it."""
-    columns: Annotated[int, Field(ge=2, le=50)] = 9
-    """Spots in a row of a point's patch."""
-    spots_per_dip: Annotated[int, Field(ge=1, le=20)] = 2
-    """Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
-    spots_per_photo: Annotated[int, Field(ge=1, le=20)] = 2
-    """Touches per photograph in the coarse row, which ends when ink is seen; few, so that spots stay small."""
-    least_ink_mm2: Annotated[float, Field(gt=0.0, le=10.0)] = 0.25
-    """Darkening that counts as ink: area times how much darker it became, 1 being black."""
-
-    @property
-    def extent_mm(self) -> float:
-        """Length of a row of touches."""
-        return (self.columns - 1) * self.pitch_mm
-
-
-class JogTouchConfig(Config):
-    """Zero touch by the operator's jog."""
-
-    steps_mm: tuple[Step, Step, Step] = (0.02, 0.1, 1.0)
 
 
 class TouchConfig(Config):
@@ -108,8 +67,6 @@ class TouchConfig(Config):
     speed_mm_s: Annotated[float, Field(ge=0.5, le=50.0)] = 5.0
     """Speed of every move at or below the start of the approach."""
     force: ForceTouchConfig = ForceTouchConfig()
-    camera: CameraTouchConfig = CameraTouchConfig()
-    jog: JogTouchConfig = JogTouchConfig()
 
     def check_points(self, size_mm: tuple[float, float]) -> None:
         """Raise ValueError where a point does not lie on a sheet of that size; for the validator of `rig.toml`."""
@@ -139,11 +96,7 @@ class SelfCheckConfig(Config):
     """How far the marks may lie, on average, from where they were commanded; a soft tip lands beside its axis."""
     turn_deg: Positive = 1.0
     scale: Annotated[float, Field(gt=0.0, le=0.2)] = 0.01
-    """Largest relative error of a length, on top of `mark_mm` divided by the triangle's extent."""
-    mark_mm: Positive = 0.3
-    """How far one mark's centre may lie from where the others imply: no two presses bend the hairs alike. To
-    distinguish 2 % from 1 %, a triangle must extend over more than 50 mm along both axes."""
-    least_ink_mm2: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
+    """Largest relative error of a length, on top of what one mark's own scatter explains over the triangle's extent."""
 
     @model_validator(mode="after")
     def _uneven(self) -> SelfCheckConfig:

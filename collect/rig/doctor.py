@@ -1,23 +1,46 @@
-"""Asks every configured device for its identity and state, and reports in one table what is wrong. Powers nothing."""
+"""Asks every configured device for its identity and state, and reports in one table what is wrong. Powers nothing.
+
+`doctor --report` writes one archive for a bug report. It holds the answers of the devices, and nothing that is secret.
+
+| file | holds |
+|---|---|
+| `report.json` | versions, platform, the doctor's findings, numbers of `rig.toml`, the checks of `rig check` |
+| `arcs.jsonl` | the transcript of the controller: one question and its answer a line; tests replay it |
+| `rtde.json` | what RTDE offers and its newest sample, if `robot.rtde_port` is configured |
+| `README.txt` | what is in it and what was taken out |
+"""
 
 from __future__ import annotations
 
 import asyncio
+import getpass
+import importlib.metadata
+import json
 import math
+import os
+import platform
+import re
+import socket
 import statistics
 import time
-from collections.abc import Awaitable, Callable
+import zipfile
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 from rich.table import Table
 from rich.text import Text
 
 from brushloop.calibrate.board.pix2len import see_board
 from brushloop.calibrate.errors import CalibrationError
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.errors import ConfigError
+from brushloop.collect.rig.check import check_rig
+from brushloop.collect.rig.config import PREFIX, RigConfig
 from brushloop.collect.rig.devices import make_robot
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, RobotMode
+from brushloop.drivers.arcs.survey import rtde_answers, survey
+from brushloop.drivers.arcs.wire import Framing
 from brushloop.drivers.camera import OpenCvCamera
 from brushloop.drivers.devices import Identity, Stamp
 from brushloop.drivers.errors import DeviceError
@@ -61,20 +84,44 @@ async def examine(config: RigConfig, clock: Clock) -> list[Finding]:
     """One finding for each configured device, in the order in which a session connects them."""
     findings = [await _asked("camera", config.camera.source, lambda: _camera(config, clock))]
     if (force := config.force) is not None:
-        findings.append(await _asked("force", _bus(force), lambda: _force(force, clock)))
+        gateway = "" if force.host is None else f" at {force.host}:{force.port}"
+        bus = f"{force.interface} {force.channel}{gateway}"
+        findings.append(await _asked("force", bus, lambda: _force(force, clock)))
     if (ink := config.ink.device) is not None:
         findings.append(await _asked("ink", ink.port, lambda: _ink(ink, clock)))
-    robot_address = f"{config.robot.host}:{config.robot.port}"
-    findings.append(await _asked("robot", robot_address, lambda: _robot(config, clock, robot_address)))
+    address = f"{config.robot.host}:{config.robot.port}"
+    findings.append(await _asked("robot", address, lambda: _robot(config, clock)))
     return findings
 
 
-async def _asked(device: str, address: str, ask: Callable[[], Awaitable[Finding]]) -> Finding:
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """What a device says of itself, and what is wrong with it."""
+
+    identity: Identity
+    latency_ms: float | None
+    notes: str
+    problem: str = ""
+    remedy: str = ""
+
+
+async def _asked(device: str, address: str, ask: Callable[[], Awaitable[_Answer]]) -> Finding:
     try:
-        return await ask()
+        answer = await ask()
     except DeviceError as error:
         remedy = error.remedy or "Check power, cable and address."
         return Finding(device, address, answers=False, problem=f"{error.op}: {error.what}", remedy=remedy)
+    return Finding(
+        device,
+        address,
+        answers=True,
+        identity=answer.identity.model,
+        firmware=answer.identity.firmware,
+        latency_ms=answer.latency_ms,
+        notes=answer.notes + (", simulated" if answer.identity.simulated else ""),
+        problem=answer.problem,
+        remedy=answer.remedy,
+    )
 
 
 async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]:
@@ -88,7 +135,7 @@ async def _timed(calls: int, ask: Callable[[], Awaitable[T]]) -> tuple[T, float]
             return answer, statistics.median(waits_ms)
 
 
-async def _camera(config: RigConfig, clock: Clock) -> Finding:
+async def _camera(config: RigConfig, clock: Clock) -> _Answer:
     notices: list[str] = []
     camera = OpenCvCamera(config.camera, clock, notices.append)
     try:
@@ -97,33 +144,16 @@ async def _camera(config: RigConfig, clock: Clock) -> Finding:
         frame, latency_ms = await _timed(FRAMES, lambda: camera.fresh(Stamp(clock.now_ns())))
     finally:
         await camera.close()
-    board, problem, remedy = await asyncio.to_thread(_board, config, frame.image)
-    return Finding(
-        "camera",
-        config.camera.source,
-        answers=True,
-        identity=identity.model,
-        latency_ms=latency_ms,
-        notes="; ".join([board, *notices]),
-        problem=problem,
-        remedy=remedy,
-    )
-
-
-def _board(config: RigConfig, image: Any) -> tuple[str, str, str]:
     try:
-        plane = see_board(image, config.board, lens=config.camera.optics)
+        plane = await asyncio.to_thread(see_board, frame.image, config.board, lens=config.camera.optics)
     except CalibrationError as error:
-        return "", f"board: {error.what}", "Put the configured board into view, in focus and evenly lit."
-    return f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px", "", ""
+        remedy = "Put the configured board into view, in focus and evenly lit."
+        return _Answer(identity, latency_ms, "; ".join(notices), f"board: {error.what}", remedy)
+    board = f"board: {plane.corners} corners, residual {plane.rms_px:.2f} px, {plane.mm_per_px:.4f} mm/px"
+    return _Answer(identity, latency_ms, "; ".join([board, *notices]))
 
 
-def _bus(config: ForceTable) -> str:
-    gateway = "" if config.host is None else f" at {config.host}:{config.port}"
-    return f"{config.interface} {config.channel}{gateway}"
-
-
-async def _force(config: ForceTable, clock: Clock) -> Finding:
+async def _force(config: ForceTable, clock: Clock) -> _Answer:
     sensor = SriM8123(config, clock)
     try:
         identity = await sensor.connect()
@@ -139,42 +169,22 @@ async def _force(config: ForceTable, clock: Clock) -> Finding:
     elif force_n > config.max_n:
         problem = f"{force_n:.2f} N with nothing pressing, above the ceiling force.max_n = {config.max_n:g} N"
         remedy = "Remove what touches the brush; the bias at each start takes off the weight of the holder."
-    return Finding(
-        "force",
-        _bus(config),
-        answers=True,
-        identity=identity.model,
-        firmware=identity.firmware or "unknown",
-        latency_ms=age_ms,
-        notes=f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias" + _simulated(identity),
-        problem=problem,
-        remedy=remedy,
-    )
+    return _Answer(identity, age_ms, f"{health.rate_hz:.0f} rounds/s, {force_n:.3f} N before bias", problem, remedy)
 
 
-async def _ink(config: InkTable, clock: Clock) -> Finding:
+async def _ink(config: InkTable, clock: Clock) -> _Answer:
     device = config.device(clock)
     try:
         identity = await device.connect()
         level, latency_ms = await _timed(CALLS, device.level)
     finally:
         await device.close()
-    return Finding(
-        "ink",
-        config.port,
-        answers=True,
-        identity=identity.model,
-        firmware=identity.firmware or "unknown",
-        latency_ms=None if level is None else latency_ms,
-        notes=("no gauge" if level is None else f"well {level:.0%} full") + _simulated(identity),
-    )
+    if level is None:
+        return _Answer(identity, None, "no gauge")
+    return _Answer(identity, latency_ms, f"well {level:.0%} full")
 
 
-def _simulated(identity: Identity) -> str:
-    return ", simulated" if identity.simulated else ""
-
-
-async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
+async def _robot(config: RigConfig, clock: Clock) -> _Answer:
     notices: list[str] = []
     robot = make_robot(config, clock, notices.append)
     try:
@@ -182,23 +192,13 @@ async def _robot(config: RigConfig, clock: Clock, address: str) -> Finding:
         state = await robot.state(CALLS)
     finally:
         await robot.close()
-    condition = f"{state.mode}, safety {state.safety}" + _simulated(identity)
     problem = remedy = ""
     if state.safety not in MOVING_ALLOWED:
         problem, remedy = f"safety mode is {state.safety}", "Look at the pendant; this program clears nothing."
     elif state.mode not in (RobotMode.POWER_OFF, RobotMode.IDLE, RobotMode.RUNNING):
         problem, remedy = f"robot mode is {state.mode}", "Look at the pendant."
-    return Finding(
-        "robot",
-        address,
-        answers=True,
-        identity=identity.model,
-        firmware=identity.firmware,
-        latency_ms=state.latency_ms,
-        notes="; ".join([condition, *notices]),
-        problem=problem,
-        remedy=remedy,
-    )
+    notes = "; ".join([*notices, f"{state.mode}, safety {state.safety}"])
+    return _Answer(identity, state.latency_ms, notes, problem, remedy)
 
 
 def doctor_table(findings: list[Finding]) -> Table:
@@ -211,3 +211,165 @@ def doctor_table(findings: list[Finding]) -> Table:
         words = [finding.notes, finding.problem and f"{finding.problem}.", finding.remedy]
         table.add_row(finding.device, verdict, who, latency, "\n".join(w for w in words if w))
     return table
+
+
+FORMAT = 1
+ENDING = ".zip"
+ABOUT = """\
+Made by `brushloop doctor --report`. Read it before you send it: it is meant to hold no secret.
+report.json  versions, platform, what each device answered, the numbers of rig.toml and what is doubtful in them
+arcs.jsonl   every question that was put to the arm's controller, and its answer
+rtde.json    what the controller's telemetry offers, if it is configured
+Taken out: names of hosts and users, addresses, paths, URLs, values of environment variables, every text of rig.toml.
+There are no photographs in it.
+"""
+SHORTEST = 3
+"""A shorter name would be found within ordinary words."""
+PATTERNS = (
+    (re.compile(r"\b[a-z][a-z0-9+.-]*://\S+", re.IGNORECASE), "<url>"),
+    (re.compile(r"\S+@[\w-]+(\.[\w-]+)+"), "<e-mail>"),
+    (re.compile(r"\b(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}\b", re.IGNORECASE), "<address>"),
+    (re.compile(r"\b\d{1,3}(?:\.\d{1,3}){3}\b"), "<address>"),
+    (re.compile(r"(?<![\w.])(?:[0-9a-f]{0,4}:){3,7}[0-9a-f]{0,4}(?![\w.])", re.IGNORECASE), "<address>"),
+    (re.compile(r"(?<![\w<>/])(?:~|/)[\w.~+-]*/[^\s'\",;]+"), "<path>"),
+    (re.compile(r"\b[A-Za-z]:\\[^\s'\",;]+"), "<path>"),
+)
+KEPT = frozenset({"kind", "interface", "framing", "dictionary", "method"})
+"""Fields of `rig.toml` whose text is one of a few fixed words; all other text in it is left out."""
+
+
+class Scrubber:
+    """Replaces what identifies a person or a network: reports are sent to people outside the lab."""
+
+    def __init__(self, known: Mapping[str, str]) -> None:
+        """`known` are names of this rig, and what stands for each."""
+        names = {value: "<environment>" for name, value in os.environ.items() if name.upper().startswith(PREFIX)}
+        names |= known
+        names |= {
+            socket.gethostname(): "<host>",
+            socket.getfqdn(): "<host>",
+            _user(): "<user>",
+            str(Path.home()): "<path>",
+            str(Path.cwd()): "<path>",
+        }
+        self._names = sorted(((k, v) for k, v in names.items() if len(k) >= SHORTEST), key=lambda pair: -len(pair[0]))
+
+    def text(self, text: str) -> str:
+        """The text with all of these replaced."""
+        for name, stands_for in self._names:
+            text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", stands_for, text)
+        for pattern, stands_for in PATTERNS:
+            text = pattern.sub(stands_for, text)
+        return text
+
+    def value(self, value: Any) -> Any:
+        """The same for every text in a JSON value."""
+        match value:
+            case str():
+                return self.text(value)
+            case dict():
+                return {key: self.value(inner) for key, inner in cast("dict[str, Any]", value).items()}
+            case list() | tuple():
+                return [self.value(inner) for inner in cast("list[Any]", value)]
+            case _:
+                return value
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a process whose user has no name
+        return ""
+
+
+def scrubber_of(config: RigConfig) -> Scrubber:
+    """A scrubber that knows the names in `rig.toml`."""
+    force, device = config.force, config.ink.device
+    names = {config.robot.host: "<host>", config.camera.source: "<camera>"}
+    names |= {force.host or "": "<host>"} if force is not None else {}
+    names |= {device.port: "<port>"} if device is not None else {}
+    return Scrubber(names)
+
+
+def numbers_only(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A table of `rig.toml` without its texts, which may name anything."""
+
+    def kept(name: str, value: Any) -> Any:
+        match value:
+            case str() if name not in KEPT:
+                return "<text>"
+            case dict():
+                return numbers_only(cast("dict[str, Any]", value))
+            case _:
+                return value
+
+    return {name: kept(name, value) for name, value in table.items()}
+
+
+def check_report(path: Path) -> None:
+    """Raise `ConfigError` if no archive can be written to this path. Called before any device is asked."""
+    if path.suffix.lower() != ENDING:
+        raise ConfigError("--report", "", f"{path} must end in {ENDING}")
+    if not path.parent.is_dir():
+        raise ConfigError("--report", "", f"{path}: there is no folder {path.parent}")
+    if path.exists():
+        raise ConfigError("--report", "", f"{path} exists and is not overwritten: choose another name")
+
+
+async def write_report(path: Path, config: RigConfig, findings: list[Finding]) -> None:
+    """Record a transcript of the controller and write the archive; `check_report` must have passed.
+
+    Raises OSError if it cannot be written.
+    """
+    robot, scrubber = config.robot, scrubber_of(config)
+    known = {
+        "framing": robot.framing,
+        "findings": scrubber.value([finding.as_json() for finding in findings]),
+        "rig": numbers_only(config.model_dump(mode="json")),
+        "checks": scrubber.value([asdict(check) for check in check_rig(config)]),
+    }
+    files = {"arcs.jsonl": await transcript(robot.host, robot.port, robot.framing, scrubber)}
+    if robot.rtde_port is not None:
+        answers = await rtde_answers(robot.host, robot.rtde_port)
+        files["rtde.json"] = json.dumps(scrubber.value(answers), indent=2)
+    write_archive(path, known, files)
+
+
+async def transcript(host: str, port: int, framing: Framing, scrubber: Scrubber) -> str:
+    """Every question to the controller and its answer, one JSON object a line, without names."""
+    lines = [
+        asdict(exchange) | {"took_ms": round(exchange.took_ms, 3)} for exchange in await survey(host, port, framing)
+    ]
+    return "".join(json.dumps(scrubber.value(line)) + "\n" for line in lines)
+
+
+def write_archive(path: Path, known: dict[str, Any], files: dict[str, str]) -> None:
+    """Write `report.json` with what is `known`, a README and these files. Raises OSError."""
+    report = {
+        "format": FORMAT,
+        "versions": _versions(),
+        "platform": {
+            "system": platform.system(),
+            "release": platform.release(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "cores": os.cpu_count(),
+        },
+        **known,
+    }
+    texts = {"README.txt": ABOUT, "report.json": json.dumps(report, indent=2), **files}
+    with path.open("xb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in texts.items():
+            archive.writestr(name, text)
+
+
+def _versions() -> dict[str, str]:
+    """Versions of brushloop and of its libraries."""
+    found: dict[str, str] = {}
+    for requirement in ("brushloop", *(importlib.metadata.requires("brushloop") or ())):
+        name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue  # an extra that is not installed
+    return found

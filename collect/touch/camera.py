@@ -17,12 +17,17 @@ from brushloop.calibrate.stroke import PX_PER_MM
 from brushloop.calibrate.stroke.rectify import rectify
 from brushloop.collect.errors import StepError
 from brushloop.collect.motion import Dip, Move, Procedures, touching, up
+from brushloop.collect.photograph.frames import Gray, undistorted
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
-from brushloop.collect.rig.optics import Gray, undistorted
 from brushloop.collect.rig.paper import PaperPlane, fit_plane
 from brushloop.collect.touch.force import Floats
 from brushloop.collect.touch.heights import (
+    COARSE_STEP_MM,
+    EXTENT_MM,
+    FINE_COUNT,
+    FINE_STEP_MM,
+    PITCH_MM,
     KnownHeights,
     PointTouches,
     Reach,
@@ -30,7 +35,6 @@ from brushloop.collect.touch.heights import (
     Touch,
     at_one_point,
     coarse_count,
-    fine_count,
     lowest_z_mm,
 )
 from brushloop.drivers.devices import Frame
@@ -171,8 +175,14 @@ def first_ink(ink_mm2: Floats, least_mm2: float) -> FirstInk:
 
 Spot = tuple[float, float, float]
 """x and y in the paper frame, z of the tip in the base frame."""
-WINDOW_SHARE = 0.75
-"""Side of the window in which a spot's ink is measured, as a share of the pitch."""
+WINDOW_MM = 0.75 * PITCH_MM
+"""Side of the window in which a spot's ink is measured."""
+SPOTS_PER_DIP = 2
+"""Touches after which the brush is dipped again: a tip that dries leaves no ink at first."""
+SPOTS_PER_PHOTO = 2
+"""Touches per photograph in the coarse row, which ends when ink is seen; few, so that spots stay small."""
+LEAST_INK_MM2 = 0.25
+"""Darkening that counts as ink: area times how much darker it became, 1 being black."""
 
 
 class FirstInkTouch:
@@ -191,21 +201,20 @@ class FirstInkTouch:
 
         Without that plane, the sheet's lean along a row would be mistaken for height. Raises `StepError`.
         """
-        paper, extent_mm = self._rig.config.paper, self._config.camera.extent_mm
+        paper = self._rig.config.paper
         known = KnownHeights(paper, self._config)
         grids = [
-            SpotGrid(point, self._config.camera, paper.size_mm, lowest_z_mm(paper, self._config, *point, extent_mm))
-            for point in points_mm
+            SpotGrid(point, paper.size_mm, lowest_z_mm(paper, self._config, *point, EXTENT_MM)) for point in points_mm
         ]
         rough: list[Touch] = []
         for grid, point in zip(grids, points_mm, strict=True):
-            rough.append(await self._coarse(grid, known.reach(*point, extent_mm)))
+            rough.append(await self._coarse(grid, known.reach(*point, EXTENT_MM)))
             known.add(rough[-1].x_mm, rough[-1].y_mm, rough[-1].z_mm)
         rounds = [rough]
         for k in range(self._config.touches):
             lean = _plane(rounds[-1])
             # Staggered by parts of a step: equal heights would only repeat the same result.
-            lower_mm = k / self._config.touches * self._config.camera.fine_step_mm
+            lower_mm = k / self._config.touches * FINE_STEP_MM
             rounds.append([await self._fine(p, around, lean, lower_mm) for p, around in zip(grids, rough, strict=True)])
         touches = [list(point) for point in zip(*rounds[1:], strict=True)]
         lean = _plane([touch for point in touches for touch in point])
@@ -213,39 +222,37 @@ class FirstInkTouch:
 
     async def _coarse(self, grid: SpotGrid, reach: Reach) -> Touch:
         """Touch lower and lower until a photograph shows ink."""
-        camera = self._config.camera
-        count = coarse_count(camera, reach)
+        count = coarse_count(reach)
         before = await self._photograph()
         spots: list[Spot] = []
         for k in range(count):
-            spots.append((*grid.take(), max(reach.start_z_mm - k * camera.coarse_step_mm, reach.lowest_z_mm)))
+            spots.append((*grid.take(), max(reach.start_z_mm - k * COARSE_STEP_MM, reach.lowest_z_mm)))
             await self._touch(spots[-1])
-            if len(spots) % camera.spots_per_photo == 0 or k + 1 == count:
+            if len(spots) % SPOTS_PER_PHOTO == 0 or k + 1 == count:
                 ink = await self._ink(before, spots)
-                if (ink >= camera.least_ink_mm2).any():
-                    return self._between(spots, ink, camera.coarse_step_mm)
+                if (ink >= LEAST_INK_MM2).any():
+                    return self._between(spots, ink, COARSE_STEP_MM)
         raise StepError(f"nothing was touched down to {spots[-1][2]:.2f} mm: no spot of the row left ink")
 
     async def _fine(self, grid: SpotGrid, around: Touch, lean: PaperPlane, lower_mm: float) -> Touch:
-        camera = self._config.camera
         before, spots = await self._photograph(), list[Spot]()
-        highest_mm = 0.5 * camera.fine_step_mm * (fine_count(camera) - 1) - lower_mm
-        for k in range(fine_count(camera)):
+        highest_mm = 0.5 * FINE_STEP_MM * (FINE_COUNT - 1) - lower_mm
+        for k in range(FINE_COUNT):
             x, y = grid.take()
             along_mm = lean.touch_z_mm(x, y) - lean.touch_z_mm(around.x_mm, around.y_mm)
-            z_mm = around.z_mm + along_mm + highest_mm - k * camera.fine_step_mm
+            z_mm = around.z_mm + along_mm + highest_mm - k * FINE_STEP_MM
             spots.append((x, y, max(z_mm, grid.lowest_z_mm)))
             await self._touch(spots[-1])
-        return self._between(spots, await self._ink(before, spots), camera.fine_step_mm)
+        return self._between(spots, await self._ink(before, spots), FINE_STEP_MM)
 
     def _between(self, spots: list[Spot], ink_mm2: NDArray[np.float64], step_mm: float) -> Touch:
         """Half way between the last clean spot and the first inked one; every height between them is equally likely."""
-        edge = first_ink(ink_mm2, self._config.camera.least_ink_mm2)
+        edge = first_ink(ink_mm2, LEAST_INK_MM2)
         x, y, z = (0.5 * (a + b) for a, b in zip(spots[edge.clean], spots[edge.inked], strict=True))
         return Touch(x, y, z, step_mm / math.sqrt(12.0))
 
     async def _touch(self, spot: Spot) -> None:
-        if self._since_dip is None or self._since_dip >= self._config.camera.spots_per_dip:
+        if self._since_dip is None or self._since_dip >= SPOTS_PER_DIP:
             await self._dip()
             self._since_dip = 0
         x, y, z = spot
@@ -266,8 +273,7 @@ class FirstInkTouch:
 
     def _measure_ink(self, before: Frame, after: Frame, spots: list[Spot]) -> NDArray[np.float64]:
         first, second, image_to_paper = before_and_after(self._rig.config, before, after)
-        side_mm = WINDOW_SHARE * self._config.camera.pitch_mm
-        return ink_at(first, second, image_to_paper, [(x, y) for x, y, _ in spots], side_mm)
+        return ink_at(first, second, image_to_paper, [(x, y) for x, y, _ in spots], WINDOW_MM)
 
 
 def _plane(touches: list[Touch]) -> PaperPlane:

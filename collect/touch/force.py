@@ -118,6 +118,15 @@ SLOW_MM = (-0.8, 0.08, 0.4)
 steps needs more than twice the samples for the same error. The first is so high that it is in the air even where the
 paper has risen since the last touch."""
 SLOW_SHARES = (0.38, 0.42, 0.2)
+LINEAR_MM = 0.45
+"""Depth to which the brush counts as a linear spring; readings below it are left out."""
+FAST_STEP_MM, MEDIUM_STEP_MM = 0.5, 0.15
+THRESHOLD_N = 0.0012
+"""Force that ends the fast approach: a soft brush pushes with a few mN in its first millimetre."""
+MOST_SAMPLES = 60_000
+"""Samples of one touch; if they are not enough, the sensor is too noisy for the brush."""
+CLEAR_MM = 1.0
+"""A rest above the previous one is approached from this much higher: every rest is reached on the way down."""
 FELT_SIGMAS = 4.0
 """A mean force this many standard errors from zero is a push."""
 LATE_STEPS = 2
@@ -162,14 +171,14 @@ class _Log:
     def samples(self) -> int:
         return sum(reading.samples for reading, _ in self.readings)
 
-    def contact(self, config: ForceTouchConfig) -> Contact:
+    def contact(self) -> Contact:
         """Fit the hinge to the readings of the linear part; iterated, because that part depends on the hinge.
 
         More readings are kept where too few are left to give it: the descent lay too low, or they are noisy still.
         """
         contact = self._fit(-math.inf)
         for _ in range(3):
-            lowest_z_mm = contact.z_mm - config.linear_mm
+            lowest_z_mm = contact.z_mm - LINEAR_MM
             if not any(lowest_z_mm <= reading.z_mm < contact.z_mm for reading, _ in self.readings):
                 break
             try:
@@ -209,13 +218,13 @@ async def touch_by_force(
     log, lowest_z_mm = _Log(None if spring is None else spring.next()), reach.lowest_z_mm
     highest_z_mm = reach.start_z_mm
     if near_z_mm is None or spring is None:
-        report(f"down to the paper in steps of {config.fast_step_mm:g} mm")
+        report(f"down to the paper in steps of {FAST_STEP_MM:g} mm")
         felt_z_mm = await _fast(probe, reach.start_z_mm, lowest_z_mm, config)
-        start_z_mm = felt_z_mm + LATE_STEPS * config.fast_step_mm + CLEAR_STEPS * config.medium_step_mm
-        report(f"steps of {config.medium_step_mm:g} mm around {felt_z_mm:.1f} mm")
+        start_z_mm = felt_z_mm + LATE_STEPS * FAST_STEP_MM + CLEAR_STEPS * MEDIUM_STEP_MM
+        report(f"steps of {MEDIUM_STEP_MM:g} mm around {felt_z_mm:.1f} mm")
         await _medium(probe, log, start_z_mm, lowest_z_mm, config)
-        highest_z_mm = start_z_mm + config.fast_step_mm
-        near_z_mm = log.contact(config).z_mm
+        highest_z_mm = start_z_mm + FAST_STEP_MM
+        near_z_mm = log.contact().z_mm
     run, left = ROUGH_RUN, ""
     while True:
         run += 1
@@ -223,7 +232,7 @@ async def touch_by_force(
         for depth_mm, share in zip(SLOW_MM, SLOW_SHARES, strict=True):
             z_mm = max(near_z_mm - depth_mm, lowest_z_mm)
             log.readings.append((await probe.rest(z_mm, max(4, round(share * config.slow_samples))), run))
-        contact = log.contact(config)
+        contact = log.contact()
         if _known(contact, near_z_mm, config):
             if contact.z_mm > highest_z_mm:
                 raise StepError(
@@ -231,7 +240,7 @@ async def touch_by_force(
                     "in the air: the sensor is too noisy for so few samples"
                 )
             return contact
-        if log.samples > config.max_samples:
+        if log.samples > MOST_SAMPLES:
             raise StepError(
                 f"the contact is known to only {contact.sigma_mm:.3f} mm after {log.samples} samples of the force, "
                 f"{config.sigma_mm:g} mm are asked for: the sensor is too noisy for this brush"
@@ -254,14 +263,14 @@ def _known(contact: Contact, tried_z_mm: float, config: ForceTouchConfig) -> boo
 async def _fast(probe: Probe, start_z_mm: float, lowest_z_mm: float, config: ForceTouchConfig) -> float:
     """Go down in large steps; return the height of the first rest at which something is felt."""
     z_mm, reading = start_z_mm, await probe.rest(start_z_mm, config.fast_samples)
-    felt_n = _felt_n(reading, config)
+    felt_n = _felt_n(reading)
     if abs(reading.force_n) > felt_n:
         raise StepError(
             f"the force is {1e3 * reading.force_n:.1f} mN at the start of the approach, at {start_z_mm:.2f} mm: "
             "the brush touches already, or the sensor was not set to zero"
         )
     while z_mm > lowest_z_mm + 1e-6:
-        z_mm = max(z_mm - config.fast_step_mm, lowest_z_mm)
+        z_mm = max(z_mm - FAST_STEP_MM, lowest_z_mm)
         if (await probe.rest(z_mm, config.fast_samples)).force_n > felt_n:
             return z_mm
     raise StepError(f"nothing was touched down to {lowest_z_mm:.2f} mm: the force stayed below {1e3 * felt_n:.1f} mN")
@@ -273,15 +282,15 @@ async def _medium(probe: Probe, log: _Log, start_z_mm: float, lowest_z_mm: float
     while True:
         reading = await probe.rest(z_mm, config.medium_samples)
         log.readings.append((reading, ROUGH_RUN))
-        if min(before_n, reading.force_n) > _felt_n(reading, config) and len(log.readings) > CLEAR_STEPS:
+        if min(before_n, reading.force_n) > _felt_n(reading) and len(log.readings) > CLEAR_STEPS:
             return
         if z_mm <= lowest_z_mm + 1e-6:
-            raise StepError(f"nothing was touched down to {z_mm:.2f} mm, in steps of {config.medium_step_mm:g} mm")
-        z_mm, before_n = max(z_mm - config.medium_step_mm, lowest_z_mm), reading.force_n
+            raise StepError(f"nothing was touched down to {z_mm:.2f} mm, in steps of {MEDIUM_STEP_MM:g} mm")
+        z_mm, before_n = max(z_mm - MEDIUM_STEP_MM, lowest_z_mm), reading.force_n
 
 
-def _felt_n(reading: Reading, config: ForceTouchConfig) -> float:
-    return max(config.threshold_n, FELT_SIGMAS * reading.sd_n / math.sqrt(reading.samples))
+def _felt_n(reading: Reading) -> float:
+    return max(THRESHOLD_N, FELT_SIGMAS * reading.sd_n / math.sqrt(reading.samples))
 
 
 SILENT_S = 5.0
@@ -339,8 +348,8 @@ class RigProbe:
     async def rest(self, z_mm: float, samples: int) -> Reading:
         """Go to the height from above, come to rest, and average this many samples."""
         force, speed_mm_s = self._config.force, self._config.speed_mm_s
-        if self._last_z_mm is not None and z_mm > self._last_z_mm and force.clear_mm > 0.0:
-            await self._procedures.lower(*self._at_mm, z_mm + force.clear_mm, speed_mm_s)
+        if self._last_z_mm is not None and z_mm > self._last_z_mm:
+            await self._procedures.lower(*self._at_mm, z_mm + CLEAR_MM, speed_mm_s)
         rests_z_mm = await self._procedures.lower(*self._at_mm, z_mm, speed_mm_s)
         self._last_z_mm = z_mm
         after_ns = self._procedures.rig.clock.now_ns() + round(force.settle_s * 1e9)

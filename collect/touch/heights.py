@@ -9,7 +9,7 @@ from typing import Literal
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.config_touch import CameraTouchConfig, Method, TouchConfig
+from brushloop.collect.rig.config_touch import Method, TouchConfig
 from brushloop.collect.rig.paper import PaperPlane, Sheet, fit_plane
 from brushloop.sessions.events import TouchedPoint, ZeroTouchResult
 
@@ -167,30 +167,34 @@ def through(points: list[PointTouches], config: TouchConfig) -> PlaneResult:
     return PlaneResult(fit.plane, config.method, tuple(points), fit.residuals_mm)
 
 
+COARSE_STEP_MM, FINE_STEP_MM = 0.5, 0.08
+"""Steps of the rows of touches by camera; the error of a touch is about half of a fine step."""
+PITCH_MM, COLUMNS = 4.0, 9
+"""Distance between spots, and spots in a row of a point's patch: a shallow touch leaves a mark of one to three
+millimetres, and camera and arm must agree on the place within a quarter of the pitch."""
+EXTENT_MM = (COLUMNS - 1) * PITCH_MM
 SLACK_STEPS = 2
 """Fine steps beyond the coarse step, on either side: a coarse touch is accurate only to its step."""
+FINE_COUNT = 1 + 2 * SLACK_STEPS + math.ceil(COARSE_STEP_MM / FINE_STEP_MM)
+"""Spots of one fine row."""
 
 
 class SpotGrid:
     """The spots around one point, to and fro from the lower left, so that consecutive touches are neighbours."""
 
-    def __init__(
-        self, at_mm: tuple[float, float], config: CameraTouchConfig, sheet_mm: tuple[float, float], lowest_z_mm: float
-    ) -> None:
+    def __init__(self, at_mm: tuple[float, float], sheet_mm: tuple[float, float], lowest_z_mm: float) -> None:
         """No spot lies lower than `lowest_z_mm`."""
         self.lowest_z_mm = lowest_z_mm
         self._at_mm = at_mm
         self._sheet_mm = sheet_mm
-        self._config = config
         self._next = 0
 
     def take(self) -> tuple[float, float]:
         """The next fresh spot. Raises `StepError` where it does not lie on the sheet."""
-        row, column = divmod(self._next, self._config.columns)
+        row, column = divmod(self._next, COLUMNS)
         self._next += 1
-        column = self._config.columns - 1 - column if row % 2 else column
-        pitch_mm = self._config.pitch_mm
-        x_mm, y_mm = self._at_mm[0] + column * pitch_mm, self._at_mm[1] + row * pitch_mm
+        column = COLUMNS - 1 - column if row % 2 else column
+        x_mm, y_mm = self._at_mm[0] + column * PITCH_MM, self._at_mm[1] + row * PITCH_MM
         if not (0.0 <= x_mm <= self._sheet_mm[0] and 0.0 <= y_mm <= self._sheet_mm[1]):
             raise StepError(
                 f"the touches at ({self._at_mm[0]:g}, {self._at_mm[1]:g}) mm do not fit on the sheet: "
@@ -199,14 +203,9 @@ class SpotGrid:
         return x_mm, y_mm
 
 
-def fine_count(config: CameraTouchConfig) -> int:
-    """SpotGrid of one fine row."""
-    return 1 + 2 * SLACK_STEPS + math.ceil(config.coarse_step_mm / config.fine_step_mm)
-
-
-def coarse_count(config: CameraTouchConfig, reach: Reach) -> int:
-    """SpotGrid of a whole coarse row, which ends early where ink is seen."""
-    return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / config.coarse_step_mm) + 1
+def coarse_count(reach: Reach) -> int:
+    """Spots of a whole coarse row, which ends early where ink is seen."""
+    return math.ceil((reach.start_z_mm - reach.lowest_z_mm) / COARSE_STEP_MM) + 1
 
 
 MARK_MM = 3.0
@@ -223,19 +222,17 @@ def touch_rects(paper: PaperConfig, config: TouchConfig) -> list[Rect]:
         case "force" | "jog":
             return [(x, y, 0.0, 0.0) for x, y in config.points_mm or [paper.touch_point_mm]]
         case "camera":
-            pitch_mm, columns = config.camera.pitch_mm, config.camera.columns
-            rows = [math.ceil(spots / columns) for spots in patch_spots(paper, config)]
+            rows = [math.ceil(spots / COLUMNS) for spots in patch_spots(paper, config)]
             return [
-                (x, y, (columns - 1) * pitch_mm, (count - 1) * pitch_mm)
-                for (x, y), count in zip(config.points_mm, rows, strict=True)
+                (x, y, EXTENT_MM, (count - 1) * PITCH_MM) for (x, y), count in zip(config.points_mm, rows, strict=True)
             ]
 
 
 def patch_spots(paper: PaperConfig, config: TouchConfig) -> list[int]:
     """The most spots that each point's patch may take."""
-    known, camera = KnownHeights(paper, config), config.camera
-    reaches = [known.reach(x, y, camera.extent_mm) for x, y in config.points_mm]
-    return [coarse_count(camera, reach) + config.touches * fine_count(camera) for reach in reaches]
+    known = KnownHeights(paper, config)
+    reaches = [known.reach(x, y, EXTENT_MM) for x, y in config.points_mm]
+    return [coarse_count(reach) + config.touches * FINE_COUNT for reach in reaches]
 
 
 def used_patches(sheet: Sheet, paper: PaperConfig, config: TouchConfig) -> set[int]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from brushloop.collect.errors import JogGivenUp, StepError
 from brushloop.collect.motion import Dip, Procedures
 from brushloop.collect.operator import Asker, Choice, Prompt
-from brushloop.collect.rig.config_touch import JogTouchConfig, TouchConfig
+from brushloop.collect.rig.config_touch import TouchConfig
 from brushloop.collect.rig.paper import PaperPlane
 from brushloop.collect.touch.camera import FirstInkTouch
 from brushloop.collect.touch.force import ForceTap, RigProbe, Spring, touch_by_force
@@ -120,6 +120,8 @@ class Jogged:
 NextJog = Callable[[Jogged], Awaitable[float | None]]
 """The next step in mm, positive up; None if the tip touches."""
 ROUNDING_MM = 1e-6
+JOG_MM = {"1": -1.0, "2": -0.1, "3": -0.02, "8": 0.02, "9": 0.1, "0": 1.0}
+"""Step of each key, positive up."""
 
 
 async def _touch_by_jog(
@@ -127,10 +129,8 @@ async def _touch_by_jog(
 ) -> Touch:
     """Touch `number` of `of`; the brush is left where the operator stopped.
 
-    A step that would go below the end of the travel, or above where the jog began, is shortened. Raises `StepError` for
-    a step of a size that the configuration does not have.
+    A step that would go below the end of the travel, or above where the jog began, is shortened.
     """
-    steps_mm = config.jog.steps_mm
     z_mm = reach.start_z_mm
     while True:
         rests_mm = await procedures.lower(*at_mm, z_mm, config.speed_mm_s)
@@ -138,20 +138,16 @@ async def _touch_by_jog(
         step_mm = await next_jog(Jogged(rests_mm - reach.expected_z_mm, lowest, number, of))
         if step_mm is None:
             return Touch(*at_mm, rests_mm)
-        if all(abs(abs(step_mm) - size) > ROUNDING_MM for size in steps_mm):
-            raise StepError(f"a jog of {step_mm:g} mm is not one of {', '.join(f'{s:g}' for s in steps_mm)} mm")
         z_mm = min(max(z_mm + step_mm, reach.lowest_z_mm), reach.start_z_mm)
 
 
-def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> NextJog:
+def asked(asker: Asker, height: str = "the height") -> NextJog:
     """Ask for each jog on the screen. `height` names the height that is kept without a jog.
 
     The returned function raises `NeedsOperator` if nobody watches, and `JogGivenUp` if the operator gives up.
     """
-    small, middle, large = config.steps_mm
-    keys = {"1": -large, "2": -middle, "3": -small, "8": small, "9": middle, "0": large}
     choices = (
-        *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in keys.items()),
+        *(Choice(key, f"{'down' if step < 0 else 'up'} {abs(step):g} mm") for key, step in JOG_MM.items()),
         Choice("t", "the tip just touches"),
         Choice("x", f"give up: {height} stays unchanged"),
     )
@@ -168,6 +164,6 @@ def asked(asker: Asker, config: JogTouchConfig, height: str = "the height") -> N
         key = await asker.ask(Prompt(question, choices, "x"))
         if key == "x":
             raise JogGivenUp(at.number, at.of, height)
-        return keys.get(key)
+        return JOG_MM.get(key)
 
     return next_jog

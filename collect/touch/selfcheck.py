@@ -31,7 +31,10 @@ LEAST_SPAN_MM = 60.0
 """Least extent of a wide triangle along either axis."""
 MOST_OF_SHEET = 0.25
 """Largest share of a sheet's patches that a check may take; smaller sheets are checked in one patch."""
-MOST_MARK_MM2 = 400.0
+MARK_MM = 0.3
+"""How far one mark's centre may lie from where the others imply: no two presses bend the hairs alike. To distinguish
+2 % from 1 %, a triangle must extend over more than 50 mm along both axes."""
+LEAST_MARK_MM2, MOST_MARK_MM2 = 1.0, 400.0
 """More ink than any mark has: a brush that is pressed 10 mm deep leaves less."""
 MIRRORS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "mirrored in x": ((-1.0, 0.0), (0.0, 1.0)),
@@ -48,12 +51,6 @@ def triangle_in(patch: Patch, config: SelfCheckConfig) -> Triangle:
         raise StepError(f"a triangle of {x_mm:g} by {y_mm:g} mm does not fit into patch {patch.index}")
     left, bottom = patch.x_mm + 0.5 * (patch.size_x_mm - x_mm), patch.y_mm + 0.5 * (patch.size_y_mm - y_mm)
     return (left, bottom), (left + x_mm, bottom), (left, bottom + y_mm)
-
-
-def triangle_of(patches: Sequence[Patch]) -> Triangle:
-    """One place in each of three spare patches, as far apart as the corners of the sheet."""
-    a, b, c = (patch.anchor_mm for patch in patches)
-    return a, b, c
 
 
 def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
@@ -76,14 +73,17 @@ def partners(sheet: Sheet, patch: Patch, used: Set[int]) -> tuple[Patch, ...]:
         key=lambda pair: -abs(pair[0].anchor_mm[0] - x_mm) * abs(pair[1].anchor_mm[1] - y_mm),
     )
     for pair in pairs:
-        if _second_best(np.array(triangle_of((patch, *pair)))) >= UNEVEN:
+        if _second_best(np.array([corner.anchor_mm for corner in (patch, *pair)])) >= UNEVEN:
             return pair
     return ()
 
 
 def triangle_on(patches: Sequence[Patch], config: SelfCheckConfig) -> Triangle:
-    """The triangle over three patches, or within the only one."""
-    return triangle_of(patches) if len(patches) == 3 else triangle_in(patches[0], config)
+    """One place in each of three patches, as far apart as the corners of the sheet, or three within the only one."""
+    if len(patches) == 1:
+        return triangle_in(patches[0], config)
+    a, b, c = (patch.anchor_mm for patch in patches)
+    return a, b, c
 
 
 async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> SelfCheckResult:
@@ -103,17 +103,17 @@ async def self_check(procedures: Procedures, places_mm: Triangle, dip: Dip) -> S
             await procedures.go(above, near)
             await procedures.queue(pressing)
         after = await procedures.capture()
-    found_mm = await asyncio.to_thread(_find, rig, before, after, config)
+    found_mm = await asyncio.to_thread(_find, rig, before, after)
     return judge(commanded, found_mm, config)
 
 
-def _find(rig: Rig, before: Frame, after: Frame, config: SelfCheckConfig) -> Floats:
+def _find(rig: Rig, before: Frame, after: Frame) -> Floats:
     try:
         first, second, image_to_paper = before_and_after(rig.config, before, after)
     except StepError as error:
         # A board in a mirrored picture is not seen either.
         raise StepError(f"self-check: {error}") from None
-    marks = new_marks(first, second, image_to_paper, config.least_ink_mm2)
+    marks = new_marks(first, second, image_to_paper, LEAST_MARK_MM2)
     if marks and marks[0].ink_mm2 > MOST_MARK_MM2:
         large = marks[0]
         raise StepError(
@@ -148,7 +148,7 @@ def judge(commanded_mm: Floats, found_mm: Floats, config: SelfCheckConfig) -> Se
         raise _refused(what, found, "Check paper.yaw_deg and how the board lies")
     scale = float(np.linalg.norm(linear[:, 0])), float(np.linalg.norm(linear[:, 1]))
     spans = np.ptp(commanded_mm, axis=0)
-    if any(abs(s - 1.0) > config.scale + config.mark_mm / span for s, span in zip(scale, spans, strict=True)):
+    if any(abs(s - 1.0) > config.scale + MARK_MM / span for s, span in zip(scale, spans, strict=True)):
         listed = " and ".join(f"{100.0 * (s - 1.0):+.2f} % along {axis}" for s, axis in zip(scale, "xy", strict=True))
         raise _refused(
             f"lengths are off by {listed}, limit {100.0 * config.scale:g} %", found, "Check the board's square_mm"

@@ -24,7 +24,7 @@ from textual.widgets import Footer, Input
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.headless import REFRESH_S, stop_signals
 from brushloop.collect.operator import Asker, Prompt
-from brushloop.collect.rig.optics import gray
+from brushloop.collect.photograph.frames import gray
 from brushloop.collect.teach.day import LeftOff, Picture, Shown, Target, WentBack
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.question_screens import YES, AskScreen, question_content, yes_or_no

@@ -256,7 +256,7 @@ async def _measured(context: StepContext, config: TouchConfig) -> PlaneResult:
     run = context.run
     tap = ForceTap()
     with context.guard.also(tap.take):
-        jog = asked(run.asker, config.jog, _height(run))
+        jog = asked(run.asker, _height(run))
 
         def tell(doing: str) -> None:
             run.progress.doing(f"zero touch by {config.method}: {doing}")

@@ -16,6 +16,7 @@ from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures
 from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
+from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.protocols.steps import MARKING, CaptureStep
 from brushloop.collect.quality.checks import (
     Check,
@@ -26,7 +27,6 @@ from brushloop.collect.quality.checks import (
     check_frame,
     patch_is_blank,
 )
-from brushloop.collect.rig.optics import undistorted
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.devices import Frame
 from brushloop.model.fitted import FittedPress

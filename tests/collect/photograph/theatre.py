@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from brushloop.collect.photograph.photographer import ArmTrips, Photographer
-from brushloop.collect.rig.optics import CameraConfig
+from brushloop.collect.rig.config import CameraConfig
 from brushloop.drivers.devices import Frame, Pose, PoseSample, Stamp
 from brushloop.drivers.host import Clock
 from tests.simulated_time import LoopClock

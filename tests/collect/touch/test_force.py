@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config_touch import ForceTouchConfig
+from brushloop.collect.touch import force
 from brushloop.collect.touch.camera import first_ink
 from brushloop.collect.touch.force import Contact, Reading, find_contact, touch_by_force
 from brushloop.collect.touch.heights import SPAN_SIGMAS, Reach
@@ -204,22 +205,20 @@ async def test_a_slow_drift_of_the_sensor_is_no_force(reaction: Reaction) -> Non
     assert abs(float(np.mean(errors))) < 0.03
 
 
-async def test_nothing_is_touched_within_the_travel(reaction: Reaction) -> None:
-    probe = Felt(reaction, 117.0, np.random.default_rng(1))
-    with pytest.raises(StepError, match=r"nothing was touched down to 118\.00 mm"):
-        await touch_by_force(probe, REACH, ForceTouchConfig())
-    assert probe.deepest_mm == pytest.approx(-1.0)
-
-
-async def test_a_brush_that_touches_at_the_start_is_refused(reaction: Reaction) -> None:
-    with pytest.raises(StepError, match="touches already"):
-        await touch_by_force(Felt(reaction, 124.0, np.random.default_rng(1)), REACH, ForceTouchConfig())
-
-
-async def test_a_sensor_that_is_too_noisy_says_so(reaction: Reaction) -> None:
-    config = ForceTouchConfig(max_samples=2000)
-    with pytest.raises(StepError, match="too noisy for this brush"):
-        await touch_by_force(Felt(reaction, 120.0, np.random.default_rng(1)), REACH, config)
+@pytest.mark.parametrize(
+    ("paper_z_mm", "samples", "said"),
+    [
+        (117.0, force.MOST_SAMPLES, r"nothing was touched down to 118\.00 mm"),
+        (124.0, force.MOST_SAMPLES, "touches already"),
+        (120.0, 2000, "too noisy for this brush"),
+    ],
+)
+async def test_a_touch_that_finds_nothing_begins_too_low_or_stays_unsure_is_refused(
+    reaction: Reaction, monkeypatch: pytest.MonkeyPatch, paper_z_mm: float, samples: int, said: str
+) -> None:
+    monkeypatch.setattr(force, "MOST_SAMPLES", samples)
+    with pytest.raises(StepError, match=said):
+        await touch_by_force(Felt(reaction, paper_z_mm, np.random.default_rng(1)), REACH, ForceTouchConfig())
 
 
 FEW_SAMPLES = ForceTouchConfig(sigma_mm=0.3, fast_samples=20, medium_samples=40, slow_samples=100)

@@ -14,8 +14,10 @@ from pydantic import ValidationError
 
 from brushloop.collect.errors import NeedsOperator, StepError
 from brushloop.collect.operator import Asker
+from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.config_touch import TouchConfig
-from brushloop.collect.touch.heights import PlaneResult
+from brushloop.collect.rig.paper import Sheet
+from brushloop.collect.touch.heights import PlaneResult, Touch, at_one_point, used_patches
 from brushloop.collect.touch.measure import Jogged, asked, measure_plane
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import MotionFailed
@@ -23,14 +25,9 @@ from brushloop.drivers.errors import MotionFailed
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench
 
-
-from brushloop.collect.rig.config import PaperConfig
-from brushloop.collect.rig.paper import Sheet
-from brushloop.collect.touch.heights import Touch, at_one_point, used_patches
-
 CORNERS = [(0.0, 0.0), (110.0, 0.0), (0.0, 80.0), (110.0, 80.0)]
 THREE: dict[str, Any] = {"points_mm": [(6.0, 4.0), (104.0, 4.0), (50.0, 76.0)]}
-PATCHES: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 40.0)], "camera": {"pitch_mm": 4.0}}
+PATCHES: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 40.0)]}
 
 
 async def measured(bench: Bench, **config: Any) -> PlaneResult:
@@ -67,8 +64,8 @@ async def test_touches_by_camera_lie_within_150_um_of_the_truth_at_3_sigma(make_
         lean_deg = 1.0 if seed % 2 else rng.uniform(0.0, 1.0)
         slope_deg = (lean_deg * math.cos(towards), lean_deg * math.sin(towards))
         bench = make_bench(slope_deg, paper_z_mm=120.0 + rng.uniform(-1.5, 1.5), seed=seed)
-        places = {"points_mm": [(3.0, 3.0), (75.0, 3.0), (35.0, 36.0)], "camera": {"pitch_mm": 3.5}}
-        errors += errors_mm(bench, await measured(bench, method="camera", touches=8, **places))
+        places = [(2.0, 2.0), (76.0, 2.0), (39.0, 31.0)]
+        errors += errors_mm(bench, await measured(bench, method="camera", touches=8, points_mm=places))
     assert len(errors) == 24 * sheets
     assert abs(float(np.mean(errors))) + 3.0 * float(np.std(errors)) < 0.15
     assert abs(float(np.mean(errors))) < 0.03
@@ -125,29 +122,22 @@ async def test_a_bump_under_the_sheet_is_refused(make_bench: MakeBench) -> None:
     assert bench.lifted
 
 
-async def test_an_arm_that_was_stopped_is_left_where_it_is(make_bench: MakeBench) -> None:
-    bench = make_bench()
-
-    async def stopped(_samples: int, _axis: tuple[float, float, float], _after_ns: int) -> tuple[float, float, int]:
-        raise asyncio.CancelledError
-
-    bench.tap.average = stopped  # pyright: ignore[reportAttributeAccessIssue]
-    with pytest.raises(asyncio.CancelledError):
-        await measured(bench, method="force")
-    assert not bench.lifted
-
-
-async def test_an_arm_that_failed_is_left_where_it_is(make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "error", [asyncio.CancelledError(), MotionFailed("robot", "moveLine", "rests 0.40 mm and 0.00 deg from the target")]
+)
+async def test_an_arm_that_was_stopped_or_failed_is_left_where_it_is(
+    make_bench: MakeBench, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
     bench = make_bench()
     move = bench.move
 
     async def held_up(target: Pose, *, speed_mm_s: float, acc_mm_s2: float) -> None:
         await move(target, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2)
         if target.z_mm < 121.0:
-            raise MotionFailed("robot", "moveLine", "rests 0.40 mm and 0.00 deg from the target")
+            raise error
 
     monkeypatch.setattr(bench, "move", held_up)
-    with pytest.raises(MotionFailed):
+    with pytest.raises(type(error)):
         await measured(bench, method="force")
     assert not bench.lifted
 
@@ -209,7 +199,7 @@ async def test_a_jog_ends_at_the_travel_limit_and_says_so(make_bench: MakeBench)
 async def test_a_jog_that_nobody_watches_asks_for_an_operator(make_bench: MakeBench) -> None:
     bench = make_bench()
     config = TouchConfig(method="jog")
-    nobody = asked(Asker(watched=False), config.jog)
+    nobody = asked(Asker(watched=False))
     with pytest.raises(NeedsOperator, match="Jog until the tip just touches"):
         await measure_plane(bench.effector, config, next_jog=nobody)
     assert bench.lifted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,14 +18,13 @@ from numpy.typing import NDArray
 from brushloop.collect.errors import StepError
 from brushloop.collect.rig.config import PaperConfig
 from brushloop.collect.rig.config_touch import SelfCheckConfig
-from brushloop.collect.rig.paper import Sheet, to_base
+from brushloop.collect.rig.paper import Patch, Sheet, to_base
 from brushloop.collect.touch.selfcheck import (
     Triangle,
     judge,
     partners,
     self_check,
     triangle_in,
-    triangle_of,
     triangle_on,
 )
 from brushloop.drivers.devices import Pose
@@ -123,12 +123,10 @@ def in_paper(bench: Bench, change: Any) -> Any:
     ("change", "why"),
     [
         (lambda x, y: (110.0 - x, y), "mirrored in x"),
-        (lambda x, y: (x, 80.0 - y), "mirrored in y"),
         (lambda x, y: (y + 10.0, x - 20.0 if x > 50.0 else x), "3 marks|swapped|mirrored"),
-        (lambda x, y: (1.02 * x, 1.02 * y), r"lengths are off by \+(1\.[5-9]|2\.\d).* along x"),
         (lambda x, y: (x + 3.0, y - 4.0), "the marks lie off by"),
     ],
-    ids=["mirrored x", "mirrored y", "folded", "2 % too large", "displaced"],
+    ids=["mirrored x", "folded", "displaced"],
 )
 async def test_an_arm_that_goes_elsewhere_is_refused(make_bench: MakeBench, change: Any, why: str) -> None:
     bench = make_bench()
@@ -158,6 +156,10 @@ async def test_an_even_triangle_is_refused_before_anything_moves(make_bench: Mak
     assert bench.target == at
 
 
+def triangle(patches: Sequence[Patch]) -> Triangle:
+    return triangle_on(patches, CONFIG)
+
+
 def paper(size_x_mm: float, size_y_mm: float) -> PaperConfig:
     return PaperConfig(origin_mm=(0.0, 0.0), touch_z_mm=120.0, size_mm=(size_x_mm, size_y_mm))
 
@@ -167,13 +169,13 @@ def test_a_sheet_with_room_is_checked_over_three_corners_and_a_small_one_in_one_
     first = sheet.patch(0)
     wide = partners(sheet, first, {0})
     assert [patch.index for patch in wide] == [5, 36]
-    assert triangle_on((first, *wide), CONFIG) == triangle_of((first, *wide))
+    assert triangle((first, *wide)) == tuple(patch.anchor_mm for patch in (first, *wide))
     again = partners(sheet, sheet.patch(1), {0, 1, 5, 36})
     assert [patch.index for patch in again] == [4, 37], "a second attempt finds places of its own"
     assert partners(sheet, first, set(range(sheet.capacity)) - {1, 6}) == (), "what is left is too near"
     small = Sheet(paper(110.0, 80.0))
     assert partners(small, small.patch(0), set()) == ()
-    assert triangle_on((small.patch(0),), CONFIG) == triangle_in(small.patch(0), CONFIG)
+    assert triangle((small.patch(0),)) == triangle_in(small.patch(0), CONFIG)
 
 
 @given(width=st.floats(40.0, 600.0), height=st.floats(24.0, 600.0), used=st.sets(st.integers(0, 60)))
@@ -182,7 +184,7 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_cells(width: float, h
     patch = sheet.patch(0)
     if wide := partners(sheet, patch, used):
         assert not used & {one.index for one in wide}
-        places = np.array(triangle_of((patch, *wide)))
+        places = np.array(triangle((patch, *wide)))
         assert np.ptp(places, axis=0).min() >= 60.0
         mirrored = places * np.array([-1.0, 1.0])
         with pytest.raises(StepError, match="mirrored in x"):
@@ -192,7 +194,7 @@ def test_a_wide_triangle_is_always_uneven_wide_and_on_free_cells(width: float, h
 def whole_sheet(make_bench: MakeBench) -> tuple[Bench, Triangle]:
     bench = make_bench(whole=True)
     sheet = Sheet(bench.rig.config.paper)
-    return bench, triangle_of((sheet.patch(0), *partners(sheet, sheet.patch(0), set())))
+    return bench, triangle((sheet.patch(0), *partners(sheet, sheet.patch(0), set())))
 
 
 async def test_a_camera_that_is_2_percent_wrong_is_seen_over_three_corners_but_not_in_one_cell(

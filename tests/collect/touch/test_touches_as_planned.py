@@ -1,4 +1,4 @@
-"""A touch that is measured stays where the plan has checked it, also over the loopback rig's own wires."""
+"""A touch that is measured stays where the plan has checked it."""
 
 from __future__ import annotations
 
@@ -24,16 +24,6 @@ from tests.collect.sent import lowest_mm, not_checked, not_sent
 
 if TYPE_CHECKING:
     from conftest import Bench, MakeBench
-
-
-from brushloop.collect.motion import Procedures
-from brushloop.collect.rig.config import load_rig
-from brushloop.collect.rig.devices import connected
-from brushloop.collect.touch.force import ForceTap
-from brushloop.drivers.host import HostClock
-from brushloop.drivers.sim.config import SimConfig, Table, View
-from brushloop.drivers.sim.rig import LoopbackRig
-from tests.collect.sent import noting
 
 TOUCH, CHECK = ZeroTouchStep(0), SelfCheckStep(0)
 POINTS: dict[str, Any] = {"points_mm": [(4.0, 4.0), (70.0, 4.0), (36.0, 36.0)], "touches": 1}
@@ -115,38 +105,3 @@ def test_a_touch_that_the_operator_asks_for_by_key_is_checked_before_it(make_ben
     check_step(Path("rig.toml"), there, plane, TOUCH)
     with pytest.raises(ConfigError, match=r"y = -10\.000 mm is outside .*zero_touch"):
         check_step(Path("rig.toml"), there, plane, replace(TOUCH, method="jog"))
-
-
-VIEW = View(width_px=512, height_px=384, px_per_mm=1.56, fps=50.0)
-QUICK = {"fast_samples": 12, "medium_samples": 25, "slow_samples": 150, "sigma_mm": 0.03}
-"""For a sensor five times quieter than the rig's: averages take real time, whatever the rate of the simulation."""
-
-
-async def test_a_sheet_that_lies_lower_than_taught_is_found_and_the_brush_is_lifted(tmp_path: Path) -> None:
-    table = replace(Table(), paper_z_mm=119.3, slope_deg=(0.5, -0.5))
-    sim = SimConfig(rate=60.0, table=table, view=VIEW, force_noise_n=0.0004)
-    async with LoopbackRig(sim) as loopback:
-        text = loopback.toml().replace("latency_ms = 250.0", "latency_ms = 60.0")
-        (tmp_path / "rig.toml").write_text(text.replace("touch_z_mm = 119.330", "touch_z_mm = 120.0"), encoding="utf-8")
-        config = load_rig(tmp_path / "rig.toml")
-        async with connected(config, HostClock(), lambda _notice: None) as rig:
-            assert rig.force is not None
-            await rig.robot.enable()
-            sent: list[Pose] = []
-            noting(loopback.world.motion, sent.append)
-            await rig.force.bias(0.5)
-            touch = TouchConfig(method="force", touches=2, force=QUICK)  # pyright: ignore[reportArgumentType]
-            tap = ForceTap()
-            rig.force.listen(tap.take)
-            result = await measure_plane(Procedures(rig), touch, tap=tap)
-            at_mm = (await rig.robot.where()).position_mm
-
-    asked = config.model_copy(update={"touch": touch})
-    planned = moves_of(asked, PaperPlane(config.paper.touch_z_mm), ZeroTouchStep(0))
-    assert len(sent) > 10
-    assert not not_checked(config, sent, planned.segments)
-    [point] = result.points
-    truth_mm = table.surface_z_mm(*config.paper.touch_point_mm)
-    assert [t.z_mm for t in point.touches] == pytest.approx([truth_mm] * 2, abs=0.12)
-    assert all(t.sigma_mm is not None and t.sigma_mm <= 0.03 for t in point.touches)
-    assert at_mm[2] == pytest.approx(config.motion.safe_z_mm, abs=0.01)
