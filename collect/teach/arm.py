@@ -18,7 +18,7 @@ from brushloop.collect.teach.day import Asked, Day, Step, Target
 from brushloop.collect.teach.store import Notebook, touch_of
 from brushloop.drivers.arcs.controller import MOVING_ALLOWED, Controller, six
 from brushloop.drivers.arcs.robot import AUBOPE_PORT
-from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, numbers, open_arcs
+from brushloop.drivers.arcs.wire import DEVICE, Framing, RpcConnection, answers, numbers, open_arcs
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.errors import ConnectionLost, DeviceError, DeviceTimeout, ProtocolViolation, RpcError
 from brushloop.drivers.geometry import distance, from_wire
@@ -209,19 +209,6 @@ async def find_framing(host: str, port: int) -> tuple[Framing, Cabinet]:
             first = first or error
     assert first is not None
     raise first
-
-
-async def answers(host: str, port: int, within_s: float = 5.0) -> bool:
-    """Whether anything listens there."""
-    try:
-        async with asyncio.timeout(within_s):
-            _, writer = await asyncio.open_connection(host, port)
-    except (OSError, TimeoutError):
-        return False
-    writer.close()
-    with contextlib.suppress(OSError):
-        await writer.wait_closed()
-    return True
 
 
 class ArmStep(Step):

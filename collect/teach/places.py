@@ -114,6 +114,8 @@ class PlacesStep(Step):
 
         Raises `CannotTeach` unless the pictures from there show the same.
         """
+        # Going back may have left one of the places: its picture has to be taken with the arm there.
+        day.save(day.notebook.without(*AWAY))
         pictures: list[Thumbnail] = []
         async with taught_camera(day.notebook, day.clock) as camera:
             for kind, how in AWAY.items():

@@ -422,7 +422,7 @@ async def open_arcs(connection: RpcConnection, aubope_port: int) -> None:
     try:
         await connection.open()
     except (ConnectionLost, DeviceTimeout):
-        if await _answers(connection.host, aubope_port):
+        if await answers(connection.host, aubope_port):
             raise WrongGeneration(
                 DEVICE,
                 "connect",
@@ -432,7 +432,8 @@ async def open_arcs(connection: RpcConnection, aubope_port: int) -> None:
         raise
 
 
-async def _answers(host: str, port: int) -> bool:
+async def answers(host: str, port: int) -> bool:
+    """Whether anything listens there."""
     probe = RpcConnection(host, port)
     try:
         await probe.open()

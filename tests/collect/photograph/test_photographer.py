@@ -1,16 +1,100 @@
-"""A photograph is fresh because the camera has shown the arm over the sheet, and then gone."""
+"""A photograph is fresh because the camera has shown the arm over the sheet, and then gone. How late a camera is."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from brushloop.collect.errors import ArmInPicture, CameraLate
-from brushloop.collect.photograph.photographer import CameraDelay, Look
-from brushloop.drivers.devices import Frame
-from tests.collect.photograph.theatre import OUT_MM, OVER_MM, PERIOD_S, Theatre
+from brushloop.collect.photograph.frames import FrameChange
+from brushloop.collect.photograph.photographer import ArmPlace, ArmTrips, CameraDelay, Look, Photographer, look
+from brushloop.collect.rig.config import CameraConfig
+from brushloop.drivers.devices import Frame, Pose, PoseSample, Stamp
+from brushloop.drivers.host import Clock
+from tests.simulated_time import LoopClock
+
+PERIOD_S, TRIP_S = 0.02, 0.06
+PARK_MM, OVER_MM = (0.0, 0.0, 100.0), (200.0, 0.0, 100.0)
+OUT_MM, IN_MM = 60.0, 120.0
+"""From here to there on its way the arm comes into the picture."""
+
+
+@dataclass
+class Theatre:
+    """`Robot` and `Camera` as far as a photographer needs them; every delay is in seconds of the loop's time."""
+
+    delay: Callable[[float], float]
+    """By the time of exposure, in s since the start."""
+    clock: Clock = field(default_factory=LoopClock)
+    intruder: bool = False
+    """A hand in the picture."""
+    ink: int = 0
+    """Strokes on the sheet."""
+
+    def __post_init__(self) -> None:
+        self.start_s = self._now_s()
+        self._legs: list[tuple[float, float, float]] = [(self.start_s, 0.0, 0.0)]
+        self._shown = 0
+        self.exposures_s: dict[int, float] = {}
+        """By the sequence of the frame, since the start: the truth."""
+
+    def photographer(self, **limits: float) -> Photographer:
+        config = CameraConfig.model_validate({"kind": "opencv", "source": "0", **limits})
+        trips = ArmTrips(OVER_MM, PARK_MM, lambda: self.go(1.0), lambda: self.go(0.0), self._is_over)
+        return Photographer(self, self, config, self.clock, trips)  # pyright: ignore[reportArgumentType]
+
+    def way(self, t_s: float) -> float:
+        """Where the arm was: 0 parked, 1 over the sheet."""
+        began_s, start, end = next(leg for leg in reversed(self._legs) if leg[0] <= t_s or leg is self._legs[0])
+        return start + (end - start) * min(max((t_s - began_s) / TRIP_S, 0.0), 1.0)
+
+    def latest(self) -> PoseSample:
+        now_ns = self.clock.now_ns()
+        x_mm = OVER_MM[0] * self.way(now_ns / 1e9)
+        return PoseSample(Stamp(now_ns), Pose(x_mm, 0.0, 100.0, 1.0, 0.0, 0.0, 0.0))
+
+    async def fresh(self, after: Stamp) -> Frame:
+        while True:
+            exposed_s = self.start_s + self._shown * PERIOD_S
+            arrival_s = exposed_s + self.delay(exposed_s - self.start_s)
+            if arrival_s > self._now_s():
+                await asyncio.sleep(arrival_s - self._now_s())
+                continue
+            self._shown += 1
+            if arrival_s * 1e9 >= after.host_ns:
+                self.exposures_s[self._shown] = exposed_s - self.start_s
+                stamp = Stamp(round(arrival_s * 1e9), None, self._shown)
+                return Frame(stamp, stamp.host_ns, self._draw(exposed_s))
+
+    async def go(self, way: float) -> None:
+        now_s = self._now_s()
+        self._legs.append((now_s, self.way(now_s), way))
+        await asyncio.sleep(TRIP_S + 0.01)
+
+    async def _is_over(self) -> bool:
+        return self.way(self._now_s()) > 0.5
+
+    def _draw(self, t_s: float) -> np.ndarray:
+        image = np.full((120, 160), 230, np.uint8)
+        x_mm = OVER_MM[0] * self.way(t_s)
+        if x_mm > OUT_MM:
+            shown = min((x_mm - OUT_MM) / (IN_MM - OUT_MM), 1.0)
+            cv2.circle(image, (80, round(120 + 30 - 90 * shown)), 30, (70,), -1)
+        if self.intruder:
+            cv2.rectangle(image, (10, 10), (50, 50), (40,), -1)
+        for number in range(self.ink):
+            image[5 + 12 * (number // 8) :][:2, 5 + 18 * (number % 8) :][:, :6] = 15
+        return image
+
+    def _now_s(self) -> float:
+        return self.clock.now_ns() / 1e9
 
 
 def age_s(theatre: Theatre, frame: Frame, since_s: float) -> float:
@@ -167,3 +251,102 @@ async def test_a_few_stalls_do_not_keep_an_exact_delay_from_being_measured():
     await photographer.photograph()
     assert photographer.delay is not None
     assert photographer.delay.delay_s == pytest.approx(0.3, rel=0.1)
+
+
+# The delay by one trip, from when the camera saw the arm and when it was where
+
+
+ENTERS = 0.4
+"""The share of its way at which the arm comes into the picture; nothing below knows it."""
+
+
+def way(t_s: float, trip_s: float, stay_s: float) -> float:
+    """Parked for a second, there, a stay, and back."""
+    begins_s, ends_s = 1.0, 1.0 + trip_s + stay_s
+    return min(max((t_s - begins_s) / trip_s, 0.0), 1.0) - min(max((t_s - ends_s) / trip_s, 0.0), 1.0)
+
+
+def trip(
+    delay_s: float, *, period_s: float, phase: float, trip_s: float, stay_s: float
+) -> tuple[list[FrameChange], list[ArmPlace]]:
+    end_s = 2.0 + 2.0 * trip_s + stay_s
+    exposed = np.arange(phase * period_s, end_s, period_s)
+    trips = [way(t, trip_s, stay_s) for t in exposed]
+    seen = [
+        FrameChange(float(t) + delay_s, 0.15 * min(max((w - ENTERS) / 0.3, 0.0), 1.0))
+        for t, w in zip(exposed, trips, strict=True)
+    ]
+    return seen, [ArmPlace(float(t), way(float(t), trip_s, stay_s)) for t in np.arange(0.0, end_s, 0.01)]
+
+
+@given(
+    delay_s=st.floats(0.0, 2.5),
+    period_s=st.floats(0.02, 0.125),
+    phase=st.floats(0.0, 1.0),
+    trip_s=st.floats(0.05, 2.0),
+    stay_s=st.floats(0.3, 1.0),
+)
+def test_the_delay_is_found_within_its_resolution(
+    delay_s: float, period_s: float, phase: float, trip_s: float, stay_s: float
+):
+    found = look(*trip(delay_s, period_s=period_s, phase=phase, trip_s=trip_s, stay_s=stay_s))
+    assert found is not None
+    assert found.resolution_s <= period_s
+    assert found.delay_s == pytest.approx(delay_s, abs=found.resolution_s + 0.03)
+
+
+def test_a_slow_arm_is_seen_on_its_way_and_gives_the_delay_far_better_than_the_frames_come():
+    seen, placed = trip(0.1, period_s=0.125, phase=0.3, trip_s=2.0, stay_s=0.5)
+    found = look(seen, placed)
+    assert found is not None
+    assert found.delay_s == pytest.approx(0.1, abs=0.02)
+    assert found.resolution_s < 0.03
+
+
+@pytest.mark.parametrize(
+    ("stay_s", "seen_s", "shown"),
+    [
+        (0.3, 0.9, lambda frame: frame),
+        (0.3, 0.3, lambda frame: FrameChange(frame.arrival_s, 0.0)),
+        (3.0, 3.0, lambda frame: None if 1.5 < frame.arrival_s < 3.0 else frame),
+    ],
+    ids=["another trip was seen for longer", "the picture does not change", "a long silence"],
+)
+def test_pictures_that_do_not_show_the_trip_give_no_delay(
+    stay_s: float, seen_s: float, shown: Callable[[FrameChange], FrameChange | None]
+) -> None:
+    seen, placed = trip(0.1, period_s=0.05, phase=0.0, trip_s=0.1, stay_s=stay_s)
+    assert look(seen, placed) is not None
+    seen, _ = trip(0.1, period_s=0.05, phase=0.0, trip_s=0.1, stay_s=seen_s)
+    assert look([frame for frame in map(shown, seen) if frame is not None], placed) is None
+
+
+def test_several_looks_are_reported_with_their_spread():
+    delay = CameraDelay((Look(0.20, 0.02), Look(0.26, 0.04)))
+    assert delay.delay_s == pytest.approx(0.23)
+    assert delay.spread_s == pytest.approx(0.06)
+    assert delay.bound_s == pytest.approx(0.30)
+    assert str(delay) == "230 ± 21 ms (from 2 trips, which differ by 60 ms)"
+
+
+def test_a_trip_in_which_the_computer_stalled_does_not_make_the_camera_later() -> None:
+    delay = CameraDelay((Look(0.41, 0.03), Look(0.65, 0.03), Look(0.42, 0.03), Look(0.40, 0.03)))
+    assert delay.delay_s == pytest.approx(0.41)
+    assert delay.spread_s == pytest.approx(0.25), "it still counts as unsteady"
+    assert delay.bound_s == pytest.approx(0.68), "and a photograph waits for the longest"
+    assert CameraDelay((Look(0.40, 0.03), Look(0.65, 0.03))).delay_s == pytest.approx(0.525), "either may have stalled"
+
+
+@pytest.mark.parametrize(
+    ("delays_s", "exact"),
+    [
+        ((0.53, 0.54, 0.53, 0.53), True),
+        ((0.53, 0.54, 0.79, 0.53, 0.53), True),
+        ((0.66, 0.67), False),
+        ((0.43, 0.42, 0.44), False),
+        ((0.54, 0.56, 1.07, 0.55, 0.97, 0.55), False),
+        ((0.30, 0.38, 0.34, 0.27), False),
+    ],
+)
+def test_a_delay_is_exact_if_most_of_four_or_more_trips_agree(delays_s: tuple[float, ...], exact: bool) -> None:
+    assert CameraDelay(tuple(Look(delay_s, 0.03) for delay_s in delays_s)).exact is exact
