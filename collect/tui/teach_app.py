@@ -166,6 +166,8 @@ class Teaching:
 class TeachScreen(Screen[None], inherit_bindings=False):
     """Shows what the guide holds; its keys answer the question."""
 
+    AUTO_FOCUS = ""
+    """The hidden field would take the first key, if the screen came to the front after the first question."""
     HELP = f"""
 Everything taught is kept; the same command resumes. Escape takes the answer or touch before the question back.
 Page up and down turn the pages of what was found.
