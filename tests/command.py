@@ -12,10 +12,10 @@ from unittest import mock
 from brushloop.__main__ import main
 
 
-def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """What the command printed, and its exit code, as if it had been a process in the folder `cwd`."""
+def brushloop(*words: str | Path, cwd: Path | None = None, encoding: str = "utf-8") -> subprocess.CompletedProcess[str]:
+    """What the command printed in this encoding, and its exit code, as if it had been a process in the folder `cwd`."""
     arguments = ["brushloop", *map(str, words)]
-    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding, write_through=True) for _ in range(2))
     code = 0
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "argv", arguments))
@@ -27,5 +27,5 @@ def brushloop(*words: str | Path, cwd: Path | None = None) -> subprocess.Complet
             main()
         except SystemExit as ended:
             code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
-    printed = [stream.buffer.getvalue().decode() for stream in (out, err)]  # pyright: ignore[reportAttributeAccessIssue]
+    printed = [stream.buffer.getvalue().decode(encoding) for stream in (out, err)]  # pyright: ignore[reportAttributeAccessIssue]
     return subprocess.CompletedProcess(arguments, code, *printed)

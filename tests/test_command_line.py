@@ -135,12 +135,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("encoding", "shown"), [("ascii", "\\u7f8a\\u6beb \\xe9"), ("latin-1", "\\u7f8a\\u6beb é")])
 def test_what_a_terminal_cannot_show_is_escaped(folder: Path, encoding: str, shown: str) -> None:
-    environment = os.environ | {"PYTHONIOENCODING": encoding}
-    ran = subprocess.run(
-        [*PROCESS, "sessions", "show", "s"], cwd=folder, env=environment, capture_output=True, check=False
-    )
-    assert (ran.returncode, ran.stderr) == (0, b"")
-    assert shown in ran.stdout.decode(encoding)
+    ran = brushloop("sessions", "show", "s", cwd=folder, encoding=encoding)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert shown in ran.stdout
 
 
 def test_a_reader_that_has_ended_ends_the_command_quietly(folder: Path) -> None:

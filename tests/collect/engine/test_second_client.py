@@ -102,8 +102,7 @@ def test_an_arm_that_was_moved_at_a_question_first_goes_up_along_its_tool(lab: L
     (lab.folder / "rig.toml").write_text(text + '\n[touch]\nmethod = "jog"\ntouches = 1\n')
     engine = lab.engine(watched=True)
     engine.start()
-    jog = question(engine)
-    assert "Jog until" in jog.question
+    jog = question(engine, "Jog until")
     second_client(lab, engine, UNDER)
     sent = lines_sent(lab)
     engine.answer(jog.number, "3")
@@ -128,8 +127,7 @@ def test_an_arm_that_somebody_still_moves_is_asked_about_and_left_alone(lab: Lab
     second_client(lab, engine, MotionControl_moveLine=slowly)
     sent = lines_sent(lab)
     engine.resume()
-    prompt = question(engine)
-    assert "the arm is moving, and not from here" in prompt.question
+    prompt = question(engine, "the arm is moving, and not from here")
     assert not sent
     assert lab.rig.world.tool().z_mm > here.z_mm, "it is not stopped either"
     engine.answer(prompt.number, "g")
@@ -143,8 +141,7 @@ def test_an_arm_that_was_switched_off_in_a_pause_is_asked_about_and_powered_agai
     second_client(lab, engine, RobotManage_poweroff={})
     sent = lines_sent(lab)
     engine.resume()
-    prompt = question(engine)
-    assert "robot mode is not Running" in prompt.question
+    prompt = question(engine, "robot mode is not Running")
     assert not sent
     engine.answer(prompt.number, "g")
     wait_for_end(engine)
@@ -167,8 +164,7 @@ def test_an_arm_that_was_left_outside_its_limits_is_not_moved_until_it_is_jogged
     second_client(lab, engine, brush_pose(480.0, 40.0, 250.0, tilt_deg=60.0))
     sent = lines_sent(lab)
     engine.resume()
-    prompt = question(engine)
-    assert "the arm stands where tilt = 60.000 deg" in prompt.question
+    prompt = question(engine, "the arm stands where tilt = 60.000 deg")
     assert "Jog the arm up" in prompt.question
     assert not sent
     second_client(lab, engine, UNDER)
@@ -208,17 +204,15 @@ def test_a_tool_offset_that_changes_after_the_last_look_leaves_a_void_and_no_str
         return move_line(params)
 
     methods["rob1.MotionControl.moveLine"] = tampered
-    engine = lab.engine()
-    engine.start()
     with pytest.raises((SettingsChanged, MotionFailed)):
-        wait_for_end(engine)
+        lab.run()
     folder = lab.session
     lines = list(read_lines(folder / "journal.jsonl"))
     pressed = {line["key"] for line in lines if line["event"] == "begin" and line["kind"] == "press"}
     assert pressed
     assert not [line for line in lines if line["event"] == "done" and line["key"] in pressed]
     assert [line for line in lines if line["event"] == "void" and line["key"] in pressed]
-    assert engine.snapshot().strokes_done == 0
+    assert lab.engines[-1].snapshot().strokes_done == 0
 
 
 def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
@@ -226,8 +220,7 @@ def test_whoever_watches_has_the_tool_set_anew_and_goes_on(lab: Lab) -> None:
     start_and_pause(engine)
     second_client(lab, engine, **SHORTER)
     engine.resume()
-    prompt = question(engine)
-    assert "tool offset is (0, 0, 170) mm" in prompt.question
+    prompt = question(engine, "tool offset is (0, 0, 170) mm")
     assert prompt.default == "x"
     engine.answer(prompt.number, "g")
     wait_for_end(engine)

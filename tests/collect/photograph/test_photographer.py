@@ -232,7 +232,7 @@ def stalling(seed: int, share: float) -> Callable[[float], float]:
 
 async def test_beside_a_busy_computer_an_exact_delay_is_right_or_refused():
     found: list[float] = []
-    for seed in range(6):
+    for seed in range(3):
         photographer = Theatre(stalling(seed, 0.6)).photographer(
             max_jitter_ms=2000, max_delay_ms=3000, exact_delay=True
         )
@@ -243,7 +243,7 @@ async def test_beside_a_busy_computer_an_exact_delay_is_right_or_refused():
         assert photographer.delay is not None
         found.append(photographer.delay.delay_s)
     assert all(abs(delay_s - 0.3) <= 0.2 * 0.3 for delay_s in found), found
-    assert len(found) < 6
+    assert len(found) < 3
 
 
 async def test_a_few_stalls_do_not_keep_an_exact_delay_from_being_measured():
