@@ -46,14 +46,16 @@ def again_steps_done(out: Path) -> int:
 def test_killed_in_mid_collection_the_same_command_ends_with_every_stroke_exactly_once(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     command = [sys.executable, "-c", SMALL, str(out)]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    # however late a busy machine draws and takes pictures
+    late = os.environ | {"BRUSHLOOP_CAMERA__MAX_DELAY_MS": "10000", "BRUSHLOOP_CAMERA__MAX_JITTER_MS": "10000"}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": late}
     with subprocess.Popen(command, start_new_session=True, **quiet) as first:
         try:
             wait_until(lambda: again_steps_done(out) >= PRESSED, f"{PRESSED} steps", process=first, timeout_s=500.0)
         finally:
             os.killpg(first.pid, signal.SIGKILL)
 
-    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, env=late)
     assert ran.returncode == 0, ran.stderr
 
     session, again = sorted((out / "sessions").iterdir())
