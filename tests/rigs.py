@@ -179,6 +179,8 @@ def wired_lab(folder: Path, config: SimConfig = COARSE) -> Iterator[Lab]:
     """A coarse lab on sockets, whose processes end with the block."""
     with serving(config) as rig:
         lab = coarse(Lab(rig, folder))
+        for limit in ("max_delay_ms = 3000.0", "max_jitter_ms = 2000.0"):
+            lab.edit_rig(limit, f"{limit.partition(' ')[0]} = 10000.0")  # of a busy machine
         yield lab
         for process in lab.processes:
             process.kill()

@@ -64,7 +64,7 @@ def wired_lab(tmp_path: Path) -> Iterator[Lab]:
 
 @dataclass
 class Collected:
-    """A session of four strokes over sockets, from its beginning to its end."""
+    """A session of four strokes, from its beginning to its end."""
 
     lab: Lab
     """Its rig has ended; the world remembers what was pressed."""
@@ -78,6 +78,6 @@ class Collected:
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Collected:
     """For whoever only looks at what a run leaves; nobody writes into it."""
-    with rigs.wired_lab(tmp_path_factory.mktemp("collected")) as lab:
-        lab.write_protocol(tilts="[0.0, 10.0]")
+    with rigs.wireless_lab(tmp_path_factory.mktemp("collected"), COARSE) as lab:
+        rigs.coarse(lab).write_protocol(tilts="[0.0, 10.0]")
         return Collected(lab, lab.run())
