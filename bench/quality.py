@@ -387,7 +387,7 @@ def score(samples: Iterable[Sample | Blank], limits: QualityConfig, *, with_prev
             sheet_mm=sample.sheet_mm,
         )
         scores.seconds.append(time.perf_counter() - began)
-        scores.counts[sample.label, verdict.cause.name if verdict.cause else None] += 1
+        scores.counts[sample.label, Failure(verdict.cause.name) if verdict.cause else None] += 1
     return scores
 
 

@@ -103,7 +103,7 @@ class BusyEngine:
             force_n=trace_n[-1] if trace_n else 0.0,
             target_mm=(410.0, -45.0, 130.0),
             trace_n=trace_n,
-            picture=Picture(picture, self._frames[picture % 5], 0.9),
+            picture=Picture(self._frames[picture % 5], 0.9),
         )
 
     def stop(self) -> None:

@@ -141,7 +141,7 @@ def plan(
         poses = all_poses(rig, wanted, PaperPlane(rig.paper.touch_z_mm), every_patch=True)
         asked = asyncio.run(ask_reach(config, rig, poses))
     if picture is not None:
-        from brushloop.collect.planning.picture import draw_plan
+        from brushloop.collect.planning.summary import draw_plan
 
         draw_plan(rig, wanted, made, picture)
     if as_json:

@@ -1,20 +1,4 @@
-"""Errors of a collection.
-
-ConfigError            a user's file or option cannot be used: file, field, allowed range
-StepError              a step failed in a defined way; says what state it leaves and what must come next
- +-- StepVoid          the press was cut short: its paper patch stays used, press again on a new one
- +-- BadPicture        the photograph cannot be used: take it again
- |    +-- ArmInPicture something hides the sheet: the photograph says nothing about ink
- +-- ForceTooHigh      the press met more force than allowed: the arm was stopped where it was
- +-- NeedsOperator     a person must act first
- |    +-- CameraLate   the camera's delay is too long, not steady, or cannot be measured
- |    +-- PosesLate    the controller's poses come too late
- +-- JogGivenUp        the operator did not find the paper by jog: its known height stays
- +-- SheetFull         no free patch is left on the sheet
-CannotTeach            what was taught on the first day contradicts itself or cannot be used
-CollectAborted         the session stopped before its protocol was finished; it can be resumed
- +-- Parked            ended between two steps on request, with the arm parked
-"""
+"""Errors of a collection: each says what state it leaves and what must come next, and has the exit code of its run."""
 
 from __future__ import annotations
 
@@ -67,7 +51,6 @@ class ArmInPicture(BadPicture):
     """Something that should not be in the picture stays there. Leaves the arm parked and the stroke as it is."""
 
     def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
         super().__init__(
             f"something moves or stays in the picture {seconds:g} s after the arm parked: the arm, a hand or a shadow, "
             "or camera or sheet were moved. Clear the view; the arm must be out of it at motion.park_mm."
@@ -78,8 +61,6 @@ class ForceTooHigh(StepError):
     """The brush met something hard. Leaves the arm stopped, perhaps with the brush down; a person must look first."""
 
     def __init__(self, force_n: float, limit_n: float) -> None:
-        self.force_n = force_n
-        self.limit_n = limit_n
         super().__init__(
             f"the force reached {force_n:.2f} N, the ceiling is {limit_n:g} N: a stop was sent to the arm. "
             "Look at what is under the brush before going on."
@@ -102,7 +83,6 @@ class PosesLate(NeedsOperator):
 
     def __init__(self, lag_ms: float, limit_ms: float) -> None:
         self.lag_ms = lag_ms
-        self.limit_ms = limit_ms
         super().__init__(
             f"poses of the arm arrive {lag_ms:.0f} ms late; robot.max_pose_lag_ms = {limit_ms:g}. If only pushed poses "
             "are late, leave robot.rtde_port out of rig.toml: they are then asked for. If not, look at the network."
@@ -121,8 +101,6 @@ class SheetFull(StepError):
     """No free patch is left. Leaves the arm parked; a fresh sheet must be put in before the next press."""
 
     def __init__(self, capacity: int, sheet: int) -> None:
-        self.capacity = capacity
-        self.sheet = sheet
         super().__init__(
             f"all {capacity} patches of sheet {sheet} are used. "
             f"Put a fresh sheet in, then run the same command with --sheet {sheet + 1}."

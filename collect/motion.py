@@ -21,25 +21,17 @@ CLEARANCE_MM = 8.0
 """Height above the paper at which the fast approach ends."""
 DWELL_MM = 0.05
 """Length of the slow end of the descent that serves as the dwell: ARCS's queue can only wait by moving."""
+BLEND_MM = 1.0
+"""Distance from a drawn point at which the tip may turn towards the next, so that the arm does not halt there. ARCS
+accepts no less."""
 CHECK_APPROACH_MM = 4.0
 """Height above the paper at which the slow approach of a self-check's mark begins."""
 CHECK_SPEED_MM_S = 5.0
 """Speed of that approach."""
 
 
-@dataclass(frozen=True, slots=True)
-class Move:
-    """A straight line to a target, and how fast to go there."""
-
-    target: Pose
-    speed_mm_s: float
-    least_s: float = 0.0
-    """Minimum duration."""
-
-    @property
-    def poses(self) -> tuple[Pose]:
-        """The target."""
-        return (self.target,)
+Move = QueuedLine
+"""A straight line to a target, and how fast to go there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +65,12 @@ class Region:
 Segment = Move | Path | Region
 Dip = Callable[[], Awaitable[None]]
 """Fills the brush; begins and ends at travel height."""
+Hold = Callable[[], Awaitable[None]]
+"""Waits over the place where a stroke begins."""
+
+
+async def at_once() -> None:
+    """Do not wait."""
 
 
 # Travel and photographs
@@ -226,12 +224,6 @@ def up(config: RigConfig, x_mm: float, y_mm: float) -> Move:
     return Move(upright(config, x_mm, y_mm, config.motion.safe_z_mm), config.motion.press_speed_mm_s)
 
 
-def lift_moves(config: RigConfig, here: Pose) -> list[Move]:
-    """Straight up to travel height from wherever the tip is; no move if it is there already."""
-    high = Pose(here.x_mm, here.y_mm, config.motion.safe_z_mm, *here.quaternion)
-    return [Move(high, config.motion.press_speed_mm_s)] if here.z_mm < config.motion.safe_z_mm else []
-
-
 def visit_moves(config: RigConfig, plane: PaperPlane, x_mm: float, y_mm: float) -> list[Move]:
     """Over a point of the sheet, down to clearance, slowly to the expected surface, and up."""
     motion, paper = config.motion, config.paper
@@ -316,8 +308,7 @@ class Procedures:
         Returns the poses that were seen meanwhile.
         """
         self.target_mm = min((move.target.position_mm for move in moves), key=lambda at: at[2], default=None)
-        lines = [QueuedLine(move.target, move.speed_mm_s, move.least_s) for move in moves]
-        return await self.rig.robot.sequence(lines, acc_mm_s2=self._config.motion.acc_mm_s2)
+        return await self.rig.robot.sequence(moves, acc_mm_s2=self._config.motion.acc_mm_s2)
 
     async def retreat(self) -> None:
         """Lift along the tool axis to safe height, then park. A killed process may have left the brush down."""
@@ -357,7 +348,9 @@ class Procedures:
 
     async def lift(self) -> None:
         """Go straight up to travel height from wherever the tip is."""
-        await self.go(*lift_moves(self._config, await self.rig.robot.where()))
+        here, motion = await self.rig.robot.where(), self._config.motion
+        if here.z_mm < motion.safe_z_mm:
+            await self.go(Move(Pose(here.x_mm, here.y_mm, motion.safe_z_mm, *here.quaternion), motion.press_speed_mm_s))
 
     @contextlib.asynccontextmanager
     async def lifted_after(self) -> AsyncGenerator[None]:
@@ -386,9 +379,14 @@ class Procedures:
         await self.go(*moves)
         self._dips += 1
 
-    async def press(self, patch: Patch, condition: Condition, dwell_s: float) -> float:
-        """Press once; returns the depth reached below the paper along its normal, in mm."""
-        before, pressing = press_moves(self._config, self.plane, patch, condition, dwell_s)
+    async def press(self, patch: Patch, condition: Condition, dwell_s: float, hold: Hold = at_once) -> float:
+        """Press once; returns the depth reached below the paper along its normal, in mm.
+
+        `hold` is awaited over the patch, at travel height.
+        """
+        (first, *before), pressing = press_moves(self._config, self.plane, patch, condition, dwell_s)
+        await self.go(first)
+        await hold()
         await self.go(*before)
         seen = await self.queue(pressing)
         reached_mm = max((-self.plane.above_mm(self._config.paper, pose) for pose in seen), default=0.0)
@@ -396,20 +394,23 @@ class Procedures:
             raise StepVoid(f"the depth was {reached_mm:.3f} mm, {condition.depth_mm:g} mm was commanded")
         return reached_mm
 
-    async def stroke(self, patch: Patch, drawn: Drawn, number: int) -> float:
+    async def stroke(self, patch: Patch, drawn: Drawn, number: int, hold: Hold = at_once) -> float:
         """Draw stroke `number`, from 0, of a figure whose poses were checked; begins and ends at safe height.
 
-        Returns the depth at which the brush landed, in mm.
+        `hold` is awaited over the first point. Returns the depth at which the brush landed, in mm.
         """
         robot, acc_mm_s2, depth_mm = self.rig.robot, self._config.motion.acc_mm_s2, 0.0
-        for segment in stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s):
+        moves = stroke_moves(self._config, self.plane, patch, drawn.strokes[number], drawn.speed_mm_s)
+        for place, segment in enumerate(moves):
+            if place == 1:
+                await hold()
             if isinstance(segment, Move):
                 await self.go(segment)
             else:
                 depth_mm = -self.plane.above_mm(self._config.paper, await robot.where())
                 poses, speed_mm_s = segment.poses, segment.speed_mm_s
                 self.target_mm = poses[-1].position_mm
-                await robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=drawn.blend_mm)
+                await robot.follow(poses, speed_mm_s=speed_mm_s, acc_mm_s2=acc_mm_s2, blend_mm=BLEND_MM)
         return depth_mm
 
     async def capture(self) -> Frame:

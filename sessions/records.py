@@ -123,9 +123,10 @@ class Check(Event):
     score: float | None = None
     """Measured value; None if it could not be measured."""
     threshold: float | None = None
+    unit: str = ""
     passed: bool
     reason: str = ""
-    """Why the check failed, for the operator; empty if it passed."""
+    """Why the check failed and what to do about it; empty if it passed."""
 
 
 class Quality(Event):

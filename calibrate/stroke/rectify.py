@@ -17,16 +17,18 @@ KNOTS = 8
 """Pixels between computed points of the distortion map; it changes slowly and is interpolated in between."""
 
 
-def rectify(image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float]) -> Gray:
-    """Rectify the window (x, y, width, height in the paper frame) to 20 px/mm, row 0 at its far edge (largest y).
+def rectify(
+    image: Gray, image_to_paper: Floats, window_mm: tuple[float, float, float, float], px_per_mm: float = PX_PER_MM
+) -> Gray:
+    """Rectify the window (x, y, width, height in the paper frame), row 0 at its far edge (largest y).
 
     `image_to_paper` has pixel centres on integers, as cv2 does; the result's pixel (i, j) covers [j, j+1) x [i, i+1).
     """
     x, y, width, height = window_mm
-    step = 1.0 / PX_PER_MM
+    step = 1.0 / px_per_mm
     raster_to_paper = np.array([[step, 0.0, x + 0.5 * step], [0.0, -step, y + height - 0.5 * step], [0.0, 0.0, 1.0]])
     raster_to_image = np.linalg.inv(image_to_paper) @ raster_to_paper
-    size = (round(width * PX_PER_MM), round(height * PX_PER_MM))
+    size = (round(width * px_per_mm), round(height * px_per_mm))
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image, raster_to_image, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return cast("Gray", warped)

@@ -145,7 +145,6 @@ def write_plan(plan: Plan, repeats: int, out: Path) -> Path:
         'kind = "write"',
         f"cell_mm = [{plan.cell_mm!r}, {plan.cell_mm!r}]",
         f"speed_mm_s = {plan.planned_by.speed_mm_s!r}",
-        "blend_mm = 1.0",
         f"repeats = {repeats}",
     ]
     for figure in plan.figures:

@@ -13,17 +13,15 @@ import contextlib
 import math
 import threading
 from collections.abc import Callable, Generator
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 from brushloop.collect.engine.control import FINAL, RunControl, State
-from brushloop.collect.engine.live import LiveView, Telemetry, previewing, watching
+from brushloop.collect.engine.live import LiveView, Telemetry, each_frame
 from brushloop.collect.engine.policy import board_first, resume_question
-from brushloop.collect.engine.progress import Progress
+from brushloop.collect.engine.recorder import uninterrupted
 from brushloop.collect.engine.run import Run
-from brushloop.collect.engine.snapshot import Snapshot
-from brushloop.collect.engine.steps.context import RunContext, uninterrupted
+from brushloop.collect.engine.snapshot import Progress, Snapshot
 from brushloop.collect.errors import (
     NOT_AT_REST,
     CollectAborted,
@@ -34,7 +32,7 @@ from brushloop.collect.errors import (
 )
 from brushloop.collect.motion import Procedures
 from brushloop.collect.operator import Asker, Choice, OperatorRequest, OperatorRequests, Prompt
-from brushloop.collect.planning.walk import layout_of, sheet_of, steps_on
+from brushloop.collect.planning.walk import sheet_of, steps_on
 from brushloop.collect.protocols.config import ProtocolConfig
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.devices import Rig, connected
@@ -92,7 +90,7 @@ class Engine:
         self._protocol_config = protocol
         self._open_store = open_store
         self._resumes = resumes
-        self._progress = Progress(protocol, clock, layout_of(rig, protocol), resumes)
+        self._progress = Progress(protocol, clock, sheet_of(rig, protocol).layout, resumes)
         self._clock = clock
         self._asker = Asker(watched=watched, waiting=self._waiting)
         self._armed = armed
@@ -141,8 +139,8 @@ class Engine:
                 force_n = math.hypot(*rig.force.latest().force_n) if rig.force is not None else None
         if force_n is not None:
             self._telemetry.note_force(force_n, self._clock.now_ns())
-        return replace(
-            self._progress.snapshot(state),
+        return self._progress.snapshot(
+            state=state,
             tip_mm=tip_mm,
             force_n=force_n,
             prompt=self._asker.prompt,
@@ -259,15 +257,16 @@ class Engine:
                 self._progress.log(f"{begun}: {store.folder}" if self.presses else BEGUN_DRY)
                 if (self._armed or not rig.simulated) and self.presses and not self._rig_config.self_check.enabled:
                     self._progress.log(UNCHECKED, warning=True)
-                async with (
-                    watching(self._live, rig.camera, self._progress.log),
-                    previewing(self._telemetry, rig.camera, wanted=self._preview),
-                ):
+                if self._live is not None:
+                    self._progress.log(f"live view: {self._live.url}")
+                shows = ([self._telemetry.frame] if self._preview else []) + ([self._live.frame] if self._live else [])
+                async with each_frame(rig.camera, shows):
                     await self._protocol(rig, store)
                 self._control.begin_closing()
                 self._progress.doing("merge and verify")
                 final = await uninterrupted(store.close)
-                self._progress.closed(f"closed: {final}" if self.presses else OVER_DRY)
+                self._progress.log(f"closed: {final}" if self.presses else OVER_DRY)
+                self._progress.over()
             finally:
                 with contextlib.suppress(DeviceError):
                     self._see_tip(rig)
@@ -307,19 +306,23 @@ class Engine:
 
     async def _protocol(self, rig: Rig, store: SessionStore) -> None:
         self._procedures = Procedures(rig)
-        context = RunContext(
-            rig,
-            store,
-            self._progress,
-            self._asker,
-            self._procedures,
-            sheet_of(self._rig_config, self._protocol_config),
-            self._protocol_config,
-            self._requests,
+        protocol = self._protocol_config
+        run = Run(
+            rig=rig,
+            store=store,
+            progress=self._progress,
+            asker=self._asker,
+            procedures=self._procedures,
+            sheet=sheet_of(self._rig_config, protocol),
+            protocol=protocol,
+            requests=self._requests,
+            control=self._control,
+            telemetry=self._telemetry,
+            live=self._live,
+            guided=self._guided,
         )
-        run = Run(context, self._control, self._telemetry, self._live, self._guided)
-        steps = steps_on(self._rig_config, self._protocol_config)
-        await run.protocol(board_first(steps) if self._guided else steps)
+        steps = steps_on(self._rig_config, protocol)
+        await run.carry_out(board_first(steps) if self._guided else steps)
 
     def _end(self, state: State, error: Exception) -> None:
         """End with `error`, whose message says so if the arm may move or the brush may be down. The session keeps it
@@ -330,7 +333,7 @@ class Engine:
         if tip_mm is not None and (self._rest_unknown or tip_mm[2] < config.motion.safe_z_mm - PARKED_MM):
             error.add_note(brush_may_be_down(tip_mm[2] - config.paper.touch_z_mm))
         self._control.end(state)
-        self._progress.ended(describe(error))
+        self._progress.over(describe(error))
         if self._store is not None:
             with contextlib.suppress(SessionError):
                 self._store.ended(describe(error))

@@ -154,22 +154,17 @@ class Fact:
         return f"{sign} {self.name:<{NAME}} {self.value}" + (f"  ({self.limit})" if self.limit else "")
 
 
-def facts_of(result: StepResult, config: RigConfig) -> tuple[Fact, ...]:
-    """What a finished set-up step measured, from its result in the journal."""
-    match result:
-        case BoardResult():
-            return _board(result, config)
-        case ZeroTouchResult():
-            return _touch(result, config)
-        case SelfCheckResult():
-            return _self_check(result, config)
-        case _:
-            return ()
-
-
 def accept_question(result: StepResult, config: RigConfig) -> Prompt:
     """Ask whether the result is good enough. The default is to stop: nothing goes on without an answer."""
-    facts = facts_of(result, config)
+    match result:
+        case BoardResult():
+            facts = _board(result, config)
+        case ZeroTouchResult():
+            facts = _touch(result, config)
+        case SelfCheckResult():
+            facts = _self_check(result, config)
+        case _:
+            facts = []
     good = all(fact.good is not False for fact in facts)
     verdict = f"{TITLES[result.kind]}: " + ("all within limits." if good else "not all is within limits.")
     text = "\n".join([verdict, *map(str, facts)])
@@ -191,29 +186,31 @@ def board_first(protocol: Protocol) -> Protocol:
     yield from protocol
 
 
-def _board(result: BoardResult, config: RigConfig) -> tuple[Fact, ...]:
-    rms_px = result.rms_px
+def _within(name: str, value: float, limit: float, shown: str) -> Fact:
+    """A value that may be at most `limit` to either side of zero."""
+    return Fact(name, shown, f"at most {limit:g}", abs(value) <= limit)
+
+
+def _board(result: BoardResult, config: RigConfig) -> list[Fact]:
+    rms_px, delay_ms, jitter_ms = result.rms_px, result.camera_delay_ms, result.camera_jitter_ms
     facts = [
         Fact("corners seen", str(result.corners)),
         Fact("scale (pix2len)", f"{result.mm_per_px:.4f} mm/px"),
-        Fact("residual of corners", f"{rms_px:.2f} px", f"at most {WORST_RMS_PX:g}", rms_px <= WORST_RMS_PX),
+        _within("residual of corners", rms_px, WORST_RMS_PX, f"{rms_px:.2f} px"),
     ]
-    for name, value_ms, limit_ms in (
-        ("delay of the camera", result.camera_delay_ms, config.camera.max_delay_ms),
-        ("variation of the delay", result.camera_jitter_ms, config.camera.max_jitter_ms),
-    ):
-        if value_ms is not None:
-            facts.append(Fact(name, f"{value_ms:.0f} ms", f"at most {limit_ms:g}", value_ms <= limit_ms))
+    if delay_ms is not None and jitter_ms is not None:
+        facts.append(_within("delay of the camera", delay_ms, config.camera.max_delay_ms, f"{delay_ms:.0f} ms"))
+        facts.append(_within("variation of the delay", jitter_ms, config.camera.max_jitter_ms, f"{jitter_ms:.0f} ms"))
     for check in result.checks:
         score = check.score or 0.0
         if check.name == "blurred":
             facts.append(Fact("focus: blur", f"{score:.2f} mm", f"at most {check.threshold:g}", check.passed))
         elif check.name == "exposure":
             facts.append(Fact("light: paper", f"level {score:.0f}", "", check.passed))
-    return tuple(facts)
+    return facts
 
 
-def _touch(result: ZeroTouchResult, config: RigConfig) -> tuple[Fact, ...]:
+def _touch(result: ZeroTouchResult, config: RigConfig) -> list[Fact]:
     touch, method = config.touch, result.method
     named = {"taught": "taught height, visited", "kept": "none: the previous height is kept"}
     facts = [Fact("method", named.get(method, method))]
@@ -222,31 +219,27 @@ def _touch(result: ZeroTouchResult, config: RigConfig) -> tuple[Fact, ...]:
         if method in named:
             facts.append(Fact(where, f"{'rests' if method == 'taught' else 'is'} at {point.z_mm:.2f} mm"))
             continue
-        span_mm, limit_mm = point.span_mm, touch.repeatability_mm
-        facts.append(Fact(where, f"{point.z_mm:.3f} mm", "", None))
-        facts.append(Fact("  its touches span", f"{span_mm:.3f} mm", f"at most {limit_mm:g}", span_mm <= limit_mm))
+        span_mm = point.span_mm
+        facts.append(Fact(where, f"{point.z_mm:.3f} mm"))
+        facts.append(_within("  its touches span", span_mm, touch.repeatability_mm, f"{span_mm:.3f} mm"))
     if method not in named:
-        near = abs(result.moved_mm) <= touch.moved_mm
-        facts.append(Fact("from the height before", f"{result.moved_mm:+.3f} mm", f"at most {touch.moved_mm:g}", near))
+        moved_mm = result.moved_mm
+        facts.append(_within("from the height before", moved_mm, touch.moved_mm, f"{moved_mm:+.3f} mm"))
     residuals = [abs(residual_mm) for residual_mm in result.residuals_mm]
     if len(residuals) > 3:
-        worst_mm = max(residuals)
-        facts.append(
-            Fact("off the plane", f"{worst_mm:.3f} mm", f"at most {touch.residual_mm:g}", worst_mm <= touch.residual_mm)
-        )
+        facts.append(_within("off the plane", max(residuals), touch.residual_mm, f"{max(residuals):.3f} mm"))
     plane = "level: fewer than three points" if len(residuals) < 3 else f"leans by {result.slope_deg:.2f}°"
     facts.append(Fact("plane", plane))
-    return tuple(facts)
+    return facts
 
 
-def _self_check(result: SelfCheckResult, config: RigConfig) -> tuple[Fact, ...]:
+def _self_check(result: SelfCheckResult, config: RigConfig) -> list[Fact]:
     limits = config.self_check
     off_mm, turn_deg = math.hypot(*result.offset_mm), result.turn_deg
     scale_x, scale_y = (100.0 * (scale - 1.0) for scale in result.scale)
-    worst_mm = max(result.residuals_mm)
-    return (
-        Fact("marks lie off by", f"{off_mm:.2f} mm", f"at most {limits.offset_mm:g}", off_mm <= limits.offset_mm),
-        Fact("turned by", f"{turn_deg:+.2f}°", f"at most {limits.turn_deg:g}", abs(turn_deg) <= limits.turn_deg),
+    return [
+        _within("marks lie off by", off_mm, limits.offset_mm, f"{off_mm:.2f} mm"),
+        _within("turned by", turn_deg, limits.turn_deg, f"{turn_deg:+.2f}°"),
         Fact("lengths off by", f"{scale_x:+.2f} % in x, {scale_y:+.2f} % in y"),
-        Fact("left over", f"{worst_mm:.2f} mm"),
-    )
+        Fact("left over", f"{max(result.residuals_mm):.2f} mm"),
+    ]

@@ -22,29 +22,21 @@ from brushloop.collect.engine.policy import (
     in_set_up,
     question,
 )
-from brushloop.collect.engine.recorder import ForceGuard, Recorder
+from brushloop.collect.engine.recorder import ForceGuard, Recorder, RunContext, StepContext, uninterrupted
 from brushloop.collect.engine.steps import brush, capture
-from brushloop.collect.engine.steps.capture import marked_bad
-from brushloop.collect.engine.steps.context import RunContext, StepContext, uninterrupted
-from brushloop.collect.errors import NeedsOperator, Parked, PosesLate, SheetFull, StepError, arm_at_fault, describe
+from brushloop.collect.errors import (
+    NeedsOperator,
+    Parked,
+    PosesLate,
+    SheetFull,
+    StepError,
+    arm_at_fault,
+    describe,
+)
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.planning.walk import patches_of
-from brushloop.collect.protocols.plan import takes
-from brushloop.collect.protocols.steps import (
-    MARKING,
-    BoardStep,
-    CaptureStep,
-    DipStep,
-    DrawStep,
-    PressStep,
-    Protocol,
-    ReviewStep,
-    SelfCheckStep,
-    Step,
-    TouchStep,
-    ZeroTouchStep,
-    press_of,
-)
+from brushloop.collect.protocols import steps
+from brushloop.collect.protocols.steps import MARKING, Protocol, Step, press_of, takes
 from brushloop.drivers.errors import ArmMoved, DeviceError, LimitExceeded, MotionError
 from brushloop.sessions.errors import SessionError
 from brushloop.sessions.events import DipResult, ReviewResult, StepKind, StepResult
@@ -55,11 +47,10 @@ HEIGHTS = MARKING | {StepKind.ZERO_TOUCH, StepKind.TOUCH}
 """Steps whose heights count only if the tool is still the one that was set, and the poses came in time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
+@dataclass(slots=True, kw_only=True)
+class Run(RunContext):
     """One run of a protocol in one process."""
 
-    context: RunContext
     control: RunControl
     telemetry: Telemetry
     """Gets every force."""
@@ -70,20 +61,20 @@ class Run:
     done: set[str] = field(default_factory=set[str])
     """Keys of the steps that this process has done."""
 
-    async def protocol(self, protocol: Protocol) -> None:
+    async def carry_out(self, protocol: Protocol) -> None:
         """Power on, retreat, do every step that is not in the journal yet, repeat what was marked bad, park."""
-        self.context.progress.doing("power on")
-        await self._once_arm_is_free(self.context.rig.robot.enable)
+        self.progress.doing("power on")
+        await self._once_arm_is_free(self.rig.robot.enable)
         await self._once_arm_is_free(self._recover)
         await self._walk(protocol)
         for number in itertools.count():
-            step = ReviewStep(number)
-            if step.key not in self.context.store.state.done and not marked_bad(self.context):
+            step = steps.ReviewStep(number)
+            if step.key not in self.store.state.done and not capture.marked_bad(self):
                 break
             reviewed = await self._result(step)
             assert isinstance(reviewed, ReviewResult)
             for again in reviewed.again:
-                await self._walk(takes(self.context.progress.planned(again.index)))
+                await self._walk(takes(self.progress.planned(again.index)))
         await self._once_arm_is_free(self._recover)  # the arm may have left for a dip that does not follow
 
     async def _walk(self, protocol: Protocol) -> None:
@@ -101,17 +92,17 @@ class Run:
         while True:
             try:
                 if released:
-                    await self.context.rig.robot.enable()
+                    await self.rig.robot.enable()
                 return await act()
             except (MotionError, LimitExceeded) as error:
-                if not self.context.asker.watched:
+                if not self.asker.watched:
                     raise
                 await self._ask(error)
                 released = True
 
     async def _result(self, step: Step) -> StepResult:
         """Return the result of a step: from the journal if it is done, else by doing it until it succeeds."""
-        known = self.context.store.state.done.get(step.key)
+        known = self.store.state.done.get(step.key)
         if known is not None and (not step.run_scoped or step.key in self.done):
             return known.result
         failures, asked = 0, self.guided and in_set_up(step)
@@ -123,17 +114,17 @@ class Run:
                 if answer == GO_ON:
                     self.done.add(step.key)
                     return result
-                self.context.forget_camera()
+                self.forget_camera()
                 step = by_method(step, answer)
             except (StepError, DeviceError) as error:
                 if isinstance(error, NeedsOperator) and self.control.park_wanted:
                     await self._park()  # a question of this step was left open
                 failures += 1
                 action = decide(step, error, failures)
-                if asked and self.context.asker.watched:
+                if asked and self.asker.watched:
                     action = Action.ASK  # the person at the set-up can remove the cause
-                self.context.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
-                if action is Action.ABORT or (action is Action.ASK and not self.context.asker.watched):
+                self.progress.log(f"{step.kind}: {error} -> {action}", warning=True)
+                if action is Action.ABORT or (action is Action.ASK and not self.asker.watched):
                     await self._lift(error)
                     raise
                 if action is Action.ASK:
@@ -152,9 +143,9 @@ class Run:
             await self._park()
         await self.control.pause_point()
         await self._back_in_control()
-        if isinstance(step, DipStep) and self.context.requests.take(OperatorRequest.NEW_SHEET):
+        if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.NEW_SHEET):
             await self._new_sheet()
-        if isinstance(step, DipStep) and self.context.requests.take(OperatorRequest.JOG):
+        if isinstance(step, steps.DipStep) and self.requests.take(OperatorRequest.JOG):
             await self._touch_again(step)
         if self.control.park_wanted:
             await self._park()
@@ -164,11 +155,11 @@ class Run:
         or a question, or with another client."""
         released = False
         try:
-            return await self.context.rig.robot.confirm()
+            return await self.rig.robot.confirm()
         except ArmMoved:
             pass
         except MotionError as error:
-            if not self.context.asker.watched:
+            if not self.asker.watched:
                 raise
             await self._ask(error)
             released = True
@@ -179,24 +170,22 @@ class Run:
         raise Parked("parked on request; the same command resumes from here")
 
     async def _new_sheet(self) -> None:
-        sheet = self.context.store.state.sheet
+        sheet = self.store.state.sheet
         text = f"Replace sheet {sheet + 1} by a blank one, then go on."
         choices = (Choice(GO_ON, f"the blank sheet lies there: it becomes sheet {sheet + 2}"), KEEP_SHEET)
         await self._once_arm_is_free(self._recover)
-        if await self.context.asker.ask_or_default(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
-            self.context.fresh_sheet()
+        if await self.asker.ask_or_default(Prompt(text, choices, KEEP_SHEET.key)) == GO_ON:
+            self.fresh_sheet()
         await self._once_arm_is_free(self._recover)
 
     async def _touch_again(self, step: Step) -> None:
         """Zero touch by jog between two strokes; if it fails, the plane stays as it was."""
-        touch = ZeroTouchStep(step.index + 1, method="jog", between_strokes=True)
+        touch = steps.ZeroTouchStep(step.index + 1, method="jog", between_strokes=True)
         released = False
         try:
             await self.perform(touch)
         except (StepError, DeviceError) as error:
-            self.context.progress.log(
-                f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True
-            )
+            self.progress.log(f"zero touch by jog: {error} The previous height of the paper is kept.", warning=True)
             if arm_at_fault(error):
                 await self._ask(error)
                 released = isinstance(error, MotionError)
@@ -204,7 +193,7 @@ class Run:
 
     async def _ask_about(self, result: StepResult) -> str:
         """Let a person accept what a set-up step measured. Raises `Parked` if the answer is to stop."""
-        answer = await self.context.asker.ask_or_default(accept_question(result, self.context.rig.config))
+        answer = await self.asker.ask_or_default(accept_question(result, self.rig.config))
         if answer == STOP.key:
             await self._park()
         return answer
@@ -216,17 +205,17 @@ class Run:
             with contextlib.suppress(StepError, DeviceError):
                 await self._recover()  # a person is about to reach under the arm
                 in_order = True
-        asked = question(error, self.context.store.state.sheet)
-        answer = await self.context.asker.ask_or_default(asked)
+        asked = question(error, self.store.state.sheet)
+        answer = await self.asker.ask_or_default(asked)
         meant = next(choice.label for choice in asked.choices if choice.key == answer)
-        self.context.progress.log(f"{asked.question} -> {meant}")
+        self.progress.log(f"{asked.question} -> {meant}")
         if answer == STOP.key:
             if in_order:
                 raise Parked(f"stopped at a question, parked: {describe(error)}") from error
             raise error
-        self.context.forget_camera()
+        self.forget_camera()
         if isinstance(error, SheetFull):
-            self.context.fresh_sheet()
+            self.fresh_sheet()
         return answer
 
     async def _lift(self, error: StepError | DeviceError | SessionError) -> None:
@@ -240,13 +229,13 @@ class Run:
 
     async def _recover(self) -> None:
         self.control.move_to(State.RECOVERING)
-        self.context.progress.doing("retreat")
+        self.progress.doing("retreat")
         try:
-            await self.context.rig.robot.confirm()
+            await self.rig.robot.confirm()
         except ArmMoved as moved:
-            self.context.progress.log(describe(moved), warning=True)  # logged before the arm moves
-        self.context.left_ink_ns = None
-        await self.context.procedures.retreat()
+            self.progress.log(describe(moved), warning=True)  # logged before the arm moves
+        self.left_ink_ns = None
+        await self.procedures.retreat()
         self.control.go_on()
 
     async def perform(self, step: Step) -> StepResult:
@@ -254,37 +243,37 @@ class Run:
 
         Raises `SheetFull` before anything is begun.
         """
-        run, store, press = self.context, self.context.store, press_of(step)
-        run.progress.doing(step.kind.replace("_", " ") if press is None else f"{step.kind} {press.stroke_id}")
-        used, sheet = run.used_patches(), store.state.sheet + 1
-        if isinstance(step, DipStep):
-            run.sheet.free(used, sheet)  # a brush full of ink does not wait for a fresh sheet
-        patches = patches_of(step, run.sheet, used, sheet)
+        store, press = self.store, press_of(step)
+        self.progress.doing(step.kind.replace("_", " ") if press is None else f"{step.kind} {press.stroke_id}")
+        used, sheet = self.used_patches(), store.state.sheet + 1
+        if isinstance(step, steps.DipStep):
+            self.sheet.free(used, sheet)  # a brush full of ink does not wait for a fresh sheet
+        patches = patches_of(step, self.sheet, used, sheet)
         attempt = store.begin(step.key, step.kind, patches=tuple(patch.index for patch in patches), press=press)
-        run.progress.begun(step)
+        self.progress.begun(step)
         try:
             with self._observed(attempt) as (recorder, guard):
-                result = await self._do(step, StepContext(run, patches, attempt, recorder, guard))
+                result = await self._do(step, StepContext(self, patches, attempt, recorder, guard))
                 lag_ms = await self._checked_lag_ms(step)
             recorder.cadence(lag_ms)
         except BaseException as error:
-            run.left_ink_ns = None
+            self.left_ink_ns = None
             why = "stopped by the operator" if isinstance(error, asyncio.CancelledError) else describe(error)
             await uninterrupted(store.void, attempt, why)
-            run.progress.finished()
+            self.progress.finished()
             raise
-        if isinstance(result, DipResult) and run.requests.take(OperatorRequest.SKIP):
-            left_out = run.progress.planned(step.index).press()
+        if isinstance(result, DipResult) and self.requests.take(OperatorRequest.SKIP):
+            left_out = self.progress.planned(step.index).press()
             result = result.model_copy(update={"skipped": left_out})
-            run.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
+            self.progress.log(f"{left_out.stroke_id}: is left out, as the operator requested")
         await uninterrupted(store.done, attempt, result)
-        run.progress.finished()
+        self.progress.finished()
         return result
 
     @contextlib.contextmanager
     def _observed(self, attempt: Attempt) -> Generator[tuple[Recorder, ForceGuard]]:
         """Within the block, record the poses and forces of an attempt, and show them to whoever watches."""
-        rig, show = self.context.rig, None if self.live is None else self.live.offer
+        rig, show = self.rig, None if self.live is None else self.live.offer
         force = rig.config.force
         recorder = Recorder(attempt.writer, rig.clock, None if force is None else force.rate_hz, show)
         if show is not None:
@@ -302,7 +291,7 @@ class Run:
     async def _checked_lag_ms(self, step: Step) -> float | None:
         """How late poses came, in ms. Raises `PosesLate` if the heights of the step do not count for that, and
         `DeviceError` if the tool is not the one that was set."""
-        robot, limit_ms = self.context.rig.robot, self.context.rig.config.robot.max_pose_lag_ms
+        robot, limit_ms = self.rig.robot, self.rig.config.robot.max_pose_lag_ms
         if step.kind in HEIGHTS:
             with contextlib.suppress(ArmMoved):  # where the arm is now does not change what was done
                 await robot.confirm()
@@ -313,21 +302,21 @@ class Run:
 
     async def _do(self, step: Step, context: StepContext) -> StepResult:
         match step:
-            case ZeroTouchStep():
+            case steps.ZeroTouchStep():
                 return await brush.zero_touch(context, step)
-            case TouchStep():
+            case steps.TouchStep():
                 return await brush.touch(context, step)
-            case SelfCheckStep():
+            case steps.SelfCheckStep():
                 return await brush.check_rig(context)
-            case BoardStep():
+            case steps.BoardStep():
                 return await capture.board(context)
-            case DipStep():
+            case steps.DipStep():
                 return await brush.dip(context)
-            case PressStep():
+            case steps.PressStep():
                 return await brush.press(context, step)
-            case DrawStep():
+            case steps.DrawStep():
                 return await brush.draw(context, step)
-            case CaptureStep():
+            case steps.CaptureStep():
                 return await capture.capture(context, step)
-            case ReviewStep():
-                return await capture.review(context.run)
+            case steps.ReviewStep():
+                return capture.review(self)

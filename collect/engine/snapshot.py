@@ -1,20 +1,38 @@
-"""What a screen shows of a run: one immutable `Snapshot`, plain values only, so that a screen imports it quickly."""
+"""What a screen shows of a run: one immutable `Snapshot`; and `Progress`, which keeps it up to date.
+
+What was pressed, kept or left out is counted from the journal's `RunState`; only the log and the step in progress are
+remembered here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+import threading
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from brushloop.collect.engine.control import State
+from brushloop.collect.protocols.steps import CaptureStep, DipStep, DrawStep, Planned, PressStep, Step, with_review
+from brushloop.sessions.events import CaptureResult, DipResult, Press, PressResult, ReviewResult, SelfCheckResult
 from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
     from numpy.typing import NDArray
 
-    from brushloop.collect.engine.control import State
-    from brushloop.collect.engine.last_capture import LastCapture
     from brushloop.collect.operator import OperatorRequest, Prompt
+    from brushloop.collect.protocols.config import ProtocolConfig
+    from brushloop.collect.quality.checks import Verdict
+    from brushloop.collect.rig.paper import Layout
+    from brushloop.drivers.host import Clock
+    from brushloop.sessions.store import SessionStore
+
+LOG_LINES = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +87,6 @@ class SheetMap:
 class Picture:
     """A reduced picture of the camera's newest frame."""
 
-    number: int
     image: NDArray[np.uint8]
     """(h, w) gray."""
     blur_px: float | None = None
@@ -77,25 +94,51 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
+class LastCapture:
+    """One capture, as a screen shows it."""
+
+    press: Press
+    still: int
+    kept: bool
+    verdict: Verdict | None
+    """None where captures are not judged."""
+    photo: NDArray[np.uint8] | None = None
+    """(h, w) gray: the field around the zero-touch point, seen from above."""
+    binary: NDArray[np.bool_] | None = None
+    """(128, 128), true where there is ink: the image that a validation compares, in the millimetre alignment."""
+    model: NDArray[np.bool_] | None = None
+    """(128, 128) mark of CCD-BSM as published for the same H and alpha; None for a figure, or if it gives none."""
+
+    @property
+    def likeness(self) -> float | None:
+        """CSIM of `binary` and `model`, 0 to 1; None if either is missing or shows no ink."""
+        if self.binary is None or self.model is None or not (self.binary.any() and self.model.any()):
+            return None
+        from brushloop.model.similarity import csim  # only where a capture is shown
+
+        return csim(self.binary.astype(float), self.model.astype(float))
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """State of a run at one moment."""
 
-    session_id: str
-    source: str
-    state: State
-    step: str
+    session_id: str = ""
+    source: str = ""
+    state: State = State.IDLE
+    step: str = ""
     """What is being done, in words."""
-    strokes_done: int
-    strokes_planned: int
-    grid: tuple[CellCount, ...]
-    voids: int
+    strokes_done: int = 0
+    strokes_planned: int = 0
+    grid: tuple[CellCount, ...] = ()
+    voids: int = 0
     """Attempts that were cut short."""
-    elapsed_s: float
-    eta_s: float | None
-    """Remaining time in seconds; None until a stroke has been timed."""
-    messages: tuple[str, ...]
+    elapsed_s: float = 0.0
+    eta_s: float | None = None
+    """Remaining time in seconds; None until two strokes of this process give a time per stroke."""
+    messages: tuple[str, ...] = ()
     """The newest lines of the log, oldest first."""
-    error: str
+    error: str = ""
     """Why the run failed or stopped; empty otherwise."""
     tip_mm: tuple[float, float, float] | None = None
     """Position of the brush tip; None while the arm sends no fresh pose."""
@@ -130,3 +173,184 @@ class Snapshot:
     """Folder of the session; empty until there is one."""
     no_pose_s: float | None = None
     """Time since the arm last sent a pose; None below a second. While it is set, no value on the screen is live."""
+
+
+class Progress:
+    """Progress of one run; written by the engine's thread, read from any."""
+
+    def __init__(
+        self, protocol: ProtocolConfig, clock: Clock, layout: Layout | None = None, resumes: Path | None = None
+    ) -> None:
+        """`layout` is that of the sheet; it determines the order of the strokes. `resumes` is the session's folder."""
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._planned = self._plan = self._left = protocol.planned(layout)
+        self._layout = layout
+        self._store: SessionStore | None = None
+        self._started_ns = clock.now_ns()
+        self._over_ns: int | None = None
+        self._index: int | None = None
+        self._logged = 0
+        self._messages: deque[str] = deque(maxlen=LOG_LINES)
+        self._now = Snapshot(
+            session_id="" if resumes is None else resumes.name,
+            folder="" if resumes is None else str(resumes),
+            strokes_planned=len(self._plan),
+            grid=self._grid([], [], []),
+        )
+
+    def opened(self, store: SessionStore) -> int:
+        """Begin with what a new or resumed session holds; returns how many strokes of it count."""
+        self._store = store
+        self._change(session_id=store.folder.name, folder=str(store.folder), source=store.header.source)
+        self._count()
+        return self._now.strokes_done
+
+    def doing(self, what: str) -> None:
+        """Say what the run is doing, in words."""
+        self._change(step=what)
+
+    @contextlib.contextmanager
+    def meanwhile(self, what: str) -> Generator[None]:
+        """Within the block, say what else the run is doing in the middle of a step."""
+        before = self._now.step
+        self.doing(what)
+        yield
+        self.doing(before)
+
+    def begun(self, step: Step) -> None:
+        """Note that a step begins."""
+        if isinstance(step, DipStep | PressStep | DrawStep | CaptureStep):
+            self._index = step.index
+        self._count()
+
+    def finished(self) -> None:
+        """Note that a step is done, or was cut short."""
+        self._count()
+
+    @property
+    def first_free_index(self) -> int:
+        """The lowest index above all steps of the protocol; the steps of repeated strokes begin there."""
+        return 1 + max((stroke.index for stroke in self._planned), default=0)
+
+    def more_than(self, stroke_id: str) -> bool:
+        """Whether a stroke other than this one is still to be made."""
+        return any(stroke.stroke_id != stroke_id for stroke in self._left)
+
+    def planned(self, index: int) -> Planned:
+        """The stroke whose steps have this index."""
+        return next(stroke for stroke in self._plan if stroke.index == index)
+
+    def show(self, last: LastCapture) -> None:
+        """Show the newest capture."""
+        self._change(last=last)
+
+    def not_kept(self) -> None:
+        """Show that the newest capture does not count."""
+        if self._now.last is not None:
+            self._change(last=replace(self._now.last, kept=False))
+
+    def log(self, text: str, *, warning: bool = False) -> None:
+        """Add a line to the operator's log."""
+        with self._lock:
+            self._logged += 1
+            self._messages.append(f"warning: {text}" if warning else text)
+
+    def over(self, error: str = "") -> None:
+        """Note that the run is over, and why if it ended early."""
+        self._over_ns, self._index = self._clock.now_ns(), None
+        self._change(error=error)
+        if self._store is not None:
+            self._count()
+
+    def snapshot(self, **values: Any) -> Snapshot:
+        """One consistent snapshot, with the `values` that only the engine knows."""
+        with self._lock:
+            return replace(
+                self._now,
+                elapsed_s=((self._over_ns or self._clock.now_ns()) - self._started_ns) / 1e9,
+                messages=tuple(self._messages),
+                messages_before=self._logged - len(self._messages),
+                **values,
+            )
+
+    def _change(self, **values: Any) -> None:
+        with self._lock:
+            self._now = replace(self._now, **values)
+
+    def _count(self) -> None:
+        """Count what the journal holds; of strokes that were pressed again after a review, only the repetition."""
+        assert self._store is not None
+        state, plan = self._store.state, self._planned
+        marks: dict[tuple[int | None, int | None], Mark] = dict.fromkeys(state.used_patches, Mark.VOID)
+        for begin in state.running.values():
+            marks |= {(begin.sheet, patch): Mark.NOW for patch in begin.patches[:1]}
+        kept: dict[str, Press] = {}
+        bad: list[Press] = []
+        left_out: list[Press] = []
+        times_ns: list[int] = []
+        ink_level: float | None = None
+        for step in state.files.values():
+            match step.result:
+                case PressResult(press=press):
+                    marks[press.sheet, press.patch] = Mark.WAITING
+                case SelfCheckResult(sheet=sheet, patches=patches):
+                    marks |= {(sheet, patch): Mark.CHECK for patch in patches}
+                case CaptureResult(press=press, kept=True):
+                    marks[press.sheet, press.patch] = Mark.KEPT
+                    kept[press.stroke_id] = press
+                    times_ns += [step.t_ns] if step.t_ns >= self._started_ns else []
+                case CaptureResult(press=press, retake=retake):
+                    marks[press.sheet, press.patch] = Mark.BAD
+                    bad.append(press)
+                    left_out += [] if retake else [press]
+                case DipResult(skipped=skipped):
+                    ink_level = step.result.ink_level
+                    left_out += [] if skipped is None else [skipped]
+                case ReviewResult(again=again) as review:
+                    plan = with_review(plan, review)
+                    for stroke in again:
+                        press = kept.pop(stroke.stroke_id)
+                        marks[press.sheet, press.patch] = Mark.BAD
+                        bad.append(press)
+                case _:
+                    pass
+        ended = kept.keys() | {press.stroke_id for press in left_out}
+        self._plan, self._left = plan, [stroke for stroke in plan if stroke.stroke_id not in ended]
+        sheet, layout = state.sheet, self._layout
+        on_sheet = () if layout is None else tuple(marks.get((sheet, patch)) for patch in range(layout.capacity))
+        self._change(
+            strokes_done=len(kept),
+            strokes_planned=len(plan),
+            grid=self._grid(kept.values(), bad, left_out),
+            voids=len(state.cut),
+            given_up=len(left_out),
+            eta_s=self._eta_s(times_ns),
+            ink_level=ink_level,
+            sheet=None if layout is None else SheetMap(sheet + 1, layout.columns, layout.rows, on_sheet),
+        )
+
+    def _grid(self, kept: Iterable[Press], bad: Iterable[Press], left_out: Iterable[Press]) -> tuple[CellCount, ...]:
+        """The strokes of each condition."""
+        counts = [Counter(press.condition for press in presses) for presses in (kept, bad, left_out)]
+        current = next((stroke for stroke in self._left if stroke.index == self._index), None)
+        following = next((stroke for stroke in self._left if stroke is not current), None)
+        return tuple(
+            CellCount(
+                asked,
+                counts[0][asked],
+                planned,
+                counts[1][asked],
+                counts[2][asked],
+                current is not None and asked == current.condition,
+                following is not None and asked == following.condition,
+            )
+            for asked, planned in sorted(Counter(stroke.condition for stroke in self._plan).items())
+        )
+
+    def _eta_s(self, times_ns: Sequence[int]) -> float | None:
+        """Remaining time, from the times of this process's captures that count."""
+        if not self._left:
+            return 0.0
+        timed = len(times_ns) - 1
+        return len(self._left) * (times_ns[-1] - times_ns[0]) / 1e9 / timed if timed > 0 else None

@@ -12,11 +12,20 @@ from pathlib import Path
 
 from brushloop.collect.errors import ConfigError, StepError
 from brushloop.collect.motion import park_moves
-from brushloop.collect.planning.walk import moves_of, placed_steps, sheet_of
+from brushloop.collect.planning.walk import marks_of, moves_of, placed_steps, sheet_of
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.kinds import CalibrationConfig, GridConfig, WriteConfig
-from brushloop.collect.protocols.steps import MARKING, CaptureStep, DrawStep, PressStep, SelfCheckStep, Step, press_of
-from brushloop.collect.rig.config import RigConfig
+from brushloop.collect.protocols.kinds import CalibrationConfig
+from brushloop.collect.protocols.steps import (
+    MARKING,
+    CaptureStep,
+    DrawStep,
+    Planned,
+    PressStep,
+    SelfCheckStep,
+    Step,
+    press_of,
+)
+from brushloop.collect.rig.config import BrushConfig, PaperConfig, RigConfig
 from brushloop.collect.rig.devices import limits_of
 from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.selfcheck import triangle_in
@@ -32,10 +41,12 @@ TOUCH_CLEAR_MM = 5.0
 
 def check_protocol(rig_path: Path, protocol_path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
     """Raise `ConfigError` with file, field and range for the first problem."""
-    _check_brush(protocol_path, rig, protocol)
-    sheet = sheet_of(rig, protocol)
-    if not isinstance(protocol, CalibrationConfig):
-        _check_cells(rig_path, protocol_path, rig, protocol, sheet)
+    first_round = [stroke for stroke in protocol.planned() if stroke.repeat == 1]  # the others repeat it
+    if first_round:
+        sheet = sheet_of(rig, protocol)
+        _check_sheet(rig_path, protocol_path, rig, protocol, sheet)
+        _check_brush(protocol_path, rig.brush, protocol.depths_field, first_round, sheet.patch(0))
+        _check_touch_point(rig_path, rig.paper, first_round, sheet)
     _check_touches(protocol_path, rig, protocol)
     check_poses(rig_path, rig, protocol, PaperPlane(rig.paper.touch_z_mm))
 
@@ -63,70 +74,44 @@ def _moved(step: Step) -> object:
             return replace(step, index=0)
 
 
-def _check_brush(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:
-    brush = rig.brush
-    for depth_mm, tilt_deg, name in _depths(protocol):
-        if depth_mm > brush.max_depth_mm:
-            raise ConfigError(
-                path,
-                protocol.depths_field,
-                f"{name}{depth_mm:g} mm is deeper than brush.max_depth_mm = {brush.max_depth_mm:g} mm allows",
-            )
-        most_mm = brush.length_mm * math.cos(math.radians(tilt_deg))
-        if depth_mm > most_mm:
-            raise ConfigError(
-                path,
-                protocol.depths_field,
-                f"{name}{depth_mm:g} mm at {tilt_deg:g} deg is more than the bundle allows ({most_mm:.1f} mm)",
-            )
-
-
-def _depths(protocol: ProtocolConfig) -> Iterator[tuple[float, float, str]]:
-    """(depth in mm, tilt in deg, its name for a message) of every press and every drawn point."""
-    if isinstance(protocol, WriteConfig):
-        for figure in protocol.figures:
-            for stroke in figure.strokes:
-                yield from ((point[2], point[3], f"{figure.name}: ") for point in stroke.points)
-    else:
-        for stroke in protocol.planned():
-            name = "" if isinstance(protocol, GridConfig) else f"{stroke.stroke_id}: "
-            yield stroke.condition.depth_mm, stroke.condition.tilt_deg, name
-
-
-def _check_cells(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
-    own = isinstance(protocol, WriteConfig)
+def _check_sheet(rig_path: Path, path: Path, rig: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> None:
     if sheet.capacity == 0:
-        raise ConfigError(
-            path if own else rig_path,
-            "cell_mm" if own else "paper.cell_mm",
-            f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}",
-        )
+        own = protocol.own_patch_mm is not None
+        where, field = (path, "cell_mm") if own else (rig_path, "paper.cell_mm")
+        raise ConfigError(where, field, f"{sheet.cell_mm} does not fit on {rig.paper.size_mm}")
     if rig.self_check.enabled:
         try:
             triangle_in(sheet.patch(0), rig.self_check)
         except StepError as error:
             what = f"{error}; --arm switches the self-check on, `enabled = false` switches it off"
             raise ConfigError(rig_path, "self_check.legs_mm", what) from None
-    x_mm, y_mm = rig.paper.touch_point_mm
+
+
+def _check_brush(path: Path, brush: BrushConfig, field: str, strokes: Iterable[Planned], patch: Patch) -> None:
+    for stroke in strokes:
+        for _, _, asked in marks_of(stroke, patch):
+            depth_mm, tilt_deg = asked.depth_mm, asked.tilt_deg
+            deep = f"{stroke.stroke_id}: {depth_mm:g} mm"
+            if depth_mm > brush.max_depth_mm:
+                limit = f"is deeper than brush.max_depth_mm = {brush.max_depth_mm:g} mm allows"
+                raise ConfigError(path, field, f"{deep} {limit}")
+            most_mm = brush.length_mm * math.cos(math.radians(tilt_deg))
+            if depth_mm > most_mm:
+                limit = f"at {tilt_deg:g} deg is more than the bundle allows ({most_mm:.1f} mm)"
+                raise ConfigError(path, field, f"{deep} {limit}")
+
+
+def _check_touch_point(rig_path: Path, paper: PaperConfig, strokes: Iterable[Planned], sheet: Sheet) -> None:
+    x_mm, y_mm = paper.touch_point_mm
+    first = sheet.patch(0)
+    marks = {(x_mm, y_mm) for stroke in strokes for x_mm, y_mm, _ in marks_of(stroke, first)}
     for patch in map(sheet.patch, range(sheet.capacity)):
-        for mark_x, mark_y in _marks(protocol, patch):
-            if math.dist((mark_x, mark_y), (x_mm, y_mm)) < TOUCH_CLEAR_MM:
-                what = "a drawn point" if own else "a press"
-                raise ConfigError(
-                    rig_path,
-                    "paper.touch_point_mm",
-                    f"{[x_mm, y_mm]} lies within {TOUCH_CLEAR_MM:g} mm of {what} at "
-                    f"{[round(mark_x, 1), round(mark_y, 1)]}",
-                )
-
-
-def _marks(protocol: ProtocolConfig, patch: Patch) -> Iterator[tuple[float, float]]:
-    if not isinstance(protocol, WriteConfig):
-        yield patch.anchor_mm
-        return
-    for figure in protocol.figures:
-        for stroke in figure.strokes:
-            yield from ((patch.x_mm + x_mm, patch.y_mm + y_mm) for x_mm, y_mm, *_ in stroke.points)
+        right_mm, up_mm = patch.x_mm - first.x_mm, patch.y_mm - first.y_mm
+        for mark_x, mark_y in marks:
+            at = [round(mark_x + right_mm, 1), round(mark_y + up_mm, 1)]
+            if math.dist(at, (x_mm, y_mm)) < TOUCH_CLEAR_MM:
+                what = f"{[x_mm, y_mm]} lies within {TOUCH_CLEAR_MM:g} mm of ink at {at}"
+                raise ConfigError(rig_path, "paper.touch_point_mm", what)
 
 
 def _check_touches(path: Path, rig: RigConfig, protocol: ProtocolConfig) -> None:

@@ -1,10 +1,12 @@
-"""A whole plan: every step in order with its place, ink and time; and the tables that show it."""
+"""A whole plan: every step in order with its place, ink and time; and the tables and the picture that show it."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -12,16 +14,16 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from brushloop.collect.errors import StepError
-from brushloop.collect.motion import Path, park_moves
-from brushloop.collect.planning.walk import StepMoves, Walked, placed_steps, sheet_of, walk
+from brushloop.collect.motion import Path as MotionPath
+from brushloop.collect.motion import park_moves
+from brushloop.collect.planning.walk import StepMoves, Walked, marks_of, poses_of, sheet_of, walk
 from brushloop.collect.protocols.config import ProtocolConfig
-from brushloop.collect.protocols.kinds import ReplayConfig, WriteConfig
-from brushloop.collect.protocols.steps import MARKING, DrawStep, PressStep, SelfCheckStep, TouchStep
+from brushloop.collect.protocols.steps import Drawn, DrawStep, Planned, PressStep, TouchStep
 from brushloop.collect.rig.config import BrushConfig, RigConfig
 from brushloop.collect.rig.devices import limits_of
-from brushloop.collect.rig.paper import Patch, Sheet
-from brushloop.collect.touch.selfcheck import triangle_in
+from brushloop.collect.rig.paper import Patch, Sheet, to_base
+from brushloop.collect.rig.show import BLUE, GREY, ORANGE, Axes, finish, from_above, shown_name
+from brushloop.collect.touch.selfcheck import partners
 from brushloop.drivers.devices import Pose
 from brushloop.drivers.geometry import distance
 from brushloop.drivers.limits import Limits
@@ -57,7 +59,7 @@ def move_s(start: Pose, target: Pose, speed_mm_s: float, acc_mm_s2: float, limit
     return trapezoid_s(travel_mm, speed_mm_s, acc_mm_s2)
 
 
-def path_s(start: Pose, path: Path, acc_mm_s2: float, limits: Limits) -> float:
+def path_s(start: Pose, path: MotionPath, acc_mm_s2: float, limits: Limits) -> float:
     """Seconds through poses without a halt: each line at its speed, one ramp up and one down; corners cost nothing."""
     total_s, before = path.speed_mm_s / acc_mm_s2, start
     for pose in path.poses:
@@ -71,60 +73,26 @@ def step_s(config: RigConfig, here: Pose, moves: StepMoves) -> tuple[float, Pose
     limits, acc_mm_s2 = limits_of(config), config.motion.acc_mm_s2
     total_s = moves.dwell_s + moves.captures * (config.camera.latency_ms / 1e3 + FRAME_S)
     for segment in moves.segments:
-        if isinstance(segment, Path):
+        if isinstance(segment, MotionPath):
             total_s += path_s(here, segment, acc_mm_s2, limits)
             here = segment.poses[-1]
         else:
             # Of a region one descent: the number of descents of a measured touch is not known beforehand.
-            total_s += move_s(here, segment.poses[0], segment.speed_mm_s, acc_mm_s2, limits)
-            here = segment.poses[0]
+            target = poses_of(segment)[0]
+            total_s += move_s(here, target, segment.speed_mm_s, acc_mm_s2, limits)
+            here = target
         total_s += SETTLE_S
     return total_s, here
 
 
-HELD_SHARE = 0.3
-"""Share of a wet bundle's volume that is ink between the hairs. Assumed: weigh a dipped brush to know it."""
+def reach_of(brush: BrushConfig, condition: Condition) -> tuple[float, float, float]:
+    """How far a mark reaches from its zero-touch point in mm: along the heading, against it, and to either side.
 
-
-@dataclass(frozen=True, slots=True)
-class InkNeed:
-    """Upper estimate of the ink, and what it is based on."""
-
-    ml: float
-    why: str
-
-
-def bundle_ml(brush: BrushConfig) -> float:
-    """Volume of the bundle as a cone of its largest radius and its length."""
-    return math.pi * brush.radius_mm**2 * brush.length_mm / 3.0 / 1e3
-
-
-def ink_need(config: RigConfig, dips: int) -> InkNeed:
-    """Count a full load per dip, as if each mark emptied the brush; for a pump that doses by count, its doses."""
-    device = config.ink.device
-    if device is not None and (doses_ml := device.doses_ml(dips)) is not None:
-        return InkNeed(doses_ml, f"what the {device.kind} doses in {dips} dips")
-    load_ml = HELD_SHARE * bundle_ml(config.brush)
-    return InkNeed(
-        dips * load_ml,
-        f"at most: every dip takes {load_ml:.2f} ml, {HELD_SHARE:.0%} of the bundle's volume (assumed)",
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Reach:
-    """How far a mark reaches from its zero-touch point: along the heading, against it, and to either side."""
-
-    ahead_mm: float
-    behind_mm: float
-    side_mm: float
-
-
-def reach_of(brush: BrushConfig, condition: Condition) -> Reach:
-    """Estimate by the stroke model as published (Eq. 1-5, lambda = pi): good for a warning, not a measurement."""
+    Estimated by the stroke model as published (Eq. 1-5, lambda = pi): good for a warning, not a measurement.
+    """
     depth_mm, alpha = max(condition.depth_mm, 0.0), math.radians(condition.tilt_deg)
     o3a, o3c, o4o3 = basic_lengths(depth_mm, alpha, brush.radius_mm, brush.length_mm, math)
-    return Reach(o3a, o4o3, math.pi * o3c)
+    return o3a, o4o3, math.pi * o3c
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +109,8 @@ class Plan:
     sheet_changes: tuple[str, ...]
     """Strokes before which a fresh sheet goes in."""
     dips: int
-    ink: InkNeed
+    ink_ml: float | None
+    """What the ink device doses; None without a device that doses by count."""
     poses: int
     seconds: float
     seconds_by_kind: dict[str, float]
@@ -191,7 +160,7 @@ def make_plan(config: RigConfig, protocol: ProtocolConfig) -> Plan:
         sheets=sheets,
         sheet_changes=tuple(changes),
         dips=dips,
-        ink=ink_need(config, dips),
+        ink_ml=None if config.ink.device is None else config.ink.device.doses_ml(dips),
         poses=poses,
         seconds=sum(seconds.values()),
         seconds_by_kind=seconds,
@@ -209,77 +178,28 @@ def _wait_s(config: RigConfig, protocol: ProtocolConfig, here: Pose, walked: Wal
 
 
 def _warnings(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[str]:
-    warnings: list[str] = []
-    if isinstance(protocol, ReplayConfig) and protocol.ignored_columns:
-        warnings.append(f"{protocol.file}: columns that are not used: {', '.join(protocol.ignored_columns)}")
-    if (added := _armed(config, protocol)) is not None:
-        warnings.append(added)
-    over_mm, worst = max(_overhangs(config, protocol, sheet), default=(0.0, ""))
-    if over_mm > 0.0:
-        warnings.append(
-            f"{worst} may reach {over_mm:.1f} mm beyond its patch of {sheet.cell_mm[0]:g} x {sheet.cell_mm[1]:g} mm, "
-            "by the closed-form stroke model: marks may run into each other"
-        )
-    return warnings
-
-
-def _armed(config: RigConfig, protocol: ProtocolConfig) -> str | None:
-    """Warning about what the self-check, which `--arm` switches on, adds to this plan; None if it adds nothing."""
-    if config.self_check.enabled is not None or not protocol.planned():
-        return None
-    armed = config.checking_itself(True)
-    try:
-        triangle_in(sheet_of(armed, protocol).patch(0), armed.self_check)
-    except StepError as error:
-        return f"with --arm the self-check comes first, and {error}: change [self_check] legs_mm, or enabled = false"
-    (before, _), (sheets, taken) = (_sheets(rig, protocol) for rig in (config, armed))
-    if sheets == before:
-        return None
-    patches = f"{taken} patches" if taken > 1 else "one patch"
-    return (
-        f"with --arm the self-check first takes {patches}: {sheets} sheets instead of {before} (`collect plan --arm`)"
-    )
-
-
-def _sheets(config: RigConfig, protocol: ProtocolConfig) -> tuple[int, int]:
-    """(sheets that are marked, patches of the first sheet that the self-check takes)."""
-    sheets, taken = 1, 0
-    for placed in placed_steps(config, protocol):
-        if placed.step.kind in MARKING:
-            sheets = placed.sheet
-        if isinstance(placed.step, SelfCheckStep):
-            taken = len(placed.patches)
-    return sheets, taken
-
-
-def _overhangs(config: RigConfig, protocol: ProtocolConfig, sheet: Sheet) -> list[tuple[float, str]]:
-    """(mm beyond the patch, stroke id) of every distinct press or figure."""
-    if not sheet.capacity:
+    first_round = [stroke for stroke in protocol.planned() if stroke.repeat == 1]
+    overhangs = [(_overhang_mm(config.brush, stroke, sheet.patch(0)), stroke.stroke_id) for stroke in first_round]
+    over_mm, stroke_id = max(overhangs, default=(0.0, ""))
+    if over_mm <= 0.0:
         return []
-    patch = sheet.patch(0)
-    if isinstance(protocol, WriteConfig):
-        return [
-            (max(_figure_overhang(config, patch, point) for s in figure.strokes for point in s.points), figure.name)
-            for figure in protocol.figures
-        ]
-    anchor_x, anchor_y = patch.anchor_mm[0] - patch.x_mm, patch.anchor_mm[1] - patch.y_mm
-    overhangs: dict[Condition, tuple[float, str]] = {}
-    for stroke in protocol.planned():
-        reach = reach_of(config.brush, stroke.condition)
-        beyond_mm = max(
-            reach.behind_mm - anchor_x,
-            anchor_x + reach.ahead_mm - patch.size_x_mm,
-            reach.side_mm - min(anchor_y, patch.size_y_mm - anchor_y),
-        )
-        overhangs.setdefault(stroke.condition, (beyond_mm, stroke.stroke_id))
-    return list(overhangs.values())
+    return [
+        f"{stroke_id} may reach {over_mm:.1f} mm beyond its patch of {sheet.cell_mm[0]:g} x {sheet.cell_mm[1]:g} mm, "
+        "by the closed-form stroke model: marks may run into each other"
+    ]
 
 
-def _figure_overhang(config: RigConfig, patch: Patch, point: tuple[float, float, float, float, float]) -> float:
-    """How far the line, half its width to either side of a drawn point, reaches beyond the patch."""
-    x_mm, y_mm, depth_mm, tilt_deg, _ = point
-    side_mm = reach_of(config.brush, Condition(depth_mm, tilt_deg)).side_mm
-    return side_mm - min(x_mm, y_mm, patch.size_x_mm - x_mm, patch.size_y_mm - y_mm)
+def _overhang_mm(brush: BrushConfig, stroke: Planned, patch: Patch) -> float:
+    """How far the mark of a press, or half the width of a drawn line to either side of it, reaches beyond the patch."""
+    beyond_mm: list[float] = []
+    for x_mm, y_mm, asked in marks_of(stroke, patch):
+        ahead_mm, behind_mm, side_mm = reach_of(brush, asked)
+        if stroke.drawn is not None:
+            ahead_mm = behind_mm = side_mm
+        right_mm, up_mm = x_mm - patch.x_mm, y_mm - patch.y_mm
+        beyond_mm += [behind_mm - right_mm, right_mm + ahead_mm - patch.size_x_mm]
+        beyond_mm += [side_mm - up_mm, up_mm + side_mm - patch.size_y_mm]
+    return max(beyond_mm)
 
 
 MOST_ROWS = 40
@@ -295,7 +215,8 @@ def plan_table(plan: Plan) -> Group:
         "sheets", f"{plan.sheets} of {plan.patches_per_sheet} patches{changes}" if plan.placed else "no marks"
     )
     totals.add_row("dips", str(plan.dips))
-    totals.add_row("ink", f"{plan.ink.ml:.1f} ml, {plan.ink.why}" if plan.dips else "none")
+    if plan.ink_ml is not None:
+        totals.add_row("ink", f"{plan.ink_ml:.1f} ml, dosed by the ink device")
     totals.add_row("steps", ", ".join(f"{count} {kind}" for kind, count in plan.steps.items()))
     totals.add_row("time", f"{duration(plan.seconds)}, not counting {OMITTED}")
     for kind, seconds in plan.seconds_by_kind.items():
@@ -325,3 +246,105 @@ def _conditions(plan: Plan) -> Table:
     if len(conditions) > MOST_ROWS:
         table.add_row("...", "...", f"{len(conditions) - MOST_ROWS} more", "")
     return table
+
+
+MOST_SHEETS = 11
+"""Most sheets drawn: with the view of the whole table, twelve panels."""
+
+
+def draw_plan(config: RigConfig, protocol: ProtocolConfig, plan: Plan, path: Path) -> None:
+    """Write the picture, in the format of the file's ending. `collect.rig.show.check_picture` must have passed.
+
+    Raises OSError if it cannot be written.
+    """
+    from matplotlib.figure import Figure as Picture
+
+    shown = min(plan.sheets, MOST_SHEETS) if plan.placed else 0
+    columns = 1 if shown == 0 else 2 if shown < 6 else 3
+    rows = math.ceil((shown + 1) / columns)
+    width, height = config.paper.size_mm
+    panel_in = 7.2
+    picture: Any = Picture(
+        figsize=(panel_in * columns, (panel_in * height / width + 0.35) * rows), layout="constrained"
+    )
+    axes: list[Axes] = list(picture.subplots(rows, columns, squeeze=False).flat)
+    sheet = sheet_of(config, protocol)
+    from_above(axes[0], config)
+    touched = [to_base(config.paper, *at) for at in plan.touches_mm]
+    axes[0].plot(*zip(*touched, strict=True), "x", color=ORANGE, markersize=9, mew=2.0)
+    axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=4, frameon=False)
+    drawn = {p.stroke_id: p.drawn for p in protocol.planned() if p.drawn is not None}
+    for number, panel in enumerate(axes[1 : shown + 1], 1):
+        _sheet(panel, config, sheet, number, plan, drawn)
+    for panel in axes[shown + 1 :]:
+        panel.set_axis_off()
+    if plan.sheets > shown > 0:
+        picture.suptitle(f"the first {shown} of {plan.sheets} sheets")
+    picture.savefig(path, dpi=110)
+
+
+def _sheet(
+    axes: Axes,
+    config: RigConfig,
+    sheet: Sheet,
+    number: int,
+    plan: Plan,
+    drawn: dict[str, Drawn],
+) -> None:
+    from matplotlib import colormaps
+
+    depths_mm = [press.condition.depth_mm for press in plan.placed]
+    low, high = min(depths_mm), max(depths_mm)
+    axes.add_patch(_outline((0.0, 0.0, *config.paper.size_mm), "black"))
+    placed = [(order, press) for order, press in enumerate(plan.placed, 1) if press.sheet == number - 1]
+    for order, press in placed:
+        assert press.patch is not None
+        patch, asked, figure = sheet.patch(press.patch), press.condition, drawn.get(press.stroke_id)
+        share = 0.5 if high == low else (asked.depth_mm - low) / (high - low)
+        shade = colormaps["cividis"](0.25 + 0.75 * (1.0 - share))
+        axes.add_patch(_outline(patch.rect_mm, GREY, shade if figure is None else None))
+        ink = "white" if figure is None and 0.25 + 0.75 * (1.0 - share) < 0.55 else "black"
+        points = max(4.0, min(0.34 * patch.size_y_mm, 0.17 * patch.size_x_mm) * 498.0 / config.paper.size_mm[0])
+        if figure is not None:
+            _figure(axes, patch.rect_mm, figure)
+            axes.text(patch.x_mm + 1.0, patch.y_mm + 1.0, f"#{order} {shown_name(press.stroke_id)}", fontsize=8)
+        else:
+            axes.text(
+                patch.x_mm + 0.36 * patch.size_x_mm,
+                patch.y_mm + 0.5 * patch.size_y_mm,
+                f"#{order}\nH{asked.depth_mm:g} a{asked.tilt_deg:g}",
+                fontsize=min(points, 9.0),
+                color=ink,
+                ha="center",
+                va="center",
+            )
+            axes.plot(*patch.anchor_mm, "+", color=ink, markersize=5, alpha=0.7)
+    if number == 1 and plan.steps.get("self_check"):
+        first = sheet.patch(0)
+        for patch in (first, *partners(sheet, first, set())):
+            axes.add_patch(_outline(patch.rect_mm, GREY))
+            axes.text(patch.x_mm + 2.0, patch.y_mm + 0.5 * patch.size_y_mm, "self-check", fontsize=8, va="center")
+    axes.plot(*zip(*plan.touches_mm, strict=True), "x", color=ORANGE, markersize=7, mew=2.0)
+    axes.set_xlim(-3.0, config.paper.size_mm[0] + 3.0)
+    axes.set_ylim(-3.0, config.paper.size_mm[1] + 3.0)
+    note = "" if drawn else ": # order, H mm, a deg; darker is deeper; + where the tip meets the paper"
+    finish(axes, f"sheet {number}, {len(placed)} strokes{note}")
+
+
+def _figure(axes: Axes, rect_mm: tuple[float, float, float, float], figure: Drawn) -> None:
+    """Trajectories, thicker where deeper, with a ring where each stroke begins."""
+    x_mm, y_mm, *_ = rect_mm
+    for number, stroke in enumerate(figure.strokes, 1):
+        for a, b in itertools.pairwise(stroke):
+            thick = 0.6 + 0.25 * max(0.0, 0.5 * (a[2] + b[2]))
+            axes.plot([x_mm + a[0], x_mm + b[0]], [y_mm + a[1], y_mm + b[1]], color=BLUE, lw=thick, alpha=0.75)
+        first = stroke[0]
+        axes.plot(x_mm + first[0], y_mm + first[1], "o", mfc="white", mec=ORANGE, markersize=9)
+        axes.text(x_mm + first[0], y_mm + first[1], str(number), fontsize=6, ha="center", va="center")
+
+
+def _outline(rect_mm: tuple[float, float, float, float], edge: str, face: object = None) -> Any:
+    from matplotlib.patches import Rectangle
+
+    x_mm, y_mm, size_x_mm, size_y_mm = rect_mm
+    return Rectangle((x_mm, y_mm), size_x_mm, size_y_mm, edgecolor=edge, facecolor=face or "none", linewidth=0.8)

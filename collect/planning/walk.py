@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from brushloop.collect.motion import (
+    Move,
     Region,
     Segment,
     inking_moves,
@@ -25,6 +27,7 @@ from brushloop.collect.protocols.steps import (
     DipStep,
     Drawn,
     DrawStep,
+    Planned,
     PressStep,
     Protocol,
     ReviewStep,
@@ -36,12 +39,18 @@ from brushloop.collect.protocols.steps import (
 )
 from brushloop.collect.rig.config import RigConfig
 from brushloop.collect.rig.config_touch import TouchConfig
-from brushloop.collect.rig.paper import Layout, PaperPlane, Patch, Sheet
+from brushloop.collect.rig.paper import PaperPlane, Patch, Sheet
 from brushloop.collect.touch.camera import SPOTS_PER_DIP
 from brushloop.collect.touch.heights import EXTENT_MM, lowest_z_mm, patch_spots, touch_rects
 from brushloop.collect.touch.selfcheck import partners, triangle_on
 from brushloop.drivers.devices import Pose
 from brushloop.sessions.events import PressResult, StepKind, StepResult
+from brushloop.sessions.records import Condition
+
+
+def poses_of(segment: Segment) -> Sequence[Pose]:
+    """Every pose that a segment commands; of a region, the outermost ones."""
+    return (segment.target,) if isinstance(segment, Move) else segment.poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +65,7 @@ class StepMoves:
     @property
     def poses(self) -> list[tuple[Pose, float]]:
         """Every pose that is commanded, with its speed in mm/s; of a `Region`, the outermost poses."""
-        return [(pose, segment.speed_mm_s) for segment in self.segments for pose in segment.poses]
+        return [(pose, segment.speed_mm_s) for segment in self.segments for pose in poses_of(segment)]
 
 
 def moves_of(
@@ -132,14 +141,22 @@ def _touches(config: RigConfig, plane: PaperPlane, step: ZeroTouchStep | TouchSt
 
 
 def _figure(config: RigConfig, plane: PaperPlane, drawn: Drawn, patch: Patch, dips: int) -> StepMoves:
+    """Every stroke of a figure; the DIP step has served the first, and the brush dips before each other one."""
     segments: list[Segment] = []
-    dipped = 0
     for number, points in enumerate(drawn.strokes):
-        if drawn.dips_before(number):
-            segments += inking_moves(config, dips + dipped)
-            dipped += 1
+        if number > 0:
+            segments += inking_moves(config, dips + number - 1)
         segments += stroke_moves(config, plane, patch, points, drawn.speed_mm_s)
-    return StepMoves(segments, dips=dipped)
+    return StepMoves(segments, dips=len(drawn.strokes) - 1)
+
+
+def marks_of(stroke: Planned, patch: Patch) -> Iterator[tuple[float, float, Condition]]:
+    """(x, y, what is commanded there) in the paper frame: the press on this patch, or each point of the figure."""
+    if stroke.drawn is None:
+        yield *patch.anchor_mm, stroke.condition
+        return
+    for x_mm, y_mm, depth_mm, tilt_deg, _ in itertools.chain.from_iterable(stroke.drawn.strokes):
+        yield patch.x_mm + x_mm, patch.y_mm + y_mm, Condition(depth_mm, tilt_deg)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,18 +176,9 @@ def sheet_of(config: RigConfig, protocol: ProtocolConfig) -> Sheet:
     return Sheet(config.paper, protocol.own_patch_mm)
 
 
-def layout_of(config: RigConfig, protocol: ProtocolConfig) -> Layout:
-    """The sheet's columns and rows, and the patches of the first sheet that the self-check uses."""
-    sheet = sheet_of(config, protocol)
-    if not config.self_check.enabled or not sheet.capacity:
-        return sheet.layout
-    first = sheet.patch(0)
-    return replace(sheet.layout, taken=frozenset({0} | {patch.index for patch in partners(sheet, first, set())}))
-
-
 def steps_on(config: RigConfig, protocol: ProtocolConfig) -> Protocol:
     """The steps as this rig runs them: balanced over its sheet, with the self-check if it is on."""
-    steps = protocol.steps(layout_of(config, protocol))
+    steps = protocol.steps(sheet_of(config, protocol).layout)
     return with_self_check(steps) if config.self_check.enabled else steps
 
 

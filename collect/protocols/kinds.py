@@ -1,45 +1,162 @@
-"""The kinds of protocol: `grid`, `few-strokes`, `list`, `replay` press; `write` draws; `calibration` only touches."""
+"""The kinds of protocol: `grid`, `few-strokes`, `list`, `replay` press; `write` draws; `calibration` only touches.
+
+A kind with rounds says what one round presses or draws; `RoundsConfig` makes the order of all rounds.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from abc import abstractmethod
-from typing import Annotated, ClassVar, Literal, Self
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import AfterValidator, AliasChoices, BaseModel, ConfigDict, Field, model_validator
 
 from brushloop.calibrate.stats import spread_out
-from brushloop.collect.protocols.plan import (
-    MAX_STROKES,
-    DeepMm,
-    DwellS,
-    FileName,
-    Planned,
-    ProtocolBase,
-    Repeats,
-    Seed,
-    StrokeId,
-    check_count,
-    check_distinct,
-    numbered,
-    shuffled,
-)
 from brushloop.collect.protocols.steps import (
     BoardStep,
     Drawn,
     HeadingDeg,
     InCellMm,
     PathDepthMm,
+    Planned,
     Protocol,
     TiltDeg,
     TouchStep,
     TrajectoryPoint,
     ZeroTouchStep,
+    balanced,
+    stroke_steps,
 )
 from brushloop.collect.rig.config_file import Config, Finite
 from brushloop.collect.rig.paper import Layout
 from brushloop.sessions.records import Condition
+
+MAX_STROKES = 10_000
+"""Most strokes of one protocol, repeats included: a month of pressing."""
+MAX_POINTS = 10_000
+"""Most points in all trajectories of one protocol together."""
+MAX_STROKE_POINTS = 1000
+MAX_ID = 100
+LEAST_APART_MM = 1.0
+"""ARCS reads a line shorter than this as a turn on the spot, with speeds in rad/s, and halts for it."""
+EARLIER_DEPTH, EARLIER_DEPTHS = AliasChoices("depth_mm", "height_mm"), AliasChoices("depths_mm", "heights_mm")
+"""Names of files that were written when the depth of a press was called a height."""
+
+_Values = TypeVar("_Values", bound=Sequence[object])
+
+
+def distinct(values: _Values) -> _Values:
+    """Return the values. Raises ValueError if one occurs twice."""
+    seen: set[object] = set()
+    for value in values:
+        if value in seen:
+            raise ValueError(f"{value!r} occurs twice")
+        seen.add(value)
+    return values
+
+
+def _stroke_id(ident: str) -> str:
+    if not 1 <= len(ident) <= MAX_ID:
+        raise ValueError(f"a name has 1 to {MAX_ID} characters")
+    if not ident.isprintable() or any(c in ' /\\<>:"|?*' for c in ident) or ident[0] in ".-~":
+        what = 'a name has no spaces, control characters, slashes or any of < > : " | ? *, and begins with no . - ~'
+        raise ValueError(what)
+    return ident
+
+
+StrokeId = Annotated[str, AfterValidator(_stroke_id)]
+"""A name that names files and is shown on terminals."""
+DeepMm = Annotated[float, Field(gt=0.0, le=100.0)]
+DwellS = Annotated[float, Field(ge=0.0, le=60.0)]
+CellMm = Annotated[float, Field(ge=10.0, le=500.0)]
+Repeats = Annotated[int, Field(ge=1, le=1000)]
+Seed = Annotated[int, Field(ge=0)]
+FileName = Annotated[str, Field(min_length=1, max_length=200)]
+Depths = Annotated[list[DeepMm], Field(min_length=1, max_length=100), AfterValidator(distinct)]
+Tilts = Annotated[list[TiltDeg], Field(min_length=1, max_length=100), AfterValidator(distinct)]
+Place = tuple[Finite, Finite]
+
+
+class ProtocolBase(Config):
+    """Fields and methods of every kind."""
+
+    depths_field: ClassVar[str] = "presses"
+    """The field that the error names if a depth is more than the brush can take."""
+    row: ClassVar[type[BaseModel] | None] = None
+    """Model of a row of the CSV that `file` names; the rows become `presses`."""
+
+    board_every: Annotated[int, Field(ge=1, le=MAX_STROKES)] | None = None
+    """Photograph the board again after this many strokes, to see whether camera or sheet moved; if left out, only at
+    the start."""
+    wait_after_dip_s: Annotated[float, Field(ge=0.0, le=600.0)] | None = None
+    """Wait over the patch until this much time has passed since the brush left the ink; if left out, it presses at
+    once."""
+
+    @property
+    def own_patch_mm(self) -> tuple[float, float] | None:
+        """Size of the paper patch that each stroke needs; None for that of the rig, `paper.cell_mm`."""
+        return None
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every stroke exactly once, in order; none for a protocol that marks nothing.
+
+        With a `layout`, conditions are spread over the sheet.
+        """
+        return []
+
+    def steps(self, layout: Layout | None = None) -> Protocol:
+        """Return the generator of steps. The layout changes the order of the steps, never their keys."""
+        return stroke_steps(self.planned(layout), board_every=self.board_every)
+
+
+class RoundsConfig(ProtocolBase):
+    """A protocol that presses or draws the same in each of several rounds."""
+
+    repeats: Repeats = 1
+    """Rounds."""
+    seed: Seed | None = None
+    """Shuffles each round and spreads the conditions over the sheet; if left out, the order is that of the round."""
+
+    @abstractmethod
+    def round(self, repeat: int) -> list[Planned]:
+        """The strokes of round `repeat`, counted from 1, in the order of the file."""
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        strokes = len(self.round(1)) * self.repeats
+        if strokes > MAX_STROKES:
+            raise ValueError(f"{strokes} strokes with repeats, at most {MAX_STROKES}")
+        for stroke_id, count in Counter(stroke.stroke_id for stroke in self.planned()).items():
+            if count > 1:
+                raise ValueError(f"{self.depths_field}: {stroke_id!r} occurs twice")
+        return self
+
+    def planned(self, layout: Layout | None = None) -> list[Planned]:
+        """Every stroke of every round; with a seed shuffled, and balanced over the sheet where its layout is known.
+
+        Rounds keep a drift of ink or paper from looking like an effect of H or alpha. The balance does the same for
+        unevenness of the paper or of the camera's view.
+        """
+        rounds = [self.round(repeat) for repeat in range(1, self.repeats + 1)]
+        if self.seed is not None:
+            rng, order = random.Random(self.seed), list(range(len(rounds[0])))
+            for k, strokes in enumerate(rounds):
+                rng.shuffle(order)
+                rounds[k] = [strokes[i] for i in order]
+        numbers = itertools.count()
+        rounds = [[replace(stroke, index=next(numbers)) for stroke in strokes] for strokes in rounds]
+        if self.seed is not None and layout is not None and layout.capacity > 0:
+            orders = balanced([[stroke.condition for stroke in strokes] for strokes in rounds], layout, self.seed)
+            rounds = [[strokes[i] for i in order] for strokes, order in zip(rounds, orders, strict=True)]
+        return [stroke for strokes in rounds for stroke in strokes]
+
+
+# Presses of a grid
 
 
 class _DesignConfig(ProtocolBase):
@@ -47,54 +164,32 @@ class _DesignConfig(ProtocolBase):
 
     depths_field: ClassVar[str] = "depths_mm"
 
-    depths_mm: Annotated[list[DeepMm], Field(min_length=1, max_length=100)]
+    depths_mm: Depths = Field(validation_alias=EARLIER_DEPTHS)
     """Depths H below the touch height."""
-    tilts_deg: Annotated[list[TiltDeg], Field(min_length=1, max_length=100)]
+    tilts_deg: Tilts
     """Tilts alpha from the paper's normal."""
     dwell_s: DwellS = 0.2
     """Time at full depth."""
 
-    @model_validator(mode="after")
-    def _distinct(self) -> Self:
-        check_distinct("depths_mm", self.depths_mm)
-        check_distinct("tilts_deg", self.tilts_deg)
-        return self
-
-    def _press(self, condition: Condition, repeat: int) -> Planned:
+    def press(self, condition: Condition, repeat: int) -> Planned:
+        """The press of a condition in round `repeat`, counted from 1."""
         name = f"H{condition.depth_mm:g}-a{condition.tilt_deg:g}-r{repeat:02d}"
         return Planned(name, condition, repeat, dwell_s=self.dwell_s)
 
 
-class GridConfig(_DesignConfig):
-    """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`.
-
-    Where the layout of the sheet is known, the order also spreads each (H, alpha) over the sheet (`protocols.plan`).
-    """
+class GridConfig(_DesignConfig, RoundsConfig):
+    """The paper's grid: every depth at every tilt, `repeats` times, in an order shuffled by `seed`."""
 
     kind: Literal["grid"]
     repeats: Repeats = 10
     """Rounds: each holds every (H, alpha) once."""
-    seed: Seed = 1
+    seed: Seed | None = 1
     """Seed of the order."""
 
-    @model_validator(mode="after")
-    def _bounded(self) -> Self:
-        check_count(len(self.depths_mm) * len(self.tilts_deg) * self.repeats)
-        return self
-
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every cell of the grid `repeats` times; each round holds all cells once, in its own shuffled order.
-
-        Rounds keep a drift of ink or paper from looking like an effect of H or alpha. With a layout, each (H, alpha) is
-        also spread over the sheet, which does the same for unevenness of the paper or of the camera's view.
-        """
-        rng = random.Random(self.seed)
-        conditions = [Condition(h, a) for h in self.depths_mm for a in self.tilts_deg]
-        rounds: list[list[Planned]] = []
-        for repeat in range(1, self.repeats + 1):
-            rng.shuffle(conditions)
-            rounds.append([self._press(condition, repeat) for condition in conditions])
-        return numbered(rounds, self.seed, layout)
+    def round(self, repeat: int) -> list[Planned]:
+        """Every cell of the grid."""
+        conditions = [Condition(depth_mm, tilt_deg) for depth_mm in self.depths_mm for tilt_deg in self.tilts_deg]
+        return [self.press(condition, repeat) for condition in conditions]
 
 
 class FewStrokesConfig(_DesignConfig):
@@ -106,49 +201,35 @@ class FewStrokesConfig(_DesignConfig):
 
     def planned(self, layout: Layout | None = None) -> list[Planned]:
         """The presses in the order of the design, which does not depend on the sheet."""
-        order = [Condition(h, a) for h, a in spread_out(self.depths_mm, self.tilts_deg)]
-        rounds = math.ceil(self.strokes / len(order))
-        presses = [self._press(condition, repeat) for repeat in range(1, rounds + 1) for condition in order]
-        return numbered([presses[: self.strokes]], None, None)
+        order = [Condition(depth_mm, tilt_deg) for depth_mm, tilt_deg in spread_out(self.depths_mm, self.tilts_deg)]
+        presses: list[Planned] = []
+        for index in range(self.strokes):
+            again, k = divmod(index, len(order))
+            presses.append(replace(self.press(order[k], again + 1), index=index))
+        return presses
 
 
-class _TableConfig(ProtocolBase):
-    """Presses one by one, from a CSV next to `protocol.toml` or written out in it as `presses`."""
-
-    file: FileName | None = None
-    """CSV with a column for each field of a press."""
-    repeats: Repeats = 1
-    """Rounds: each holds every press once."""
-    seed: Seed | None = None
-    """Shuffles each round; if left out, the order is that of the list."""
-    dwell_s: DwellS = 0.2
-    """Time at full depth of presses that have no `dwell_s` of their own."""
-
-    @model_validator(mode="after")
-    def _named_apart(self) -> Self:
-        check_count(len(self.round(1)) * self.repeats)
-        check_distinct("presses", [stroke.stroke_id for stroke in self.planned()])
-        return self
-
-    @abstractmethod
-    def round(self, repeat: int) -> list[Planned]:
-        """The presses of round `repeat`, counted from 1, in the order of the list."""
-
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every press `repeats` times, in rounds; shuffled and balanced over the sheet where there is a seed."""
-        rounds = [self.round(repeat) for repeat in range(1, self.repeats + 1)]
-        return numbered(shuffled(rounds, self.seed), self.seed, layout)
+# Presses one by one
 
 
 class PressRow(Config):
     """One press of a list."""
 
-    depth_mm: DeepMm
+    depth_mm: DeepMm = Field(validation_alias=EARLIER_DEPTH)
     tilt_deg: TiltDeg = 0.0
     dwell_s: DwellS | None = None
     """Time at full depth; if left out, the protocol's."""
     stroke_id: StrokeId | None = None
     """If left out, it is made from the row's number, H and alpha."""
+
+
+class _TableConfig(RoundsConfig):
+    """Presses one by one, from a CSV next to `protocol.toml` or written out in it as `presses`."""
+
+    file: FileName | None = None
+    """CSV with a column for each field of a press."""
+    dwell_s: DwellS = 0.2
+    """Time at full depth of presses that have no `dwell_s` of their own."""
 
 
 class ListConfig(_TableConfig):
@@ -177,31 +258,29 @@ class ListConfig(_TableConfig):
 
 
 class ReplayRow(Config):
-    """One stroke as an inversion recovered it."""
+    """One stroke as an inversion recovered it; other columns of the CSV are ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
 
     stroke_id: StrokeId
     """Its id in the original session."""
-    depth_mm: DeepMm
+    depth_mm: DeepMm = Field(validation_alias=EARLIER_DEPTH)
     tilt_deg: TiltDeg
 
 
 class ReplayConfig(_TableConfig):
     """Press again what an inversion recovered from the images of an earlier session, to compare mark with mark.
 
-    The CSV has the columns `stroke_id`, `depth_mm` and `tilt_deg`; any other column is ignored, and named in
-    `ignored_columns`.
+    The CSV has the columns `stroke_id`, `depth_mm` and `tilt_deg`.
     """
 
     row: ClassVar[type[BaseModel] | None] = ReplayRow
-    ignores_columns: ClassVar[bool] = True
 
     kind: Literal["replay"]
     of: StrokeId
     """Id of the session that the strokes are from."""
     presses: Annotated[tuple[ReplayRow, ...], Field(min_length=1, max_length=MAX_STROKES)]
     """The presses, under the ids that the strokes had. Read from `file` where one is named."""
-    ignored_columns: tuple[str, ...] = ()
-    """Columns of `file` that are not used."""
 
     def round(self, repeat: int) -> list[Planned]:
         """The presses of round `repeat`: `H13-a5-r02` pressed again is `H13-a5-r02~1`, then `~2` and so on.
@@ -221,12 +300,7 @@ class ReplayConfig(_TableConfig):
         ]
 
 
-MAX_POINTS = 10_000
-"""Most points in all trajectories of one protocol together."""
-LEAST_APART_MM = 1.0
-"""ARCS reads a line shorter than this as a turn on the spot, with speeds in rad/s, and halts for it."""
-
-CellMm = Annotated[float, Field(ge=10.0, le=500.0)]
+# Figures
 
 
 class PointRow(Config):
@@ -234,7 +308,7 @@ class PointRow(Config):
 
     x_mm: InCellMm
     y_mm: InCellMm
-    depth_mm: PathDepthMm
+    depth_mm: PathDepthMm = Field(validation_alias=EARLIER_DEPTH)
     tilt_deg: TiltDeg = 0.0
     heading_deg: HeadingDeg = 0.0
 
@@ -249,22 +323,17 @@ class DrawnStroke(Config):
 
     file: FileName | None = None
     """CSV with the columns `x_mm`, `y_mm`, `depth_mm` and optionally `tilt_deg` and `heading_deg`."""
-    points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=2, max_length=1000)]
+    points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=2, max_length=MAX_STROKE_POINTS)]
     """Points [x_mm, y_mm, depth_mm, tilt_deg, heading_deg]. Read from `file` where one is named."""
 
     @model_validator(mode="after")
     def _marks(self) -> Self:
-        for number, (a, b) in enumerate(zip(self.points, self.points[1:], strict=False), 2):
+        for number, (a, b) in enumerate(itertools.pairwise(self.points), 2):
             if math.dist(a[:3], b[:3]) < LEAST_APART_MM:
                 raise ValueError(f"point {number} is less than {LEAST_APART_MM:g} mm from the previous point")
         if max(point[2] for point in self.points) <= 0.0:
             raise ValueError("no point is below the touch height: nothing would be drawn")
         return self
-
-    @property
-    def deepest(self) -> TrajectoryPoint:
-        """The first of its deepest points."""
-        return max(self.points, key=lambda point: point[2])
 
 
 class Figure(Config):
@@ -276,7 +345,7 @@ class Figure(Config):
     """The strokes, in the order of writing."""
 
 
-class WriteConfig(ProtocolBase):
+class WriteConfig(RoundsConfig):
     """Trajectories to draw: x, y, depth, tilt and heading, in the frame of the figure's own paper patch."""
 
     depths_field: ClassVar[str] = "figures"
@@ -286,22 +355,11 @@ class WriteConfig(ProtocolBase):
     """Width and height of the patch for one figure. Its lower left corner is the origin, x along the sheet's x."""
     figures: Annotated[tuple[Figure, ...], Field(min_length=1, max_length=1000)]
     """The figures, in the order of writing."""
-    repeats: Repeats = 1
-    """Rounds: each holds every figure once."""
-    seed: Seed | None = None
-    """Shuffles each round; if left out, the order is that of the list."""
     speed_mm_s: Annotated[float, Field(ge=1.0, le=100.0)] = 20.0
     """Speed of the tip along the trajectory."""
-    blend_mm: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
-    """Distance from a point at which the tip may turn towards the next, so that the arm does not halt there. ARCS
-    accepts no less than 1 mm."""
-    dip_every_strokes: Annotated[int, Field(ge=0, le=100)] = 1
-    """Dip again within a figure after this many strokes; 0 writes it with one dip."""
 
     @model_validator(mode="after")
-    def _on_the_cell(self) -> Self:
-        check_distinct("figures", [figure.name for figure in self.figures])
-        check_count(len(self.figures) * self.repeats)
+    def _on_the_patch(self) -> Self:
         points = 0
         for figure in self.figures:
             for number, stroke in enumerate(figure.strokes, 1):
@@ -321,57 +379,41 @@ class WriteConfig(ProtocolBase):
         """The patch of one figure."""
         return self.cell_mm
 
-    def planned(self, layout: Layout | None = None) -> list[Planned]:
-        """Every figure `repeats` times, in rounds. `layout` changes nothing: figures are not conditions of a design."""
-        rounds = [
-            [self._drawn(figure, repeat, number) for number, figure in enumerate(self.figures)]
-            for repeat in range(1, self.repeats + 1)
-        ]
-        return [stroke for strokes in shuffled(rounds, self.seed) for stroke in strokes]
-
-    def _drawn(self, figure: Figure, repeat: int, number: int) -> Planned:
-        """Figure `number`, from 0, of round `repeat`, from 1."""
-        _, _, depth_mm, tilt_deg, _ = max((stroke.deepest for stroke in figure.strokes), key=lambda point: point[2])
-        drawn = Drawn(
-            [list(stroke.points) for stroke in figure.strokes],
-            self.cell_mm,
-            self.speed_mm_s,
-            self.blend_mm,
-            self.dip_every_strokes,
-        )
-        index = (repeat - 1) * len(self.figures) + number
-        return Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), repeat, index, drawn=drawn)
+    def round(self, repeat: int) -> list[Planned]:
+        """Every figure, under the condition of its deepest point."""
+        strokes: list[Planned] = []
+        for figure in self.figures:
+            drawn = Drawn([list(stroke.points) for stroke in figure.strokes], self.cell_mm, self.speed_mm_s)
+            points = itertools.chain.from_iterable(drawn.strokes)
+            _, _, depth_mm, tilt_deg, _ = max(points, key=lambda point: point[2])
+            strokes.append(Planned(f"{figure.name}-r{repeat:02d}", Condition(depth_mm, tilt_deg), repeat, drawn=drawn))
+        return strokes
 
 
 class CalibrationConfig(ProtocolBase):
     """Touches and views of the board, nothing else: no ink, no mark."""
 
     kind: Literal["calibration"]
-    touches_mm: Annotated[tuple[tuple[Finite, Finite], ...], Field(max_length=200)] = ()
+    touches_mm: Annotated[tuple[Place, ...], Field(max_length=200), AfterValidator(distinct)] = ()
     """Points of the sheet to touch, x and y in the paper frame. Three that are not on a line give the sheet's slope."""
     rounds: Annotated[int, Field(ge=1, le=100)] = 1
     """How often all of them are touched: the spread of a point over the rounds shows how well a touch repeats."""
-    board_views: Annotated[int, Field(ge=1, le=1000)] = 1
+    board_views: Annotated[int, Field(ge=1, le=100)] = 1
     """How often the board is photographed in each round."""
 
     @model_validator(mode="after")
-    def _apart(self) -> Self:
+    def _without_strokes(self) -> Self:
         if self.board_every is not None:
             raise ValueError("board_every counts strokes, and this protocol has none: use board_views")
         if self.wait_after_dip_s is not None:
             raise ValueError("wait_after_dip_s: this protocol has no dips")
-        check_distinct("touches_mm", self.touches_mm)
-        check_count((len(self.touches_mm) + self.board_views) * self.rounds)
         return self
 
     def steps(self, layout: Layout | None = None) -> Protocol:
         """Zero touch, then in each round every touch and every view of the board."""
         yield ZeroTouchStep(0)
-        touches = views = 0
-        for _ in range(self.rounds):
-            for x_mm, y_mm in self.touches_mm:
-                yield TouchStep(touches, x_mm, y_mm)
-                touches += 1
-            for _ in range(self.board_views):
-                yield BoardStep(views)
-                views += 1
+        for number in range(self.rounds):
+            for k, (x_mm, y_mm) in enumerate(self.touches_mm):
+                yield TouchStep(number * len(self.touches_mm) + k, x_mm, y_mm)
+            for k in range(self.board_views):
+                yield BoardStep(number * self.board_views + k)

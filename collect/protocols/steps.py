@@ -1,16 +1,35 @@
-"""Steps: the units of a protocol and of resume. Each kind is a class with its parameters."""
+"""Steps: the units of a protocol and of resume, each kind a class with its parameters. Then the strokes of a plan: the
+steps of each, and their order over the sheet.
+
+Conditions are spread over the sheet. Its patches are used in order, so a stroke's number determines its place. The
+sheet is cut into three bands of rows and three of columns; within each round, pairs of strokes change places wherever
+that evens out how often each (H, alpha) lies in each band. Rounds stay whole, so a drift of ink still affects every
+condition alike. A void press shifts what follows by one patch: only the plan stays balanced.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Generator
-from dataclasses import dataclass
+import itertools
+import random
+from collections.abc import Generator, Hashable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import Field, TypeAdapter
 
-from brushloop.sessions.events import Press, StepKind, StepResult
+from brushloop.collect.rig.paper import Layout
+from brushloop.sessions.events import (
+    CaptureResult,
+    DipResult,
+    Press,
+    PressResult,
+    ReviewResult,
+    StepKind,
+    StepResult,
+)
+from brushloop.sessions.records import Condition
 
 MEASURED = {"reached_mm", "dip_to_touch_s"}
 """Fields of a press that are measured, and not asked for."""
@@ -31,12 +50,6 @@ class Drawn:
     cell_mm: tuple[float, float]
     """Size of the figure's patch."""
     speed_mm_s: float
-    blend_mm: float
-    dip_every_strokes: int
-
-    def dips_before(self, stroke: int) -> bool:
-        """Whether the brush dips again before that stroke, counted from 0; the DIP step already served stroke 0."""
-        return stroke > 0 and self.dip_every_strokes > 0 and stroke % self.dip_every_strokes == 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,3 +180,132 @@ def with_self_check(protocol: Protocol) -> Protocol:
 def press_of(step: Step) -> Press | None:
     """The press that a step makes or photographs; None for the other kinds."""
     return step.press if isinstance(step, PressStep | DrawStep | CaptureStep) else None
+
+
+AGAIN = "-again"
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """One press, or one figure of several strokes."""
+
+    stroke_id: str
+    condition: Condition
+    """What is commanded; of a figure, at its deepest point."""
+    repeat: int
+    """Round, from 1."""
+    index: int = 0
+    """Number in the plan before it was balanced over the sheet. The keys of its steps are made with it, so that they do
+    not depend on the sheet."""
+    dwell_s: float = 0.0
+    drawn: Drawn | None = None
+    """The figure; None for a press."""
+    again_of: str | None = None
+    """The stroke of another session that this one repeats."""
+
+    def press(self, take: int = 1) -> Press:
+        """The press of one take."""
+        return Press(stroke_id=self.stroke_id, condition=self.condition, take=take)
+
+
+def with_review(plan: Iterable[Planned], reviewed: ReviewResult) -> list[Planned]:
+    """The plan after a REVIEW step: each stroke that was marked bad is replaced by the same under another name.
+
+    The recording holds both, and the first stays marked bad.
+    """
+    indices = {again.stroke_id: again.index for again in reviewed.again}
+    return [
+        replace(p, stroke_id=f"{p.stroke_id}{AGAIN}", index=indices[p.stroke_id]) if p.stroke_id in indices else p
+        for p in plan
+    ]
+
+
+def stroke_steps(plan: Iterable[Planned], *, board_every: int | None) -> Protocol:
+    """Zero touch, board, then dip, press or draw, capture for each stroke of the plan."""
+    yield ZeroTouchStep(0)
+    yield BoardStep(0)
+    for number, stroke in enumerate(plan):
+        if board_every is not None and number > 0 and number % board_every == 0:
+            yield BoardStep(number // board_every)
+        yield from takes(stroke)
+
+
+def takes(stroke: Planned) -> Protocol:
+    """Steps of one stroke: dip, press or draw, capture; repeated while the capture asks for a retake."""
+    index, drawn, again_of = stroke.index, stroke.drawn, stroke.again_of
+    for take in itertools.count(1):
+        dipped = yield DipStep(index, take)
+        if isinstance(dipped, DipResult) and dipped.skipped is not None:
+            break
+        press = stroke.press(take)
+        step = PressStep(index, press, stroke.dwell_s, again_of) if drawn is None else DrawStep(index, press, drawn)
+        marked = yield step
+        assert isinstance(marked, PressResult)
+        seen = yield CaptureStep(index, marked.press, again_of, drawn is not None)
+        if not (isinstance(seen, CaptureResult) and seen.retake):
+            break
+
+
+BANDS = 3
+TRIALS_PER_STROKE = 60
+"""Pairs tried for each stroke of a round; more hardly changes the result."""
+
+
+def balanced(rounds: Sequence[Sequence[Hashable]], layout: Layout, seed: int) -> list[list[int]]:
+    """The order of each round, as indices into it.
+
+    `rounds` holds the condition of every stroke. The same arguments give the same order in every process.
+    """
+    rng = random.Random(f"balance {seed}")
+    share = _shares(layout)
+    seen: dict[Hashable, list[int]] = {}
+    orders: list[list[int]] = []
+    places = itertools.count()
+    for conditions in rounds:
+        order = list(range(len(conditions)))
+        bands = [_bands(layout, next(places)) for _ in order]
+        for condition, at in zip(conditions, bands, strict=True):
+            _count(seen.setdefault(condition, [0] * (2 * BANDS)), at, 1)
+        for _ in range(TRIALS_PER_STROKE * len(order) if len(order) > 1 else 0):
+            i, k = rng.sample(range(len(order)), 2)
+            a, b = conditions[order[i]], conditions[order[k]]
+            if a == b or bands[i] == bands[k]:
+                continue
+            before = _unevenness(seen[a], share) + _unevenness(seen[b], share)
+            _exchange(seen[a], seen[b], bands[i], bands[k])
+            if _unevenness(seen[a], share) + _unevenness(seen[b], share) < before - 1e-9:
+                order[i], order[k] = order[k], order[i]
+            else:
+                _exchange(seen[a], seen[b], bands[k], bands[i])
+        orders.append(order)
+    return orders
+
+
+def _bands(layout: Layout, place: int) -> tuple[int, int]:
+    """(row band, column band) of the stroke with that number; column bands are numbered after the row bands."""
+    row, column = divmod(place % layout.capacity, layout.columns)
+    return BANDS * row // layout.rows, BANDS + BANDS * column // layout.columns
+
+
+def _shares(layout: Layout) -> list[float]:
+    """Share of the sheet that each band holds; bands that hold nothing count as one patch."""
+    counts = [0] * (2 * BANDS)
+    for place in range(layout.capacity):
+        _count(counts, _bands(layout, place), 1)
+    return [max(count, 1) / layout.capacity for count in counts]
+
+
+def _count(counts: list[int], bands: tuple[int, int], by: int) -> None:
+    for band in bands:
+        counts[band] += by
+
+
+def _exchange(a: list[int], b: list[int], from_bands: tuple[int, int], to_bands: tuple[int, int]) -> None:
+    for counts, out, into in ((a, from_bands, to_bands), (b, to_bands, from_bands)):
+        _count(counts, out, -1)
+        _count(counts, into, 1)
+
+
+def _unevenness(counts: list[int], share: list[float]) -> float:
+    """Measure of unevenness: smallest if the counts are in proportion to the shares."""
+    return sum(count * count / part for count, part in zip(counts, share, strict=True))

@@ -7,14 +7,14 @@ judges the measured mark, called by `check_capture` if it judges the photograph 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
 from brushloop.calibrate.board.pix2len import Plane
-from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
-from brushloop.calibrate.stroke.rectify import rectify
+from brushloop.calibrate.stroke import PX_PER_MM, Gray
 from brushloop.collect.quality import measure
 from brushloop.collect.quality.measure import (
     Ink,
@@ -30,19 +30,7 @@ from brushloop.collect.quality.measure import (
 )
 from brushloop.collect.rig.config_touch import QualityConfig
 from brushloop.collect.rig.paper import Patch
-
-
-class Family(StrEnum):
-    """What a failure makes useless, and therefore what must be done again."""
-
-    PICTURE = "picture"
-    """The photograph, not the stroke: remove the cause and photograph again; the stroke on paper may be sound."""
-    PLACE = "place"
-    """The ink is not where it belongs: press on a new patch."""
-    INK = "ink"
-    """Too little ink: dip again and press on a new patch."""
-    SHAPE = "shape"
-    """The hairs lay badly: comb or wipe the brush, dip, and press on a new patch."""
+from brushloop.sessions.records import Check
 
 
 class Failure(StrEnum):
@@ -52,41 +40,23 @@ class Failure(StrEnum):
     only if the hairs carried ink; its shape comes last.
     """
 
-    family: Family
-    """What it makes useless."""
+    EXPOSURE = "exposure"
+    BLURRED = "blurred"
+    CUT = "cut"
+    GLARE = "glare"
+    NEIGHBOUR = "neighbour"
+    BLANK = "blank"
+    DRY = "dry"
+    SMEARED = "smeared"
+    MISPLACED = "misplaced"
+    FAINT = "faint"
+    SPLIT = "split"
+    BENT = "bent"
 
-    def __new__(cls, value: str, family: Family) -> Failure:
-        """Make a member that equals its text and carries its family."""
-        member = str.__new__(cls, value)
-        member._value_ = value
-        member.family = family
-        return member
-
-    EXPOSURE = "exposure", Family.PICTURE
-    BLURRED = "blurred", Family.PICTURE
-    CUT = "cut", Family.PICTURE
-    GLARE = "glare", Family.PICTURE
-    NEIGHBOUR = "neighbour", Family.PLACE
-    BLANK = "blank", Family.INK
-    DRY = "dry", Family.INK
-    SMEARED = "smeared", Family.PLACE
-    MISPLACED = "misplaced", Family.PLACE
-    FAINT = "faint", Family.INK
-    SPLIT = "split", Family.SHAPE
-    BENT = "bent", Family.SHAPE
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One measured property of a capture."""
-
-    name: Failure
-    score: float
-    unit: str
-    threshold: float
-    passed: bool
-    reason: str
-    """What is wrong and what to do about it; empty where it passed."""
+    @property
+    def of_picture(self) -> bool:
+        """Whether the photograph failed, not the stroke: the stroke on paper may be sound."""
+        return self in (Failure.EXPOSURE, Failure.BLURRED, Failure.CUT, Failure.GLARE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +64,11 @@ class Verdict:
     """All checks of one capture that could be measured, in the order of `Failure`."""
 
     checks: tuple[Check, ...]
+
+    @classmethod
+    def of(cls, checks: Iterable[Check]) -> Verdict:
+        """The verdict of checks in any order."""
+        return cls(tuple(sorted(checks, key=lambda check: list(Failure).index(Failure(check.name)))))
 
     @property
     def passed(self) -> bool:
@@ -154,16 +129,30 @@ def check_capture(
     if not frame.passed:
         return frame
     anchor = patch.anchor_mm if anchor_mm is None else anchor_mm
-    press = _Press(image, previous, plane, patch, anchor, depth_mm, sheet_mm, limits)
-    ink = press.ink(MARGIN_MM)
-    checks = [
-        *frame.checks,
-        cut(ink, plane, image.shape, anchor, limits),
-        glare(image, plane, press.around(LIGHT_MM), press.cell_mm, limits),
-    ]
-    if all(check.passed for check in checks):
-        checks += _ink_checks(press, ink)
-    return Verdict(tuple(sorted(checks, key=lambda check: list(Failure).index(check.name))))
+    inside = on_sheet(patch.rect_mm, sheet_mm)
+
+    def ink_within(margin_mm: float) -> Ink:
+        """The ink in the patch and a margin around it: the stroke's own, other new ink, and old ink."""
+        window = around(patch.rect_mm, margin_mm, sheet_mm)
+        before = None if previous is None else take(previous, plane, window, measure.COARSE_PX_PER_MM)
+        return tell_apart(take(image, plane, window), before, inside, anchor, limits.ink_gate)
+
+    ink = ink_within(MARGIN_MM)
+    light = around(patch.rect_mm, LIGHT_MM, sheet_mm)
+    checks = [*frame.checks, cut(ink, plane, image.shape, anchor, limits), glare(image, plane, light, inside, limits)]
+    if not all(check.passed for check in checks):
+        return Verdict.of(checks)
+    checks.append(neighbour(ink, limits))
+    enough = blank(ink.own_mm2, depth_mm, limits)
+    mark = measure_mark(ink, anchor)
+    if not enough.passed or mark is None:
+        away = None if previous is None else far_off(ink_within(FAR_MM), anchor, depth_mm, limits)
+        return Verdict.of([*checks, away or enough])
+    checks += [enough, dry(mark, limits)]
+    if checks[-1].passed:
+        # The head, tip and tone of a dry brush's mark mean nothing.
+        checks += [smeared(mark, depth_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
+    return Verdict.of(checks)
 
 
 def check_drawing(
@@ -174,18 +163,21 @@ def check_drawing(
     depth_mm: float,
     limits: QualityConfig,
     previous: Gray | None = None,
+    sheet_mm: tuple[float, float] | None = None,
 ) -> Verdict:
     """Judge a figure, drawn down to `depth_mm`, from the (h, w) photograph taken after it.
 
     Checks exposure and blur, that the patch holds ink that `previous` does not show, and that nothing new lies across
     the patch's edge, as an arm still in the picture would. The shape is not judged: every figure has its own.
+    `sheet_mm` is as in `check_capture`.
     """
     frame = check_frame(image, plane, limits)
     if not frame.passed:
         return frame
-    inked = take(image, plane.homography, patch.rect_mm, Params()).inked(limits.ink_gate)
+    inside = on_sheet(patch.rect_mm, sheet_mm)
+    inked = take(image, plane, inside).inked(limits.ink_gate)
     if previous is not None:
-        inked = inked & ~take(previous, plane.homography, patch.rect_mm, Params()).inked(limits.ink_gate)
+        inked = inked & ~take(previous, plane, inside).inked(limits.ink_gate)
     edge = np.concatenate([inked[0], inked[-1], inked[1:-1, 0], inked[1:-1, -1]])
     return Verdict((*frame.checks, crossing(float(edge.sum()) / PX_PER_MM), blank(mm2(inked), depth_mm, limits)))
 
@@ -197,7 +189,7 @@ def patch_is_blank(
 
     `sheet_mm` (width, height) excludes the sheet's edge and what lies beyond it.
     """
-    window = take(image, plane.homography, on_sheet(patch.rect_mm, sheet_mm), Params())
+    window = take(image, plane, on_sheet(patch.rect_mm, sheet_mm))
     hidden_mm2 = mm2(~window.in_view)
     if hidden_mm2 > 0.0:
         # A patch that lies partly outside the frame cannot be called blank.
@@ -205,7 +197,7 @@ def patch_is_blank(
             f"Patch {patch.index} is not completely in the picture, {hidden_mm2:.0f} mm^2 are hidden. "
             "Move the camera or the sheet."
         )
-        return Check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, False, reason)
+        return _check(Failure.NEIGHBOUR, hidden_mm2, "mm^2", limits.foreign_mm2, reason, passed=False)
     ink_mm2 = mm2(window.inked(limits.ink_gate))
     reason = (
         f"Patch {patch.index} is not blank: {ink_mm2:.1f} mm^2 of ink. Is this the sheet that the session says it is?"
@@ -213,69 +205,17 @@ def patch_is_blank(
     return _below(Failure.NEIGHBOUR, ink_mm2, "mm^2", limits.foreign_mm2, reason)
 
 
-@dataclass(frozen=True, slots=True)
-class _Press:
-    """The arguments of `check_capture`."""
-
-    image: Gray
-    previous: Gray | None
-    plane: Plane
-    patch: Patch
-    anchor_mm: Point
-    depth_mm: float
-    sheet_mm: tuple[float, float] | None
-    limits: QualityConfig
-
-    @property
-    def cell_mm(self) -> Rect:
-        """The patch, without what lies at the sheet's edge."""
-        return on_sheet(self.patch.rect_mm, self.sheet_mm)
-
-    def around(self, margin_mm: float) -> Rect:
-        """The patch with a margin, clipped to the sheet."""
-        return around(self.patch.rect_mm, margin_mm, self.sheet_mm)
-
-    def ink(self, margin_mm: float) -> Ink:
-        """The ink in the patch and a margin around it: the stroke's own, other new ink, and old ink."""
-        window, to_paper = self.around(margin_mm), self.plane.homography
-        now = take(self.image, to_paper, window, Params())
-        before = None if self.previous is None else take(self.previous, to_paper, window, Params())
-        return tell_apart(now, before, self.cell_mm, self.anchor_mm, self.limits.ink_gate)
-
-    def away_mm(self) -> float | None:
-        """Distance from the anchor to new ink outside the patch, if there is as much of it as a press leaves."""
-        if self.previous is None:
-            return None
-        ink = self.ink(FAR_MM)
-        if ink.own_mm2 < self.limits.blank_mm2_per_mm * self.depth_mm:
-            return None
-        return float(np.hypot(*(ink.window.points_mm(ink.own) - np.array(self.anchor_mm)).T).min())
-
-
-def _ink_checks(press: _Press, ink: Ink) -> list[Check]:
-    limits = press.limits
-    checks = [neighbour(ink, limits)]
-    enough = blank(ink.own_mm2, press.depth_mm, limits)
-    if not enough.passed:
-        away_mm = press.away_mm()
-        return [*checks, enough if away_mm is None else far_off(away_mm, limits)]
-    mark = measure_mark(ink, press.anchor_mm)
-    assert mark is not None
-    checks += [enough, dry(mark, limits)]
-    if checks[-1].passed:
-        # The head, tip and tone of a dry brush's mark mean nothing.
-        checks += [smeared(mark, press.depth_mm, limits), *(check(mark, limits) for check in MARK_CHECKS)]
-    return checks
+def _check(name: Failure, score: float, unit: str, threshold: float, reason: str, *, passed: bool) -> Check:
+    """A check whose `reason` counts only if it failed."""
+    return Check(name=name, score=score, threshold=threshold, unit=unit, passed=passed, reason="" if passed else reason)
 
 
 def _below(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
-    passed = score < limit
-    return Check(name, score, unit, limit, passed, "" if passed else reason)
+    return _check(name, score, unit, limit, reason, passed=score < limit)
 
 
 def _at_least(name: Failure, score: float, unit: str, limit: float, reason: str) -> Check:
-    passed = score >= limit
-    return Check(name, score, unit, limit, passed, "" if passed else reason)
+    return _check(name, score, unit, limit, reason, passed=score >= limit)
 
 
 def exposure(image: Gray, limits: QualityConfig) -> Check:
@@ -287,7 +227,7 @@ def exposure(image: Gray, limits: QualityConfig) -> Check:
     if level >= limits.bright_level:
         reason = f"The picture is too bright: paper at {level:.0f} of 255. Expose shorter or dim the light."
     limit = limits.dark_level if level < 0.5 * (limits.dark_level + limits.bright_level) else limits.bright_level
-    return Check(Failure.EXPOSURE, level, "of 255", limit, not reason, reason)
+    return _check(Failure.EXPOSURE, level, "of 255", limit, reason, passed=not reason)
 
 
 def blurred(image: Gray, plane: Plane, limits: QualityConfig) -> tuple[Check, ...]:
@@ -310,7 +250,7 @@ def cut(ink: Ink, plane: Plane, shape: tuple[int, ...], anchor_mm: Point, limits
 
 def glare(image: Gray, plane: Plane, window: Rect, cell_mm: Rect, limits: QualityConfig) -> Check:
     """No reflection in the patch; `window` includes enough paper around it to measure the light."""
-    spots = measure.glare(rectify(image, plane.homography, window), limits.glare_share)
+    spots = measure.glare(measure.for_glare(image, plane, window), limits.glare_share)
     scale = measure.BRIGHT_PX_PER_MM
     left, top = cell_mm[0] - window[0], window[1] + window[3] - cell_mm[1] - cell_mm[3]
     rows = slice(round(top * scale), round((top + cell_mm[3]) * scale))
@@ -345,10 +285,13 @@ def blank(own_mm2: float, depth_mm: float, limits: QualityConfig) -> Check:
     return _at_least(Failure.BLANK, own_mm2, "mm^2", least_mm2, reason)
 
 
-def far_off(away_mm: float, limits: QualityConfig) -> Check:
-    """A press whose ink lies outside its patch."""
+def far_off(ink: Ink, anchor_mm: Point, depth_mm: float, limits: QualityConfig) -> Check | None:
+    """A press whose ink lies outside its patch; None if there is less of it in the wide window than a press leaves."""
+    if ink.own_mm2 < limits.blank_mm2_per_mm * depth_mm:
+        return None
+    away_mm = float(np.hypot(*(ink.window.points_mm(ink.own) - np.array(anchor_mm)).T).min())
     reason = f"The stroke lies {away_mm:.0f} mm away from its patch. {_WHERE}"
-    return Check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, False, reason)
+    return _check(Failure.MISPLACED, away_mm, "mm", limits.misplaced_mm, reason, passed=False)
 
 
 def dry(mark: Mark, limits: QualityConfig) -> Check:

@@ -28,22 +28,21 @@ GRAIN_MM = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A window at 20 px/mm, row 0 at its far edge."""
+    """A window of the paper, row 0 at its far edge."""
 
     window_mm: Rect
-    raster: Gray
-    """(h, w) as photographed; beyond the frame, its border is repeated."""
     dark: Soft
     """(h, w) 0 = paper, 1 = reflects nothing; 0 beyond the frame."""
     in_view: Mask
     """(h, w) False where the photograph does not reach."""
     pixel_mm: float
     """Side of a pixel of the photograph, on the paper."""
+    px_per_mm: float = PX_PER_MM
 
     def to_px(self, point_mm: Point) -> Point:
         """(x, y) on the raster, where pixel j covers [j, j + 1)."""
         x, y, _, height = self.window_mm
-        return (point_mm[0] - x) * PX_PER_MM, (y + height - point_mm[1]) * PX_PER_MM
+        return (point_mm[0] - x) * self.px_per_mm, (y + height - point_mm[1]) * self.px_per_mm
 
     def inside(self, rect_mm: Rect) -> tuple[slice, slice]:
         """Rows and columns of a rectangle, clipped to the window."""
@@ -53,24 +52,33 @@ class Window:
 
     def inked(self, gate: float) -> Mask:
         """(h, w) True where there is ink, after noise and grain are smoothed away."""
-        return np.asarray(cv2.GaussianBlur(self.dark, (0, 0), GRAIN_MM * PX_PER_MM), np.float32) > gate
+        return np.asarray(cv2.GaussianBlur(self.dark, (0, 0), GRAIN_MM * self.px_per_mm), np.float32) > gate
 
     def points_mm(self, mask: Mask) -> Floats:
         """(n, 2) centres of a mask's pixels in the paper frame."""
         x, y, _, height = self.window_mm
         rows, columns = np.nonzero(mask)
-        places = np.column_stack([x + (columns + 0.5) / PX_PER_MM, y + height - (rows + 0.5) / PX_PER_MM])
+        places = np.column_stack([x + (columns + 0.5) / self.px_per_mm, y + height - (rows + 0.5) / self.px_per_mm])
         return places.astype(np.float64)
 
 
-def take(image: Gray, image_to_paper: Floats, window_mm: Rect, params: Params) -> Window:
-    """Rectify a window of an (h, w) photograph and divide it by its illumination. `image_to_paper` is (3, 3)."""
-    raster = rectify(image, image_to_paper, window_mm)
-    in_view = _in_view(image, image_to_paper, window_mm, raster)
+def take(image: Gray, plane: Plane, window_mm: Rect, px_per_mm: float = PX_PER_MM) -> Window:
+    """Rectify a window of an (h, w) photograph and divide it by its illumination."""
+    raster = rectify(image, plane.homography, window_mm, px_per_mm)
+    x, y, width, height = window_mm
+    corners = np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
+    seen = apply(np.asarray(np.linalg.inv(plane.homography), np.float64), corners)
+    in_view = np.ones(raster.shape, np.bool_)
+    if seen.min() < 0.0 or bool((seen > np.array(image.shape[::-1]) - 1.0).any()):
+        # `rectify` repeats the frame's outermost pixels: mark them, to see where it did.
+        shown = np.full(image.shape, 255, np.uint8)
+        shown[[0, -1]] = 0
+        shown[:, [0, -1]] = 0
+        in_view = rectify(shown, plane.homography, window_mm, px_per_mm) > 127
+    params = Params(background_mm=Params().background_mm * px_per_mm / PX_PER_MM)  # `flatten` takes it for 20 px/mm
     dark = np.where(in_view, 1.0 - flatten(raster, params), 0.0).astype(np.float32)
-    seen = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), corners(window_mm))
-    pixel_mm = math.sqrt(window_mm[2] * window_mm[3] / cv2.contourArea(seen.astype(np.float32)))
-    return Window(window_mm, raster, dark, in_view, pixel_mm)
+    pixel_mm = math.sqrt(width * height / cv2.contourArea(seen.astype(np.float32)))
+    return Window(window_mm, dark, in_view, pixel_mm, px_per_mm)
 
 
 def on_sheet(rect_mm: Rect, sheet_mm: tuple[float, float] | None) -> Rect:
@@ -87,23 +95,6 @@ def around(rect_mm: Rect, margin_mm: float, sheet_mm: tuple[float, float] | None
     """A rectangle with a margin, clipped to the sheet: the table beyond it is not paper."""
     x, y, width, height = rect_mm
     return on_sheet((x - margin_mm, y - margin_mm, width + 2.0 * margin_mm, height + 2.0 * margin_mm), sheet_mm)
-
-
-def corners(rect_mm: Rect) -> Floats:
-    """(4, 2) corners of a rectangle."""
-    x, y, width, height = rect_mm
-    return np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
-
-
-def _in_view(image: Gray, image_to_paper: Floats, window_mm: Rect, raster: Gray) -> Mask:
-    seen = apply(np.asarray(np.linalg.inv(image_to_paper), np.float64), corners(window_mm))
-    if seen.min() >= 0.0 and bool((seen <= np.array(image.shape[::-1]) - 1.0).all()):
-        return np.ones(raster.shape, np.bool_)
-    # `rectify` repeats the frame's outermost pixels: mark them, to see where it did.
-    shown = np.full(image.shape, 255, np.uint8)
-    shown[[0, -1]] = 0
-    shown[:, [0, -1]] = 0
-    return rectify(shown, image_to_paper, window_mm) > 127
 
 
 COARSE = 4
@@ -139,15 +130,18 @@ class Ink:
 
 
 def tell_apart(now: Window, before: Window | None, cell_mm: Rect, anchor_mm: Point, gate: float) -> Ink:
-    """Find the press's own ink: new since `before` if that is given, in one piece, and near the anchor."""
+    """Find the press's own ink: new since `before` if that is given, in one piece, and near the anchor.
+
+    `now` is at 20 px/mm, `before` at any scale.
+    """
     ink = now.inked(gate)
     patch = now.inside(cell_mm)
     before_mm2 = 0.0
     if before is not None:
-        old = before.inked(gate)
-        before_mm2 = mm2(old[patch])
+        old = cv2.resize(before.inked(gate).astype(np.uint8), ink.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        before_mm2 = mm2(old[patch] > 0)
         side = round(SEAM_MM * PX_PER_MM) | 1
-        ink &= cv2.dilate(old.astype(np.uint8), np.ones((side, side), np.uint8)) == 0
+        ink &= cv2.dilate(old, np.ones((side, side), np.uint8)) == 0
     # Without a photograph from before, a piece that lies mostly in the next patch is taken to belong there.
     least_share = HOME_SHARE if before is None else 0.0
     own, beside_mm2 = _own_piece(ink, now.to_px(anchor_mm), patch, least_share)
@@ -161,36 +155,33 @@ def mm2(mask: Mask) -> float:
 
 def _own_piece(ink: Mask, anchor_px: Point, patch: tuple[slice, slice], least_share: float) -> tuple[Mask, float]:
     """(the stroke's piece, at least `least_share` of which lies in the patch; mm^2 of the other pieces in it)."""
-    height, width = ink.shape
     pieces, count = _pieces(ink)
-    areas = np.bincount(pieces.ravel(), minlength=count) / PX_PER_MM**2
-    in_cell = np.bincount(pieces[patch].ravel(), minlength=count) / PX_PER_MM**2
-    in_cell[0] = areas[0] = 0.0
+    areas = np.bincount(pieces[ink], minlength=count) / PX_PER_MM**2
+    in_cell = np.bincount(pieces[patch][ink[patch]], minlength=count) / PX_PER_MM**2
     at_home = np.where(in_cell >= least_share * areas, areas, 0.0)
-    if count <= 1 or at_home.max() == 0.0:
+    if at_home.max() == 0.0:
         return np.zeros_like(ink), float(in_cell[in_cell >= SMALLEST_MM2].sum())
-    rows, columns = np.ogrid[:height, :width]
-    near = (columns + 0.5 - anchor_px[0]) ** 2 + (rows + 0.5 - anchor_px[1]) ** 2 <= (NEAR_MM * PX_PER_MM) ** 2
-    touches = np.bincount(pieces[near], minlength=count) > 0
+    rows, columns = np.nonzero(ink)
+    near = np.hypot(columns + 0.5 - anchor_px[0], rows + 0.5 - anchor_px[1]) <= NEAR_MM * PX_PER_MM
+    touches = np.bincount(pieces[ink][near], minlength=count) > 0
     candidates = np.flatnonzero(touches & (at_home > 0.0) & (at_home >= NEAR_SHARE * at_home.max()))
     main = int(candidates[np.argmax(at_home[candidates])]) if candidates.size else int(np.argmax(at_home))
     in_cell[main] = 0.0
-    return pieces == main, float(in_cell[in_cell >= SMALLEST_MM2].sum())
+    return ink & (pieces == main), float(in_cell[in_cell >= SMALLEST_MM2].sum())
 
 
-def _pieces(ink: Mask) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.int32]], int]:
-    """(h, w) number of the piece that each inked pixel belongs to, 0 = paper, and how many numbers there are."""
+def _pieces(ink: Mask) -> tuple[NDArray[np.uint16], int]:
+    """(h, w) number of the piece that each inked pixel belongs to, and how many numbers there are."""
     height, width = ink.shape
     small = (max(width // COARSE, 1), max(height // COARSE, 1))
     share = cv2.resize(ink.astype(np.float32), small, interpolation=cv2.INTER_AREA)
     side = round(JOIN_MM * PX_PER_MM / COARSE) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     joined = cv2.morphologyEx(np.pad((share > 0.0).astype(np.uint8), side), cv2.MORPH_CLOSE, kernel)
-    count, labels = cv2.connectedComponents(np.ascontiguousarray(joined[side:-side, side:-side]), connectivity=8)
-    rows = np.arange(height, dtype=np.int64) * small[1] // height
-    columns = np.arange(width, dtype=np.int64) * small[0] // width
-    fine = np.asarray(labels, np.int32)[rows[:, None], columns[None, :]]
-    return np.where(ink, fine, 0).astype(np.int32), int(count)
+    count, labels = cv2.connectedComponents(
+        np.ascontiguousarray(joined[side:-side, side:-side]), connectivity=8, ltype=cv2.CV_16U
+    )
+    return np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), np.uint16), int(count)
 
 
 Floats32 = NDArray[np.float32]
@@ -205,8 +196,8 @@ LEAST_EDGE = 3.0
 FEWEST_EDGES = 50
 SLOPE_PX2 = 1.0 / 3.0
 """Variance of the blur that a difference over two pixels adds."""
-BRIGHT_PX_PER_MM = 2.5
-"""Raster on which glare is looked for."""
+COARSE_PX_PER_MM, BRIGHT_PX_PER_MM = 10.0, 2.5
+"""Rasters on which saturated pixels and bright spots are looked for; a photograph has about 6 px/mm."""
 INK_WIDTH_MM = 20.0
 """Strokes are narrower than this: closing fills them with the paper beside them."""
 SPOT_MM = 36.0
@@ -270,14 +261,19 @@ def edge_mm(points_mm: Floats, plane: Plane, shape: tuple[int, ...]) -> float:
     return float(min(pixels.min(), (most - pixels).min()) * plane.mm_per_px)
 
 
+def for_glare(image: Gray, plane: Plane, window_mm: Rect) -> Gray:
+    """Rectify a window of an (h, w) photograph to 10 px/mm."""
+    return rectify(image, plane.homography, window_mm, COARSE_PX_PER_MM)
+
+
 def glare(raster: Gray, share: float) -> Mask:
-    """Where a rectified window at 20 px/mm glares, at 2.5 px/mm: saturated, or a spot brighter than its surroundings.
+    """Where a rectified window at 10 px/mm glares, at 2.5 px/mm: saturated, or a spot brighter than its surroundings.
 
     A spot is what a morphological opening removes; slopes and steps of the light, such as the edge of a shadow, stay.
     """
-    height, width = (round(side * BRIGHT_PX_PER_MM / PX_PER_MM) for side in raster.shape)
+    height, width = (round(side * BRIGHT_PX_PER_MM / COARSE_PX_PER_MM) for side in raster.shape)
     small = np.asarray(cv2.resize(raster, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    full = cv2.erode(raster, np.ones((5, 5), np.uint8)) >= SATURATED
+    full = cv2.erode(raster, np.ones((3, 3), np.uint8)) >= SATURATED
     saturated = cv2.resize(full.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
     level = _morph(np.asarray(cv2.medianBlur(small, 3), np.uint8), cv2.MORPH_CLOSE, INK_WIDTH_MM)
     base = _morph(level, cv2.MORPH_OPEN, SPOT_MM)
@@ -377,11 +373,10 @@ def _spine(hairs: Mask) -> NDArray[np.float64]:
 
 
 def _gap_mm(hairs: Mask) -> float:
-    widest = np.zeros(round(GAP_SHARE * hairs.shape[1]))
-    for column in range(widest.size):
-        inked = np.flatnonzero(hairs[:, column])
-        if inked.size > 1:
-            widest[column] = np.diff(inked).max() - 1
+    tip = hairs[:, : round(GAP_SHARE * hairs.shape[1])]
+    rows = np.where(tip, np.arange(len(tip))[:, None], -1)
+    above = np.maximum.accumulate(rows, axis=0)[:-1]  # the inked row before, of each pixel from the second row on
+    widest = np.where(tip[1:] & (above >= 0), rows[1:] - above - 1, 0).max(axis=0, initial=0)
     run = round(GAP_RUN_MM * PX_PER_MM)
     if widest.size < run:
         return 0.0

@@ -28,10 +28,6 @@ PaperSide = Annotated[float, Field(ge=2.0, le=2000.0, allow_inf_nan=False)]
 """Width or height of a sheet or a patch in mm: at most a million patches fit on a sheet."""
 
 
-EARLIER_NAMES = {"height_mm": "depth_mm", "heights_mm": "depths_mm"}
-"""Fields of protocols that were written when the depth of a press was called a height."""
-
-
 class Config(BaseModel):
     """Base: frozen, extra keys refused."""
 

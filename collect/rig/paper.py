@@ -20,8 +20,6 @@ class Layout:
 
     columns: int
     rows: int
-    taken: frozenset[int] = frozenset()
-    """Cells of the first sheet that are used before the first stroke."""
 
     @property
     def capacity(self) -> int:

@@ -19,12 +19,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from brushloop.collect.engine.last_capture import LastCapture
-    from brushloop.collect.quality.checks import Check
-    from brushloop.sessions import records
-
-    Checks = Sequence[Check | records.Check]
-    """Checks of a capture, from the running engine or from a recording."""
+    from brushloop.collect.engine.snapshot import LastCapture
+    from brushloop.sessions.records import Check
 
 WHITE, BOTH, CAPTURED, PREDICTED = (255, 255, 255), (165, 165, 165), (213, 94, 0), (0, 114, 178)
 """Colours of a difference, as in the reports: after Okabe and Ito, which colour-blind readers can distinguish."""
@@ -51,7 +47,7 @@ def difference(captured: NDArray[np.bool_], predicted: NDArray[np.bool_]) -> NDA
     return colours[2 * np.asarray(captured, np.uint8) + np.asarray(predicted, np.uint8)]
 
 
-def checks_content(checks: Checks) -> Content:
+def checks_content(checks: Sequence[Check]) -> Content:
     """A line for each check with value and limit, those missed first, with what to do about them."""
     lines: list[Content] = []
     for check in sorted(checks, key=lambda check: check.passed):
@@ -69,12 +65,12 @@ def _number(value: float | None) -> str:
     return f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
 
 
-def _limit(check: Check | records.Check) -> str:
+def _limit(check: Check) -> str:
     """`≤ 0.25 mm`, or nothing for a check without a limit."""
     if check.score is None or check.threshold is None:
         return ""
     sign = "≤" if (check.score <= check.threshold) == check.passed else "≥"
-    return f"{sign} {_number(check.threshold)} {getattr(check, 'unit', '')}".rstrip()
+    return f"{sign} {_number(check.threshold)} {check.unit}".rstrip()
 
 
 class CaptureScreen(Screen[None], inherit_bindings=False):
@@ -95,7 +91,7 @@ class CaptureScreen(Screen[None], inherit_bindings=False):
         *(Binding(str(number), f"choose({number - 1})", "Picture", show=False) for number in range(1, 5)),
     ]
 
-    def __init__(self, capture: LastCapture, checks: Checks, model: str, pictures: Pictures) -> None:
+    def __init__(self, capture: LastCapture, checks: Sequence[Check], model: str, pictures: Pictures) -> None:
         """`model` says what predicts the mark of this capture, or why nothing does."""
         super().__init__()
         self._capture, self._checks, self._model = capture, checks, model

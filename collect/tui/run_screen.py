@@ -42,7 +42,7 @@ from brushloop.sessions.records import Condition
 
 if TYPE_CHECKING:
     from brushloop.collect.engine.engine import Engine
-    from brushloop.collect.engine.last_capture import LastCapture
+    from brushloop.collect.engine.snapshot import LastCapture
 
 OVER = "Over: q leaves"
 GOES_ON = "Press enter to resume, or run the same command later."

@@ -1,15 +1,16 @@
 """A quality check: a stroke whose ink is unusually dark.
 
 Put such a function into `collect/quality/checks.py` and its name into `MARK_CHECKS` there. A finding of its own needs a
-name in `Failure` there, with the family that says what is done about it, and its limit belongs
-in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig can set it. `docs/quality.md` says what it measures.
+name in `Failure` there, and its limit belongs in `QualityConfig` (`collect/rig/config_touch.py`), so that a rig can set
+it. `docs/quality.md` says what it measures.
 """
 
 from __future__ import annotations
 
-from brushloop.collect.quality.checks import Check, Failure
+from brushloop.collect.quality.checks import Failure
 from brushloop.collect.quality.measure import Mark
 from brushloop.collect.rig.config_touch import QualityConfig
+from brushloop.sessions.records import Check
 
 DARKEST_TONE = 0.97
 
@@ -19,4 +20,4 @@ def flooded(mark: Mark, limits: QualityConfig) -> Check:
     del limits  # a real check reads its threshold from here
     passed = mark.tone < DARKEST_TONE
     reason = "" if passed else f"The ink stands on the paper (darkness {mark.tone:.2f}). Wipe the brush on the rim."
-    return Check(Failure.FAINT, mark.tone, "1", DARKEST_TONE, passed, reason)
+    return Check(name=Failure.FAINT, score=mark.tone, threshold=DARKEST_TONE, unit="of 1", passed=passed, reason=reason)

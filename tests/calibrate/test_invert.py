@@ -80,7 +80,6 @@ def test_a_session_is_inverted_and_can_be_replayed(tmp_path: Path) -> None:
     assert protocol.of == "shots"
     assert [press.stroke_id for press in protocol.presses] == ["p0", "p1", "p2"]
     assert protocol.presses[1].depth_mm == pytest.approx(made.rows[1].depth_mm, abs=1e-3)
-    assert "depth_sd_mm" in protocol.ignored_columns
     with (tmp_path / "out" / "recovered.csv").open() as file:
         first = next(csv.DictReader(file))
     assert first["commanded_depth_mm"] == "12"

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Generator
-from contextlib import contextmanager
 from functools import partial
 
+from brushloop.collect.engine.recorder import RunContext, StepContext, within_limits
 from brushloop.collect.engine.steps.capture import look_at_sheet
-from brushloop.collect.engine.steps.context import RunContext, StepContext, within_limits
 from brushloop.collect.errors import StepError
-from brushloop.collect.motion import TOUCH_TOLERANCE_MM, Move, press_moves, stroke_moves
+from brushloop.collect.motion import TOUCH_TOLERANCE_MM
 from brushloop.collect.operator import Choice, Prompt
 from brushloop.collect.planning.limit_check import check_poses, check_step
 from brushloop.collect.planning.walk import touch_of
@@ -58,18 +56,6 @@ async def fill_brush(context: StepContext) -> Well | None:
     return well
 
 
-async def set_light(run: RunContext) -> None:
-    """Set the light of the ink device, once per run. Raises `DeviceError`."""
-    if run.rig.ink is not None:
-        run.light = await run.rig.ink.light()
-
-
-def must_dip(context: StepContext) -> bool:
-    """Whether the brush must dip before it may press: it is not known to hold ink, or the ink has waited too long."""
-    left_ns = context.run.left_ink_ns
-    return left_ns is None or context.run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9
-
-
 class DipToTouch:
     """Times from dip to touch within one step: one for a press, one or more for a figure that dips between strokes."""
 
@@ -83,27 +69,19 @@ class DipToTouch:
         """The longest time; None if no pose showed the brush on the paper."""
         return max(self._waits_s, default=None)
 
-    @contextmanager
-    def watching(self) -> Generator[DipToTouch]:
-        """Within the block, look at every pose."""
-        with self._context.recorder.also(self._pose):
-            yield self
-
-    async def begin(self, first: Move) -> None:
-        """Start timing a stroke that begins with the move `first`; wait above the patch if the protocol asks for a
-        fixed time after the dip."""
+    async def hold(self) -> None:
+        """Start timing a stroke, over its patch; wait there if the protocol asks for a fixed time after the dip."""
         run = self._context.run
         left_ns, run.left_ink_ns = run.left_ink_ns, None
         assert left_ns is not None
         if (wait_s := run.protocol.wait_after_dip_s) is not None:
-            await run.procedures.go(first)
             left_s = wait_s - (run.rig.clock.now_ns() - left_ns) / 1e9
             with run.progress.meanwhile(f"wait with the ink, {wait_s:g} s from the dip"):
                 await asyncio.sleep(max(left_s, 0.0))
         self._left_ns = left_ns
 
-    def _pose(self, sample: PoseSample) -> None:
-        # The first pose on the paper counts; the step's moves come down nowhere else before it.
+    def pose(self, sample: PoseSample) -> None:
+        """Take a pose: the first one on the paper counts, and the step's moves come down nowhere else before it."""
         if self._left_ns is None:
             return
         procedures, paper = self._context.run.procedures, self._context.run.rig.config.paper
@@ -115,33 +93,27 @@ class DipToTouch:
 async def press(context: StepContext, step: PressStep) -> PressResult:
     """The PRESS step."""
     patch, procedures = await _ready(context), context.run.procedures
-    down, _ = press_moves(context.run.rig.config, procedures.plane, patch, step.press.condition)
-    with DipToTouch(context).watching() as timing:
-        await timing.begin(down[0])
-        pressing = procedures.press(patch, step.press.condition, step.dwell_s)
+    timing = DipToTouch(context)
+    with context.recorder.also(timing.pose):
+        pressing = procedures.press(patch, step.press.condition, step.dwell_s, timing.hold)
         reached_mm = await context.guard.guarded(pressing)
     pressed = _as_made(context, step.press, reached_mm, timing)
     return PressResult(press=pressed, peak_force_n=_peak_n(context, context.guard.peak_n))
 
 
 async def draw(context: StepContext, step: DrawStep) -> PressResult:
-    """The DRAW step: every stroke of a figure, with dips in between if the protocol asks for them."""
+    """The DRAW step: every stroke of a figure, with a dip before each."""
     run, drawn = context.run, step.drawn
     patch = await _ready(context)
-    plane = run.procedures.plane
-    config = run.rig.config
-    await within_limits(check_step, "", config, plane, step, [patch])
     depths_mm: list[float] = []
     peaks_n: list[float] = []
-    with DipToTouch(context).watching() as timing:
-        for number, points in enumerate(drawn.strokes):
-            if drawn.dips_before(number):
+    timing = DipToTouch(context)
+    with context.recorder.also(timing.pose):
+        for number in range(len(drawn.strokes)):
+            if number > 0:
                 await fill_brush(context)
-            if run.left_ink_ns is not None:
-                first, *_ = stroke_moves(config, plane, patch, points, drawn.speed_mm_s)
-                assert isinstance(first, Move)
-                await timing.begin(first)
-            depths_mm.append(await context.guard.guarded(run.procedures.stroke(patch, drawn, number)))
+            drawing = run.procedures.stroke(patch, drawn, number, timing.hold)
+            depths_mm.append(await context.guard.guarded(drawing))
             peaks_n.append(context.guard.peak_n)
     pressed = _as_made(context, step.press, max(depths_mm), timing)
     return PressResult(
@@ -153,7 +125,8 @@ async def _ready(context: StepContext) -> Patch:
     """Check the sheet, fill the brush if its ink is old, and return the patch to press, which was seen to be blank."""
     [patch] = context.patches
     await look_at_sheet(context)
-    if must_dip(context):
+    run, left_ns = context.run, context.run.left_ink_ns
+    if left_ns is None or run.rig.clock.now_ns() - left_ns > STALE_INK_S * 1e9:
         # Resumed, paused, or the last press failed: the brush may have dried or lost its ink since its dip.
         context.recorder.log("dip again before the press")
         await fill_brush(context)
@@ -177,7 +150,8 @@ async def zero_touch(context: StepContext, step: ZeroTouchStep) -> ZeroTouchResu
     planned pose still lies within the limits."""
     run = context.run
     rig = run.rig
-    await set_light(run)
+    if rig.ink is not None:
+        run.light = await rig.ink.light()
     if rig.force is not None and rig.config.force is not None:
         await rig.force.bias(rig.config.force.bias_s)
     if step.method == "kept":

@@ -1,26 +1,27 @@
-"""Photographs: the BOARD step, the look at a blank sheet, the CAPTURE step, and which strokes then count."""
+"""Photographs: the BOARD step, the look at a blank sheet, the CAPTURE step, which strokes then count, and what a screen
+shows of them."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brushloop.calibrate.board.pix2len import Plane, see_board
-from brushloop.calibrate.errors import CalibrationError
-from brushloop.calibrate.stats import odd_waits, wait_limit_s, waits_of
-from brushloop.calibrate.stroke import Gray
-from brushloop.collect.engine.last_capture import LastCapture, mark_of, pictures_of
-from brushloop.collect.engine.steps.context import RunContext, StepContext, meanwhile, uninterrupted
+from brushloop.calibrate.compare.place import SIZE_PX, Field, covered
+from brushloop.calibrate.errors import CalibrationError, CaptureRefused
+from brushloop.calibrate.stroke import PX_PER_MM, Gray, Params
+from brushloop.calibrate.stroke.preprocess import prepare
+from brushloop.calibrate.stroke.rectify import on_window, rectify
+from brushloop.collect.engine.recorder import RunContext, StepContext, meanwhile, uninterrupted
+from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.errors import BadPicture, NeedsOperator, StepError
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
 from brushloop.collect.photograph.frames import undistorted
 from brushloop.collect.protocols.steps import MARKING, CaptureStep
 from brushloop.collect.quality.checks import (
-    Check,
-    Family,
+    Failure,
     Verdict,
     check_capture,
     check_drawing,
@@ -30,9 +31,9 @@ from brushloop.collect.quality.checks import (
 from brushloop.collect.rig.paper import Patch
 from brushloop.drivers.devices import Frame
 from brushloop.model.fitted import FittedPress
-from brushloop.sessions import records
 from brushloop.sessions.events import Again, BoardResult, CaptureResult, Press, ReviewResult
 from brushloop.sessions.recording import bad_stills
+from brushloop.sessions.records import Check, Condition, Quality, Stroke
 
 KEEP, AGAIN, SKIP = Choice("g", "good anyway: it counts"), Choice("r", "press it again"), Choice("k", "skip it")
 PICTURE_MARGIN_PX = 40
@@ -42,7 +43,11 @@ PICTURE_MARGIN_PX = 40
 async def decide(
     run: RunContext, press: Press, verdict: Verdict | None, image: Gray, patch: Patch
 ) -> tuple[bool, bool]:
-    """Return (kept, retake) of the press in `image`, by the operator's request if there is one, else the verdict."""
+    """Return (kept, retake) of the press in `image`: by the operator's request if there is one, else by the verdict.
+
+    A stroke that failed is retaken while takes are left, then a person decides; without a screen it is left out. Raises
+    `NeedsOperator` if the screen went away: the step stays open, and is done and asked about again on resume.
+    """
     stroke_id = press.stroke_id
     if run.requests.take(OperatorRequest.RETAKE):
         run.progress.log(f"{stroke_id}: is pressed again, as the operator requested")
@@ -52,39 +57,31 @@ async def decide(
         return False, False
     if verdict is None or verdict.passed:
         return True, False
-    return await _after_failure(run, press, verdict, image, patch)
-
-
-async def _after_failure(
-    run: RunContext, press: Press, verdict: Verdict, image: Gray, patch: Patch
-) -> tuple[bool, bool]:
-    """Retake while takes are left, then let a person decide; without a screen, leave the stroke out.
-
-    Raises `NeedsOperator` if the screen went away: the step stays open, and is done and asked about again on resume.
-    """
     if press.take <= run.rig.config.quality.retakes:
         return False, True
-    text = f"{press.stroke_id}, take {press.take}: {verdict.reason}"
-    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run, image, patch))
     if not run.asker.attended:
-        run.progress.log(f"{press.stroke_id}: left out", warning=True)
+        run.progress.log(f"{stroke_id}: left out", warning=True)
         return False, False
+    text = f"{stroke_id}, take {press.take}: {verdict.reason}"
     await run.procedures.park()  # a person may reach under the arm
+    prompt = Prompt(text, (KEEP, AGAIN, SKIP), SKIP.key, image=_cut_out(run.image_plane(image), image, patch))
     answer = await run.asker.ask(prompt)
     return answer == KEEP.key, answer == AGAIN.key
 
 
-def _cut_out(run: RunContext, image: Gray, patch: Patch) -> Gray:
+def _cut_out(plane: Plane, image: Gray, patch: Patch) -> Gray:
     """The patch and a margin around it."""
-    plane = run.view
-    assert plane is not None
     x_mm, y_mm, size_x_mm, size_y_mm = patch.rect_mm
-    corners = np.array([[x, y, 1.0] for x in (x_mm, x_mm + size_x_mm) for y in (y_mm, y_mm + size_y_mm)])
-    seen = corners @ np.linalg.inv(plane.homography).T
-    px = seen[:, :2] / seen[:, 2:]
+    px = plane.to_image(_corners_mm((x_mm, y_mm), (size_x_mm, size_y_mm)))
     (left, top), (right, bottom) = px.min(axis=0).astype(int), px.max(axis=0).astype(int)
     m = PICTURE_MARGIN_PX
     return image[max(0, top - m) : bottom + m, max(0, left - m) : right + m]
+
+
+def _corners_mm(at_mm: tuple[float, float], size_mm: tuple[float, float]) -> NDArray[np.float64]:
+    """(4, 2) corners of a rectangle of the sheet, in the paper frame."""
+    (x, y), (width, height) = at_mm, size_mm
+    return np.array([[x + right, y + up] for right in (0.0, width) for up in (0.0, height)])
 
 
 def marked_bad(run: RunContext) -> list[str]:
@@ -100,7 +97,7 @@ def marked_bad(run: RunContext) -> list[str]:
     return [name for name in counted if name not in listed]
 
 
-async def review(run: RunContext) -> ReviewResult:
+def review(run: RunContext) -> ReviewResult:
     """The REVIEW step: the strokes to press again."""
     reviews = run.store.state.results(ReviewResult)
     first = run.progress.first_free_index + sum(len(review.again) for review in reviews)
@@ -126,10 +123,10 @@ async def board(context: StepContext) -> BoardResult:
         mm_per_px=plane.mm_per_px,
         rms_px=plane.rms_px,
         size_px=(image.shape[1], image.shape[0]),
-        sheet_px=plane.to_image(_sheet_corners_mm(context.run.rig.config.paper.size_mm)).tolist(),
+        sheet_px=plane.to_image(_corners_mm((0.0, 0.0), context.run.rig.config.paper.size_mm)).tolist(),
+        checks=checks,
         camera_delay_ms=delay_ms,
         camera_jitter_ms=jitter_ms,
-        checks=_recorded_checks(checks),
     )
 
 
@@ -168,17 +165,12 @@ def _check_view(before: BoardResult, image: Gray, plane: Plane, sheet_mm: tuple[
             "began: set it back (camera.locked in rig.toml), or start a new session with --new."
         )
     seen_mm = plane.to_paper(np.array(before.sheet_px))
-    moved_mm = float(np.linalg.norm(seen_mm - _sheet_corners_mm(sheet_mm), axis=1).max())
+    moved_mm = float(np.linalg.norm(seen_mm - _corners_mm((0.0, 0.0), sheet_mm), axis=1).max())
     if moved_mm > MOVED_MM:
         raise NeedsOperator(
             f"the board is seen {moved_mm:.1f} mm from where it was when the session began, at most {MOVED_MM:g} mm: "
             "camera or board was moved. Put it back, or start a new session with --new."
         )
-
-
-def _sheet_corners_mm(size_mm: tuple[float, float]) -> NDArray[np.float64]:
-    """(4, 2) corners of the sheet in the paper frame."""
-    return np.array([[x, y] for x in (0.0, size_mm[0]) for y in (0.0, size_mm[1])])
 
 
 async def look_at_sheet(context: StepContext) -> None:
@@ -245,99 +237,63 @@ async def capture(context: StepContext, step: CaptureStep) -> CaptureResult:
     recorded and judged. The brush is empty and stays so until the decision is in the journal: only the next step may
     dip it. Raises `BadPicture` if the photograph, not the stroke, is at fault.
     """
-    run, press = context.run, step.press
+    run, press, still = context.run, step.press, context.attempt.serial
     if press.patch is None or press.sheet != run.store.state.sheet:
         raise StepError(f"{press.stroke_id} is not on the sheet that is in")
     patch = run.sheet.patch(press.patch)
     frame = await _fresh_frame(context)
-    waited = _wait_check(context, press)
-    looking = _looked_at(context, step, frame, patch, waited)
+    looking = _looked_at(context, step, frame, patch)
     if run.progress.more_than(press.stroke_id):
         image, verdict = await meanwhile(context.guard.guarded(run.procedures.set_out()), looking)
     else:
         image, verdict = await looking  # a dip for a retake goes to the well by itself
     kept, retake = await decide(run, press, verdict, image, patch)
-    if not kept:
-        run.progress.not_kept()
     if kept:
-        context.recorder.stroke(_stroke(step, patch, context.attempt.serial))
+        context.recorder.stroke(_stroke(step, patch, still))
+    else:
+        run.progress.not_kept()
+    cause = None if verdict is None else verdict.cause
     delay_ms, jitter_ms = _camera_delay(context)
     return CaptureResult(
         press=press,
-        still=context.attempt.serial,
+        still=still,
         kept=kept,
         retake=retake,
-        verdict="" if verdict is None or verdict.cause is None else str(verdict.cause.name),
+        verdict="" if cause is None else cause.name,
         camera_delay_ms=delay_ms,
         camera_jitter_ms=jitter_ms,
     )
 
 
 async def _looked_at(
-    context: StepContext, step: CaptureStep, frame: Frame, patch: Patch, waited: records.Check | None
+    context: StepContext, step: CaptureStep, frame: Frame, patch: Patch
 ) -> tuple[Gray, Verdict | None]:
-    """Record the frame, judge the stroke in it, and show both; nothing moves here."""
+    """Record the frame, judge the stroke in it unless captures are not judged, and show both; nothing moves here."""
+    run, stroke_id, still = context.run, step.press.stroke_id, context.attempt.serial
     image = await _recorded(context, frame)
-    verdict = await _judged(context, step, image, patch, waited)
-    context.run.sound_frame = image
-    if context.run.asker.watched:
+    verdict = None
+    if run.rig.config.quality.enabled:
+        verdict = await uninterrupted(_judge, run, step, image, patch)
+        context.recorder.quality(Quality(stroke_id=stroke_id, checks=verdict.checks), still)
+        if verdict.cause is not None:
+            run.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
+            if Failure(verdict.cause.name).of_picture:
+                raise BadPicture(verdict.cause.reason)
+    run.sound_frame = image
+    if run.asker.watched:
         await uninterrupted(_show, context, step, verdict, image, patch)
     return image, verdict
 
 
-def _wait_check(context: StepContext, press: Press) -> records.Check | None:
-    """Compare this stroke's time from dip to touch with those of earlier strokes; None if it was not recorded.
-
-    The check is recorded as a remark and decides nothing: the ink is judged from the photograph.
-    """
-    still, wait_s = context.attempt.serial, press.dip_to_touch_s
-    if wait_s is None:
-        return None
-    waits = {**waits_of(context.run.store.state), still: wait_s}
-    reason, limit_s = odd_waits(waits).get(still, ""), wait_limit_s(waits.values())
-    threshold = None if limit_s is None else sum(limit_s)
-    return records.Check(name="dip_to_touch", score=wait_s, threshold=threshold, passed=not reason, reason=reason)
-
-
-async def _judged(
-    context: StepContext, step: CaptureStep, image: Gray, patch: Patch, waited: records.Check | None
-) -> Verdict | None:
-    """Judge the capture and record the checks; None where captures are not judged."""
-    run, stroke_id = context.run, step.press.stroke_id
-    if waited is not None and not waited.passed:
-        run.progress.log(f"{stroke_id}: {waited.reason}", warning=True)
-    if not run.rig.config.quality.enabled:
-        return None
-    verdict = await uninterrupted(_judge, context.run, step, image, patch)
-    checks = _recorded_checks(verdict.checks)
-    remarks = () if waited is None else (waited,)
-    context.recorder.quality(records.Quality(stroke_id=stroke_id, checks=(*checks, *remarks)), context.attempt.serial)
-    if verdict.cause is not None:
-        run.progress.log(f"{stroke_id}: {verdict.reason}", warning=True)
-        if verdict.cause.name.family is Family.PICTURE:
-            raise BadPicture(verdict.cause.reason)
-    return verdict
-
-
-def _recorded_checks(checks: Iterable[Check]) -> tuple[records.Check, ...]:
-    return tuple(
-        records.Check(name=c.name, score=c.score, threshold=c.threshold, passed=c.passed, reason=c.reason)
-        for c in checks
-    )
-
-
 def _judge(run: RunContext, step: CaptureStep, image: Gray, patch: Patch) -> Verdict:
-    depth_mm = step.press.condition.depth_mm
-    config, previous, plane = run.rig.config, run.sound_frame, run.image_plane(image)
-    if step.drawn:
-        return check_drawing(image, plane, patch, depth_mm=depth_mm, limits=config.quality, previous=previous)
-    return check_capture(
+    config, judge = run.rig.config, check_drawing if step.drawn else check_capture
+    return judge(
         image,
-        plane,
+        run.image_plane(image),
         patch,
-        depth_mm=depth_mm,
+        depth_mm=step.press.condition.depth_mm,
         limits=config.quality,
-        previous=previous,
+        previous=run.sound_frame,
         sheet_mm=config.paper.size_mm,
     )
 
@@ -352,9 +308,9 @@ def _show(context: StepContext, step: CaptureStep, verdict: Verdict | None, imag
     context.run.progress.show(LastCapture(press, context.attempt.serial, True, verdict, photo, binary, model))
 
 
-def _stroke(step: CaptureStep, patch: Patch, still: int) -> records.Stroke:
+def _stroke(step: CaptureStep, patch: Patch, still: int) -> Stroke:
     press = step.press
-    return records.Stroke(
+    return Stroke(
         stroke_id=press.stroke_id,
         kind="drag" if step.drawn else "press",
         still=still,
@@ -367,3 +323,40 @@ def _stroke(step: CaptureStep, patch: Patch, still: int) -> records.Stroke:
         again_of=step.again_of,
         dip_to_touch_s=press.dip_to_touch_s,
     )
+
+
+# What a screen shows of a capture
+
+FIELD = Field()
+FINE = 8
+"""Points per pixel and axis at which the model's mark is evaluated."""
+
+
+def mark_of(brush: FittedPress, condition: Condition) -> NDArray[np.bool_] | None:
+    """Mark of a brush, (128, 128) on the default field; None if the model gives none there. Takes a few ms.
+
+    A brush of which only radius and length are given leaves the mark of CCD-BSM as published.
+    """
+    left, top = FIELD.anchor_mm
+    centres = (np.arange(FINE * SIZE_PX) + 0.5) * (FIELD.mm_per_px / FINE)
+    try:
+        upper, lower = brush.edges_at(condition.depth_mm, condition.tilt_deg, np.asarray(centres - left, np.float64))
+    except ValueError:
+        return None
+    up_mm = (top - centres)[:, None]
+    edge_mm = np.asarray(np.where(up_mm > 0.0, upper, lower), np.float64)
+    fine = np.abs(up_mm) <= edge_mm
+    return np.asarray(fine.reshape(SIZE_PX, FINE, SIZE_PX, FINE).mean(axis=(1, 3)) > 0.5)
+
+
+def pictures_of(image: Gray, plane: Plane, patch: Patch) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """The field around the patch's zero-touch point, and its ink on 128 x 128 px, or None if there is no ink."""
+    window = FIELD.window_mm(patch.anchor_mm)
+    left, top = FIELD.anchor_mm
+    raster = rectify(image, plane.homography, window)
+    anchor_px = left * PX_PER_MM, top * PX_PER_MM
+    try:
+        prepared = prepare(raster, anchor_px, "the capture", Params(), on_window(patch.rect_mm, window))
+    except CaptureRefused:
+        return raster, None
+    return raster, covered(prepared) > 0.5

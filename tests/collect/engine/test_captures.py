@@ -14,11 +14,12 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from brushloop.calibrate.calibrated import CalibrateRequest, calibrate_session
 from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, simulated
 from brushloop.calibrate.errors import CalibrationError
+from brushloop.collect.engine import recorder
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.last_capture import LastCapture, mark_of
+from brushloop.collect.engine.recorder import RunContext
+from brushloop.collect.engine.snapshot import LastCapture
 from brushloop.collect.engine.steps import capture as capturing
-from brushloop.collect.engine.steps import context
-from brushloop.collect.engine.steps.context import RunContext
+from brushloop.collect.engine.steps.capture import mark_of
 from brushloop.collect.errors import BadPicture, ConfigError, NeedsOperator, Parked, StepError
 from brushloop.collect.quality.checks import Verdict, check_drawing
 from brushloop.collect.rig.config import load_rig
@@ -247,10 +248,11 @@ class Camera:
 
 
 def run_with(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> RunContext:
-    monkeypatch.setattr(context, "see_board", camera.see_board)
+    monkeypatch.setattr(recorder, "see_board", camera.see_board)
     nothing: Any = SimpleNamespace()
     rig: Any = SimpleNamespace(config=SimpleNamespace(board=None))
-    return RunContext(rig, nothing, nothing, nothing, nothing, nothing, nothing)
+    names = "store", "progress", "asker", "procedures", "sheet", "protocol", "requests"
+    return RunContext(rig=rig, **dict.fromkeys(names, nothing))
 
 
 def test_a_hidden_board_is_taken_from_the_newest_frame_that_showed_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,13 +23,13 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from brushloop.collect.engine.live import FRAME_PERIOD_S, HOST, QUEUE_LIMIT, LiveView
+from brushloop.collect.engine.live import BACKLOG, HOST, LiveView
 from brushloop.collect.errors import ConfigError
 from brushloop.collect.start import CollectRequest, collect
 from brushloop.drivers.devices import Frame, Stamp
 from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.mcap_writer import Outgoing
-from brushloop.sessions.messages import encode_png, image_message, pose_message
+from brushloop.sessions.messages import pose_message
 from brushloop.sessions.records import Topic, Wrench
 from brushloop.sessions.verify import verify_session
 from tests.command import brushloop
@@ -150,30 +150,31 @@ def viewer(live: LiveView) -> Iterator[Viewer]:
     viewer.wire.close()
 
 
-def offered_again_and_again(live: LiveView, outgoing: Outgoing, over: threading.Event) -> threading.Thread:
-    """As a robot would: a subscription takes effect at some time between two messages."""
+@contextlib.contextmanager
+def again_and_again(offer: Callable[[], None]) -> Iterator[None]:
+    """Offer as a robot would: a subscription takes effect at some time between two messages."""
+    over = threading.Event()
 
-    def offer() -> None:
+    def work() -> None:
         while not over.wait(0.02):
-            live.offer(outgoing)
+            offer()
 
-    thread = threading.Thread(target=offer)
+    thread = threading.Thread(target=work)
     thread.start()
-    return thread
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @pytest.mark.parametrize("outgoing", [pose(7), wrench(7)], ids=["protobuf", "json"])
 def test_a_viewer_sees_what_is_recorded_with_its_topic_schema_and_time(
     live: LiveView, viewer: Viewer, outgoing: Outgoing
 ) -> None:
-    over = threading.Event()
-    thread = offered_again_and_again(live, outgoing, over)
-    try:
+    with again_and_again(lambda: live.offer(outgoing)):
         channel = viewer.subscribe()
         number, log_ns, data = viewer.data()
-    finally:
-        over.set()
-        thread.join()
     assert (channel["topic"], number, log_ns) == (outgoing.topic, channel["id"], 7)
     if outgoing.topic is Topic.TCP:
         assert channel["schemaName"] == "foxglove.PoseInFrame"
@@ -186,16 +187,10 @@ def test_a_viewer_sees_what_is_recorded_with_its_topic_schema_and_time(
         assert Wrench.model_validate_json(data) == outgoing.message
 
 
-def test_stills_and_frames_are_shown_as_small_jpegs(live: LiveView, viewer: Viewer) -> None:
-    still = Outgoing(Topic.STILL, 5, 4, 0, image_message(4, encode_png(frame().image)))
-    over = threading.Event()
-    thread = offered_again_and_again(live, still, over)
-    try:
+def test_frames_are_shown_as_small_jpegs(live: LiveView, viewer: Viewer) -> None:
+    with again_and_again(lambda: live.frame(frame(5))):
         channel = viewer.subscribe()
         _, log_ns, data = viewer.data()
-    finally:
-        over.set()
-        thread.join()
     assert (channel["topic"], log_ns) == (Topic.PREVIEW, 5)
     shown = CompressedImage.FromString(data)
     image = cv2.imdecode(np.frombuffer(shown.data, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -204,42 +199,12 @@ def test_stills_and_frames_are_shown_as_small_jpegs(live: LiveView, viewer: View
     assert abs(float(image.mean()) - 200.0) < 2.0
 
 
-def test_pictures_come_at_most_five_times_a_second(live: LiveView, viewer: Viewer) -> None:
-    over = threading.Event()
-
-    def film() -> None:
-        while not over.wait(0.01):
-            live.frame(frame())
-
-    thread = threading.Thread(target=film)
-    thread.start()
-    try:
-        viewer.subscribe()
-        viewer.data()
-        begin = time.monotonic()
-        for _ in range(4):
-            viewer.data()
-        took_s = time.monotonic() - begin
-    finally:
-        over.set()
-        thread.join()
-    assert took_s > 3 * FRAME_PERIOD_S, "the first of them may have waited"
-
-
 def test_nobody_waits_for_a_viewer_that_does_not_read(live: LiveView, viewer: Viewer) -> None:
     live.offer(wrench(0))
     viewer.subscribe()
-    for t_ns in range(20 * QUEUE_LIMIT):
+    for t_ns in range(40 * BACKLOG):
         live.offer(wrench(t_ns))
     live.close()  # whoever waits for this viewer waits for ever
-
-
-def test_what_does_not_fit_is_dropped_and_counted() -> None:
-    live = LiveView(port=0)  # not started: nobody takes anything out
-    for t_ns in range(QUEUE_LIMIT + 3):
-        live.offer(pose(t_ns))
-    assert live.dropped == 3
-    live.close()
 
 
 def test_it_listens_on_this_machine_only(live: LiveView) -> None:
@@ -294,7 +259,6 @@ def test_a_run_with_a_viewer_shows_what_it_records_and_records_the_same(lab: Lab
     assert Topic.PREVIEW not in recorded
     assert {Topic.PREVIEW, Topic.TCP, Topic.WRENCH, Topic.STEP, Topic.STROKE} <= seen
     assert seen <= {*recorded, Topic.PREVIEW} - {Topic.STILL}
-    assert live.dropped == 0
 
 
 def test_the_command_refuses_a_port_that_is_taken_before_anything_is_connected(lab: Lab, live: LiveView) -> None:

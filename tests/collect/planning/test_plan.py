@@ -14,8 +14,6 @@ from brushloop.collect.motion import Path as MotionPath
 from brushloop.collect.planning.limit_check import all_poses, check_poses, check_protocol
 from brushloop.collect.planning.summary import (
     Plan,
-    bundle_ml,
-    ink_need,
     make_plan,
     move_s,
     path_s,
@@ -87,7 +85,7 @@ def test_figures_take_cells_of_their_own_size_and_dip_between_strokes(tmp_path: 
 
 def test_a_calibration_marks_nothing_and_shows_where_it_touches(tmp_path: Path) -> None:
     plan = make_plan(rig(tmp_path), example("protocol-calibration.toml"))
-    assert (plan.placed, plan.dips, plan.ink.ml) == ((), 0, 0.0)
+    assert (plan.placed, plan.dips) == ((), 0)
     assert len(plan.touches_mm) == 6
 
 
@@ -110,10 +108,10 @@ NARROW = ("y_mm = [-260.0, 260.0]", "y_mm = [-260.0, 100.0]")
             (),
             r"b~1: 23",
         ),
-        (figure(HERE, TOO_DEEP), (), r"figures: a: 23 mm is deeper than brush.max_depth_mm = 22 mm"),
+        (figure(HERE, TOO_DEEP), (), r"figures: a-r01: 23 mm is deeper than brush.max_depth_mm = 22 mm"),
         (figure(HERE, THERE, patch="[300.0, 60.0]"), (), r"protocol.toml: cell_mm: .* does not fit"),
         (figure(HERE, TOO_TILTED), (), r"tilt = 20.000 deg is outside .*\(a-r01 on patch 0\)"),
-        (figure(NEAR_TOUCH, THERE), TOUCH, r"\[4.0, 26.0\] lies within 5 mm of a drawn point at \[3.0, 26.0\]"),
+        (figure(NEAR_TOUCH, THERE), TOUCH, r"\[4.0, 26.0\] lies within 5 mm of ink at \[3.0, 26.0\]"),
         ('kind = "calibration"\ntouches_mm = [[250.0, 9.0]]\n', (), r"touches_mm: \[250, 9\] lies off the sheet"),
         ('kind = "calibration"\ntouches_mm = [[240.0, 9.0]]\n', NARROW, r"y = 130.000 mm is outside .*\(touch\)"),
     ],
@@ -235,31 +233,25 @@ def test_a_turn_on_the_spot_is_read_in_radians(tmp_path: Path) -> None:
     ) == (pytest.approx(1.025))
 
 
-def test_ink_is_an_upper_estimate_and_a_pump_knows_better(tmp_path: Path) -> None:
-    config = rig(tmp_path)
-    assert bundle_ml(config.brush) == pytest.approx(1.8096, abs=1e-4)
-    assert ink_need(config, 10).ml == pytest.approx(5.43, abs=0.01)
-    pumped = rig(tmp_path, text=PUMP)
-    assert ink_need(pumped, 12).ml == pytest.approx(2 * 0.3)
-    assert "pump" in ink_need(pumped, 12).why
+def test_the_ink_of_a_plan_is_what_a_pump_doses(tmp_path: Path) -> None:
+    wanted = protocol(tmp_path, 'kind = "grid"\ndepths_mm = [11.0]\ntilts_deg = [0.0]\nrepeats = 12\n')
+    assert make_plan(rig(tmp_path, text=PUMP), wanted).ink_ml == pytest.approx(2 * 0.3)
+    assert make_plan(rig(tmp_path), wanted).ink_ml is None
 
 
 def test_the_reach_of_a_mark_is_that_of_the_model_at_the_paper_s_own_numbers(tmp_path: Path) -> None:
-    reach = reach_of(rig(tmp_path).brush, Condition(20.0, 10.0))
-    assert (reach.ahead_mm, reach.behind_mm) == (pytest.approx(2.522, abs=1e-3), pytest.approx(22.547, abs=1e-3))
-    assert 2.0 * reach.side_mm == pytest.approx(15.950, abs=1e-3)
+    ahead_mm, behind_mm, side_mm = reach_of(rig(tmp_path).brush, Condition(20.0, 10.0))
+    assert (ahead_mm, behind_mm, 2.0 * side_mm) == pytest.approx((2.522, 22.547, 15.950), abs=1e-3)
 
 
-def test_marks_that_leave_their_cells_and_columns_that_are_not_used_are_reported(tmp_path: Path) -> None:
+def test_marks_that_leave_their_cells_are_reported(tmp_path: Path) -> None:
     narrow = rig(tmp_path, "cell_mm = [40.0, 24.0]", "cell_mm = [24.0, 24.0]")
     [warning] = make_plan(narrow, example("protocol.toml")).warnings
     assert warning.startswith("H20-a0-r")
     assert "beyond its patch of 24 x 24 mm" in warning
-    assert make_plan(rig(tmp_path), example("protocol-replay.toml")).warnings == (
-        "recovered.csv: columns that are not used: depth_sd_mm",
-    )
+    assert make_plan(rig(tmp_path), example("protocol-replay.toml")).warnings == ()
     edge = protocol(tmp_path, figure([9.0, 1.0, 9.0, 0.0, 0.0], [20.0, 1.0, 9.0, 0.0, 0.0]))
-    assert "a may reach 2.5 mm beyond" in make_plan(rig(tmp_path), edge).warnings[0]
+    assert "a-r01 may reach 2.5 mm beyond" in make_plan(rig(tmp_path), edge).warnings[0]
 
 
 def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> None:
@@ -279,18 +271,6 @@ def test_a_self_check_takes_a_cell_before_the_first_stroke(tmp_path: Path) -> No
     small = rig(tmp_path, "[motion]", "[self_check]\nenabled = true\nlegs_mm = [50.0, 15.0]\n\n[motion]")
     with pytest.raises(ConfigError, match=r"rig.toml: self_check.legs_mm: a triangle of 50 by 15 mm does not fit"):
         check_protocol(tmp_path / "rig.toml", EXAMPLES / "protocol.toml", small, example("protocol.toml"))
-
-
-def test_a_plan_says_beforehand_what_the_self_check_of_an_armed_run_adds(tmp_path: Path) -> None:
-    full = 'kind = "grid"\ndepths_mm = [11.0, 13.0]\ntilts_deg = [0.0]\nrepeats = {}\n'
-    tight, roomy = (protocol(tmp_path, full.format(repeats)) for repeats in (21, 19))
-    warning = "with --arm the self-check first takes 3 patches: 2 sheets instead of 1 (`collect plan --arm`)"
-    assert make_plan(rig(tmp_path), tight).warnings == (warning,)
-    assert make_plan(rig(tmp_path), roomy).warnings == ()
-    assert make_plan(rig(tmp_path).checking_itself(False), tight).warnings == ()
-    narrow = rig(tmp_path, "[motion]", "[self_check]\nlegs_mm = [50.0, 15.0]\n\n[motion]")
-    [warning] = make_plan(narrow, roomy).warnings
-    assert warning.startswith("with --arm the self-check comes first, and a triangle of 50 by 15 mm does not fit")
 
 
 def test_moves_of_a_touch_end_above_where_they_began(tmp_path: Path) -> None:

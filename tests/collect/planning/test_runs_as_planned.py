@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from brushloop.collect.engine.recorder import StepContext
 from brushloop.collect.engine.run import Run
-from brushloop.collect.engine.steps.context import StepContext
 from brushloop.collect.motion import inking_moves
 from brushloop.collect.planning.limit_check import all_poses, check_protocol
 from brushloop.collect.planning.walk import moves_of

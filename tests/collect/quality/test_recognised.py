@@ -79,10 +79,11 @@ def test_a_verdict_shows_the_operator_what_was_seen_and_what_to_do(drawn: list[S
         split.image, split.plane, split.patch, depth_mm=split.depth_mm, limits=LIMITS, previous=split.before
     )
     assert verdict.cause is not None
-    assert verdict.cause.score > verdict.cause.threshold == LIMITS.split_mm
+    assert verdict.cause.threshold == LIMITS.split_mm
+    assert (verdict.cause.score or 0.0) > LIMITS.split_mm
     assert "mm" in verdict.reason
     assert "Comb the brush" in verdict.reason
-    [faint] = [check for check in verdict.checks if check.name is Failure.FAINT]
+    [faint] = [check for check in verdict.checks if check.name == Failure.FAINT]
     assert faint.passed
     assert faint.reason == ""
 
@@ -94,7 +95,7 @@ def test_limits_come_from_the_configuration(drawn: list[Sample | Blank]) -> None
         sound.image, sound.plane, sound.patch, depth_mm=sound.depth_mm, limits=strict, previous=sound.before
     )
     assert verdict.cause is not None
-    assert verdict.cause.name is Failure.FAINT
+    assert verdict.cause.name == Failure.FAINT
     inked = next(p for p in drawn if isinstance(p, Blank) and not p.blank)
     lax = LIMITS.model_copy(update={"foreign_mm2": 900.0})
     assert patch_is_blank(inked.image, inked.plane, inked.patch, limits=lax).passed

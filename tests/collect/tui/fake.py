@@ -16,18 +16,18 @@ from textual.app import App
 from textual.pilot import Pilot
 
 from brushloop.collect.engine.control import State
-from brushloop.collect.engine.last_capture import LastCapture, mark_of
-from brushloop.collect.engine.snapshot import CellCount, Mark, Picture, SheetMap, Snapshot
+from brushloop.collect.engine.snapshot import CellCount, LastCapture, Mark, Picture, SheetMap, Snapshot
+from brushloop.collect.engine.steps.capture import mark_of
 from brushloop.collect.errors import CollectAborted
 from brushloop.collect.operator import Choice, OperatorRequest, Prompt
-from brushloop.collect.quality.checks import Check, Failure, Verdict
+from brushloop.collect.quality.checks import Verdict
 from brushloop.collect.tui.app import OperatorApp
 from brushloop.collect.tui.pictures import Pictures
 from brushloop.collect.tui.review_screen import Review, ReviewCapture, ReviewScreen
 from brushloop.collect.tui.start_screen import SessionBrowser
 from brushloop.model.fitted import FittedPress
 from brushloop.sessions.events import CaptureResult, Press, Remark
-from brushloop.sessions.records import Condition, Header, Source
+from brushloop.sessions.records import Check, Condition, Header, Source
 from brushloop.sessions.show import Details, Summary
 
 HEIGHTS_MM = (11.0, 13.0, 15.0, 17.0, 20.0)
@@ -70,10 +70,17 @@ def blot(size: int = 128) -> np.ndarray[Any, np.dtype[np.bool_]]:
 def checks(*, split: bool = False) -> Verdict:
     return Verdict(
         (
-            Check(Failure.EXPOSURE, 201.0, "of 255", 250.0, True, ""),
-            Check(Failure.BLURRED, 0.11, "mm", 0.25, True, ""),
-            Check(Failure.DRY, 0.06, "", 0.125, True, ""),
-            Check(Failure.SPLIT, 0.42 if split else 0.02, "mm", 0.3, not split, "The tip is split." if split else ""),
+            Check(name="exposure", score=201.0, unit="of 255", threshold=250.0, passed=True),
+            Check(name="blurred", score=0.11, unit="mm", threshold=0.25, passed=True),
+            Check(name="dry", score=0.06, threshold=0.125, passed=True),
+            Check(
+                name="split",
+                score=0.42 if split else 0.02,
+                unit="mm",
+                threshold=0.3,
+                passed=not split,
+                reason="The tip is split." if split else "",
+            ),
         )
     )
 
@@ -93,7 +100,7 @@ def camera_picture() -> Picture:
     y, x = np.mgrid[0:240, 0:320]
     image = (170 + 40 * x / 320 - 20 * y / 240).astype(np.uint8)
     image[((x // 20 + y // 20) % 2 == 0) & ((x < 60) | (y > 180))] = 40
-    return Picture(7, image, 0.9)
+    return Picture(image, 0.9)
 
 
 def picture(**changes: Any) -> Snapshot:
