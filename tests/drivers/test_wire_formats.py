@@ -242,6 +242,9 @@ VALUES: list[list[Any]] = [
     [2**64 - 1, math.nan, math.inf, "é" * 20],
 ]
 PUSHES = [cbor2.dumps(values) for values in VALUES] + [json.dumps(values).encode() for values in VALUES]
+TAGGED = [cbor2.dumps([0, cbor2.CBORTag(tag, body)]) for tag in range(300) for body in ("1", b"1", 1, [1, 2], {"a": 1})]
+SHARED = b"\x82\x00\xd8\x1c\x82\x01\xd8\x1d\x00"
+"""A value that holds itself."""
 GREETING = b'{"protocol":"rtde","version":1,"input":{"set_recipe":100},"output":{"R1_actual_TCP_pose":1021}}\n\n'
 SAID = [
     b'[{"code":30047,"level":"ERROR","source":"rob1","args":["x"],"timestamp":17}]',
@@ -266,6 +269,13 @@ async def test_any_bytes_are_a_value_or_a_refusal(read: Read, valid: list[bytes]
         except DeviceError:
             continue
     assert taken > count / 100
+
+
+def test_no_tag_is_decoded():
+    """A tagged regular expression of 64 KiB would take half a minute to compile, with the arm's poses waiting."""
+    for payload in (*TAGGED, SHARED, b"\xc6" * 60_000):
+        with pytest.raises(ProtocolViolation):
+            decode_message(payload, "rtde")
 
 
 Feed = Callable[[bytes], list[bytes]]
