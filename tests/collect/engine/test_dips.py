@@ -23,7 +23,9 @@ from brushloop.collect.protocols.config import load_protocol
 from brushloop.collect.rig.config import RigConfig, load_rig
 from brushloop.collect.tui.review_screen import Review
 from brushloop.drivers.devices import Pose
+from brushloop.sessions.mcap_file import McapFile
 from brushloop.sessions.recording import Recording
+from brushloop.sessions.records import Quality, Topic
 from tests.collect.sent import noting
 from tests.journal_lines import read_lines
 from tests.rigs import Lab
@@ -94,6 +96,9 @@ def test_nobody_looks_at_the_paper_between_dip_and_press(sharp_lab: Lab, targets
     [capture] = recording.captures()
     assert capture.stroke.dip_to_touch_s == waits[-1]
     assert [seen.press.dip_to_touch_s for seen in Review(folder).captures] == waits
+    *_, (_, _, message) = McapFile(recording.path).sound().messages([str(Topic.QUALITY)])
+    remark = Quality.model_validate_json(message.data).checks[-1]
+    assert (remark.name, remark.score, remark.passed) == ("dip_to_touch", waits[-1], True)
 
 
 def test_a_brush_that_waited_with_its_ink_dips_again(
@@ -144,7 +149,7 @@ def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     async def late(self: brush_steps.DipToTouch) -> None:
         await hold(self)
         assert self._left_ns is not None
-        if next(number) == 2:
+        if next(number) == 3:  # the first that has enough others to be compared with
             self._left_ns -= 8_000_000_000  # as if eight seconds had passed
 
     monkeypatch.setattr(brush_steps.DipToTouch, "hold", late)
@@ -153,7 +158,8 @@ def test_a_stroke_that_waited_unlike_the_others_is_named_and_still_counts(
     folder = lab.session
     assert engine.snapshot().strokes_done == 4
     named = {seen.press.stroke_id: seen.unlike for seen in Review(folder).captures if seen.unlike}
-    assert "after its dip, the others after" in named["H11-a0-r03"]
+    assert "after its dip, the others after" in named["H11-a0-r04"]
+    assert any(f"H11-a0-r04: {named['H11-a0-r04']}" in line for line in engine.snapshot().messages)
 
 
 # The arm goes where the next dip begins; the decision on a photograph still comes before the dip
