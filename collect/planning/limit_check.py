@@ -108,9 +108,10 @@ def _check_touch_point(rig_path: Path, paper: PaperConfig, strokes: Iterable[Pla
     for patch in map(sheet.patch, range(sheet.capacity)):
         right_mm, up_mm = patch.x_mm - first.x_mm, patch.y_mm - first.y_mm
         for mark_x, mark_y in marks:
-            at = [round(mark_x + right_mm, 1), round(mark_y + up_mm, 1)]
+            at = mark_x + right_mm, mark_y + up_mm
             if math.dist(at, (x_mm, y_mm)) < TOUCH_CLEAR_MM:
-                what = f"{[x_mm, y_mm]} lies within {TOUCH_CLEAR_MM:g} mm of ink at {at}"
+                where = [round(at[0], 1), round(at[1], 1)]
+                what = f"{[x_mm, y_mm]} lies within {TOUCH_CLEAR_MM:g} mm of ink at {where}"
                 raise ConfigError(rig_path, "paper.touch_point_mm", what)
 
 
