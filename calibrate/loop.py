@@ -25,6 +25,7 @@ from brushloop.calibrate.compare.place import (
     Key,
     Pixels,
     Tone,
+    shown,
     simulated,
 )
 from brushloop.calibrate.errors import CalibrationError
@@ -63,9 +64,7 @@ AGAIN, ANOTHER, SIMULATED = "re-pressed", "another press", "recovered, simulated
 GOAL_POINTS = 1.0
 """Points by which re-pressed strokes may score below the originals' own repeatability."""
 NOT_AGAIN = "was not pressed again"
-HEADLINE, GRAY = (Alignment.MM, Tone.BINARY), KEYS.index((Alignment.MM, Tone.GRAY))
-SHEET_ROWS = slice(32, 96)
-"""Rows shown, the middle half: a press is at most half as thick as the field is high."""
+HEADLINE = (Alignment.MM, Tone.BINARY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,8 +283,9 @@ def verdicts(scores: Scores) -> Iterator[Verdict]:
 def _replayed(header: Header) -> str | None:
     """The session that a replay protocol repeats; None for any other."""
     try:
-        return json.loads(header.protocol).get("of")
-    except (ValueError, AttributeError):  # an import has none
+        protocol: Any = json.loads(header.protocol)
+        return str(protocol["of"]) if protocol["kind"] == "replay" else None
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
@@ -332,9 +332,7 @@ def summary(record: LoopRecord) -> Iterator[str]:
 
 def _shown(pair: Pair, percent: Floats) -> dict[str, Any]:
     """A pair in the page: its CSIM and SSIM, (2,), and its pictures."""
-    original, drawn, again = (
-        images[GRAY][SHEET_ROWS] / 255.0 for images in (pair.original.images, pair.simulated, pair.again.images)
-    )
+    original, drawn, again = map(shown, (pair.original.images, pair.simulated, pair.again.images))
     images = {
         "original": ink_uri(original),
         "recovered, simulated": ink_uri(drawn),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from brushloop.calibrate.artefact import current, load_artefact
-from brushloop.calibrate.compare.place import KEYS, Alignment, Field, Tone, brush_of, simulated
+from brushloop.calibrate.compare.place import GRAY_MM, Field, brush_of, simulated
 from brushloop.calibrate.errors import CalibrationError, CaptureRefused
 from brushloop.calibrate.presses import Refused, crop, read_presses
 from brushloop.calibrate.remote import local_path
@@ -273,7 +273,7 @@ def predict(condition: Condition, brush: Brush | BrushFit | None = None, model: 
     """
     chosen = _model(brush or Brush(), model)
     images = simulated(chosen, condition.depth_mm, condition.tilt_deg, Field())
-    image = np.asarray(images[KEYS.index((Alignment.MM, Tone.GRAY))] / 255.0, np.float32)
+    image = np.asarray(images[GRAY_MM] / 255.0, np.float32)
     edge = chosen.profile(condition.depth_mm, condition.tilt_deg).polyline()[0]
     return Prediction(chosen.name, image, edge)
 

@@ -64,6 +64,9 @@ class Polarity(StrEnum):
 Key = tuple[Alignment, Tone]
 KEYS: tuple[Key, ...] = tuple(itertools.product(Alignment, Tone))
 """Every way in which two images are compared."""
+GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
+SHOWN_ROWS = slice(32, 96)
+"""Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +160,11 @@ def images_of(mark: Outline, origin_x_mm: float, field: Field) -> Pixels:
     views = ((field.mm_per_px, left + origin_x_mm, top), (normal_mm, 0.5 * side_mm - middle_mm, 0.5 * side_mm))
     gray = dict(zip((Alignment.MM, Alignment.SIZE_NORMALISED), draw_loop(mark, views, SIZE_PX), strict=True))
     return np.stack([to_pixels(to_tone(gray[alignment], tone)) for alignment, tone in KEYS])
+
+
+def shown(images: Pixels) -> Image:
+    """The rows to show of the gray image on the millimetre field, of (len(KEYS), 128, 128)."""
+    return np.asarray(images[GRAY_MM][SHOWN_ROWS] / 255.0, np.float32)
 
 
 def draw_loop(loop: Outline, views: Sequence[tuple[float, float, float]], size_px: int) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from brushloop.calibrate.compare.place import KEYS, Alignment, Image, Pixels, Tone
+from brushloop.calibrate.compare.place import shown
 from brushloop.calibrate.errors import CalibrationError
 from brushloop.calibrate.files import read_bounded
 from brushloop.calibrate.presses import Press
@@ -22,9 +22,6 @@ from brushloop.calibrate.report import BLUE, COLOURS, ORANGE, Axis, Marks, Panel
 from brushloop.calibrate.validate.run import Outcome
 from brushloop.calibrate.validate.tables import NORMAL, STRICT, Report
 
-GRAY_MM = KEYS.index((Alignment.MM, Tone.GRAY))
-ROWS = slice(32, 96)
-"""Rows to show: the middle half of a field, as a press is at most half as thick as the field is high."""
 MAX_POINTS = 200
 MAX_CELLS, EXTREMES = 5, 6
 MAX_CURVE_BYTES = 64 * 1024 * 1024
@@ -59,10 +56,10 @@ def extremes(outcome: Outcome, model: str) -> tuple[list[int], list[int]]:
 def pictured(outcome: Outcome, k: int, model: str) -> dict[str, Any]:
     """A press with what the model predicts for it, their difference, and their scores: the paper's figures 7 and 8."""
     press, csim, ssim = outcome.scores.presses[k], np.nan, np.nan
-    captured, drawn = _shown(press.images), outcome.predicted(press)
+    captured, drawn = shown(press.images), outcome.predicted(press)
     images = {"captured": ink_uri(captured)}
     if model in drawn:
-        predicted = _shown(drawn[model])
+        predicted = shown(drawn[model])
         images |= {"predicted": ink_uri(predicted), "difference": overlay_uri(captured, predicted)}
         csim, ssim = 100.0 * outcome.scores.of_key(model, STRICT)[k]
     return {"press": press, "images": images, "scored": bool(np.isfinite(csim)), "csim": csim, "ssim": ssim}
@@ -74,8 +71,8 @@ def side_by_side(outcome: Outcome) -> dict[str, Any]:
     lines: list[tuple[Press, list[str]]] = []
     for press in (outcome.scores.presses[k] for k in first_of_cells(outcome, MAX_CELLS)):
         drawn = outcome.predicted(press)
-        predictions = (ink_uri(_shown(drawn[name])) if name in drawn else "" for name in labels)
-        lines.append((press, [ink_uri(_shown(press.images)), *predictions]))
+        predictions = (ink_uri(shown(drawn[name])) if name in drawn else "" for name in labels)
+        lines.append((press, [ink_uri(shown(press.images)), *predictions]))
     return {"labels": list(labels.values()), "lines": lines}
 
 
@@ -84,11 +81,6 @@ def first_of_cells(outcome: Outcome, most: int) -> list[int]:
     first = [numbers[0] for numbers in outcome.scores.conditions().values()]
     count = min(len(first), most)
     return [first[n * (len(first) - 1) // max(count - 1, 1)] for n in range(count)]
-
-
-def _shown(images: Pixels) -> Image:
-    """The rows to show of the gray image on the millimetre field, of (len(KEYS), 128, 128)."""
-    return np.asarray(images[GRAY_MM][ROWS] / 255.0, np.float32)
 
 
 def distributions(outcome: Outcome, report: Report) -> str:

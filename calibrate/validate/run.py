@@ -110,11 +110,18 @@ class Outcome:
     refused: Sequence[Refused]
     steps: Sequence[Step] = ()
     """Similarity by number of fitted presses; empty without ablations."""
+    drawn: dict[tuple[str, Condition], dict[str, Pixels]] = field(
+        default_factory=dict[tuple[str, Condition], dict[str, Pixels]]
+    )
+    """What was asked for before, by session and condition: a page shows a few of them several times."""
 
     def predicted(self, press: Press) -> dict[str, Pixels]:
         """(len(KEYS), 128, 128) of a press by the models that predict it."""
-        [store] = (session.store for session in self.sessions if session.header.session_id == press.session)
-        return predicted(self.models[press.session], press.condition, self.request.view, store)[0]
+        cell = press.session, press.condition
+        if cell not in self.drawn:
+            [store] = (session.store for session in self.sessions if session.header.session_id == press.session)
+            self.drawn[cell] = predicted(self.models[press.session], press.condition, self.request.view, store)[0]
+        return self.drawn[cell]
 
 
 def validate_presses(

@@ -18,19 +18,12 @@ from brushloop.collect.rig.devices import Rig, limits_of
 from brushloop.collect.touch.force import ForceTap
 from brushloop.drivers.devices import ForceSample, Frame, Identity, Pose, PoseSample, QueuedLine, Stamp
 from brushloop.drivers.geometry import brush_pose
-from brushloop.drivers.sim.config import SimConfig, Table, View
+from brushloop.drivers.sim.config import SimConfig, View
 from brushloop.drivers.sim.rig import Addresses, rig_toml
 from brushloop.drivers.sim.scene import Scene
 from brushloop.drivers.sim.world import World
+from tests.rigs import SMALL_TABLE
 
-SMALL_TABLE = Table(
-    sheet_mm=(110.0, 80.0),
-    board_origin_mm=(-20.0, -20.0),
-    board_squares=(15, 12),
-    board_square_mm=10.0,
-    board_marker_mm=7.0,
-    well_mm=(150.0, 20.0),
-)
 SMALL_VIEW = View(width_px=480, height_px=360, px_per_mm=2.8, centre_mm=(55.0, 40.0))
 WHOLE_VIEW = View(width_px=1024, height_px=768, px_per_mm=3.125)
 """Of a sheet of the usual size."""
